@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every error shmmap raises on purpose, in one tree.
+
+::
+
+    ShmmapError
+    ├── ConfigError            a setting is wrong (key, where it came from)       exit 78
+    ├── BadRequest             an argument or a message makes no sense            exit 2
+    ├── MapDataError           a file is not what it claims to be                 exit 65
+    ├── MapMissing             there is no map there                              exit 66
+    ├── DaemonUnreachable      nobody answers                                     exit 69
+    │   ├── NoSocket           nothing listens: the daemon was never started
+    │   ├── SocketPermission   the socket is there, but not for this user
+    │   ├── StaleSocket        the socket's daemon is gone
+    │   └── NoAnswer           connected, but no reply before the deadline
+    ├── ProtocolMismatch       client and daemon speak different versions         exit 76
+    ├── InstanceBusy           another daemon owns this instance                  exit 75
+    ├── NotPermitted           the daemon refuses this to this user               exit 1
+    ├── SegmentError           a segment cannot be used
+    │   ├── StaleHandle        it is gone: ask again                              exit 1
+    │   └── SegmentCorrupt     its bytes are wrong (magic, version, checksum)     exit 65
+    ├── CellError              one cell could not be had; others are unaffected   exit 1
+    │   ├── UnknownCell        the map has no such cell
+    │   ├── LoadFailed         its source cannot be read
+    │   ├── LoadTimeout        loading took longer than its deadline
+    │   ├── OverBudget         it does not fit; `holders` says who fills the budget
+    │   └── NoSpace            the shared-memory file system is full
+    └── InternalError          a defect in shmmap: please report it               exit 70
+
+``code`` is what travels on the wire, ``exit_code`` what the command line returns, ``hint`` what the
+reader can do about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+__all__ = [
+    "BadRequest",
+    "CellError",
+    "ConfigError",
+    "DaemonUnreachable",
+    "InstanceBusy",
+    "InternalError",
+    "LoadFailed",
+    "LoadTimeout",
+    "MapDataError",
+    "MapMissing",
+    "NoAnswer",
+    "NoSocket",
+    "NoSpace",
+    "NotPermitted",
+    "OverBudget",
+    "ProtocolMismatch",
+    "SegmentCorrupt",
+    "SegmentError",
+    "ShmmapError",
+    "SocketPermission",
+    "StaleHandle",
+    "StaleSocket",
+    "UnknownCell",
+    "error_from_wire",
+]
+
+
+class ShmmapError(Exception):
+    """Base of every error shmmap raises on purpose.
+
+    Parameters
+    ----------
+    message
+        What is wrong and where, in one sentence.
+    hint
+        What the reader can do about it; empty when there is nothing to add.
+    """
+
+    code: ClassVar[str] = "error"
+    exit_code: ClassVar[int] = 70
+
+    def __init__(self, message: str, *, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.message} ({self.hint})" if self.hint else self.message
+
+
+class ConfigError(ShmmapError):
+    """A setting is wrong; ``key`` names it and ``origin`` says where it was set."""
+
+    code = "bad_config"
+    exit_code = 78
+
+    def __init__(self, message: str, *, key: str = "", origin: str = "", hint: str = "") -> None:
+        super().__init__(message, hint=hint)
+        self.key = key
+        self.origin = origin
+
+
+class BadRequest(ShmmapError):
+    """An argument or a message makes no sense; asking again unchanged cannot help."""
+
+    code = "bad_request"
+    exit_code = 2
+
+
+class MapDataError(ShmmapError):
+    """A file is not what it claims to be.
+
+    Attributes
+    ----------
+    path
+        The file.
+    offset
+        Byte offset at which the contradiction was found, or None where it has no place.
+    cause
+        One of a small set of names, for programs: ``truncated``, ``lfs_pointer``, ``zero_filled``, ...
+    """
+
+    code = "bad_map_data"
+    exit_code = 65
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        path: str = "",
+        offset: int | None = None,
+        cause: str = "bad_data",
+        hint: str = "",
+    ) -> None:
+        place = f" at byte {offset}" if offset is not None else ""
+        super().__init__(f"{path}: {message}{place}" if path else message + place, hint=hint)
+        self.path = path
+        self.offset = offset
+        self.cause = cause
+
+
+class MapMissing(ShmmapError):
+    """There is no map where one was named."""
+
+    code = "map_missing"
+    exit_code = 66
+
+
+class DaemonUnreachable(ShmmapError):
+    """No daemon answers at the endpoint; the subclass says why."""
+
+    code = "unreachable"
+    exit_code = 69
+
+
+class NoSocket(DaemonUnreachable):
+    """Nothing listens at the endpoint: the daemon was never started, or listens elsewhere."""
+
+    code = "no_socket"
+
+
+class SocketPermission(DaemonUnreachable):
+    """The socket exists, but this user may not connect to it."""
+
+    code = "no_permission"
+
+
+class StaleSocket(DaemonUnreachable):
+    """The socket file is left over from a daemon that is gone."""
+
+    code = "stale_socket"
+
+
+class NoAnswer(DaemonUnreachable):
+    """The daemon did not answer before the deadline: it is stopped, hung or overloaded."""
+
+    code = "no_answer"
+
+
+class ProtocolMismatch(ShmmapError):
+    """Client and daemon speak different protocol versions, or the peer is no shmmap daemon."""
+
+    code = "protocol_mismatch"
+    exit_code = 76
+
+
+class InstanceBusy(ShmmapError):
+    """Another daemon already owns this instance."""
+
+    code = "instance_busy"
+    exit_code = 75
+
+
+class NotPermitted(ShmmapError):
+    """The daemon refuses this operation to this user."""
+
+    code = "not_permitted"
+    exit_code = 1
+
+
+class SegmentError(ShmmapError):
+    """A shared-memory segment cannot be used."""
+
+    code = "segment_error"
+    exit_code = 65
+
+
+class StaleHandle(SegmentError):
+    """The segment a handle names is gone (evicted or superseded): ask the daemon again."""
+
+    code = "stale_handle"
+    exit_code = 1
+
+
+class SegmentCorrupt(SegmentError):
+    """A segment's bytes contradict its layout: wrong magic, version, size or checksum."""
+
+    code = "segment_corrupt"
+
+
+class CellError(ShmmapError):
+    """One cell could not be had; other cells and requests are unaffected.
+
+    Attributes
+    ----------
+    cell_id, layer
+        Which cell, and which of its layers.
+    holders
+        For `OverBudget`: who keeps the budget filled, one line each.
+    """
+
+    code = "cell_error"
+    exit_code = 1
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        cell_id: str = "",
+        layer: str = "",
+        holders: Sequence[str] = (),
+        hint: str = "",
+    ) -> None:
+        super().__init__(message, hint=hint)
+        self.cell_id = cell_id
+        self.layer = layer
+        self.holders = tuple(holders)
+
+
+class UnknownCell(CellError):
+    """The map has no cell of that id."""
+
+    code = "unknown_cell"
+
+
+class LoadFailed(CellError):
+    """The cell's source cannot be read; it is retried when the file changes or after a back-off."""
+
+    code = "load_failed"
+
+
+class LoadTimeout(CellError):
+    """Loading the cell took longer than the daemon's deadline for one load."""
+
+    code = "load_timeout"
+
+
+class OverBudget(CellError):
+    """The cell does not fit in the budget or the session's quota; `holders` says who fills it."""
+
+    code = "over_budget"
+
+
+class NoSpace(CellError):
+    """The shared-memory file system is full."""
+
+    code = "no_space"
+
+
+class InternalError(ShmmapError):
+    """A defect in shmmap itself."""
+
+    code = "internal"
+    exit_code = 70
+
+
+def _tree(root: type[ShmmapError]) -> dict[str, type[ShmmapError]]:
+    found = {root.code: root}
+    for child in root.__subclasses__():
+        found.update(_tree(child))
+    return found
+
+
+def error_from_wire(code: str, message: str, hint: str = "") -> ShmmapError:
+    """Return the error a daemon's reply describes; an unknown code becomes `ShmmapError`."""
+    kind = _tree(ShmmapError).get(code, ShmmapError)
+    return kind(message, hint=hint)

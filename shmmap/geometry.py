@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Areas a client asks for, and which cell boxes they touch.
+
+All coordinates are metres in the map frame.  Borders are closed: a box that only touches an area
+belongs to it.  A *box* is ``(min_x, min_y, max_x, max_y)``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import BadRequest
+
+__all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_boxes"]
+
+Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+def _finite(kind: str, **values: float) -> None:
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise BadRequest(f"{kind}: {name} must be a finite number of metres, not {value!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class ZRange:
+    """Closed interval of heights, metres, map frame."""
+
+    min: float
+    max: float
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.min) or math.isnan(self.max) or self.min > self.max:
+            raise BadRequest(f"z range: need min <= max, not {self.min!r} and {self.max!r}")
+
+    def overlaps(self, z_min: float, z_max: float) -> bool:
+        """Whether the heights ``[z_min, z_max]`` touch this range; unknown (NaN) heights do."""
+        return not (z_max < self.min or z_min > self.max)
+
+
+def _check_radius(kind: str, x: float, y: float, radius: float) -> None:
+    _finite(kind, x=x, y=y, radius=radius)
+    if radius < 0:
+        raise BadRequest(f"{kind}: radius must not be negative, it is {radius!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """True circle: a box belongs to it when its nearest point is within ``radius``."""
+
+    x: float
+    y: float
+    radius: float
+    z: ZRange | None = None
+
+    def __post_init__(self) -> None:
+        _check_radius("circle", self.x, self.y, self.radius)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Smallest box around the area."""
+        return self.x - self.radius, self.y - self.radius, self.x + self.radius, self.y + self.radius
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Where distance is measured from."""
+        return self.x, self.y
+
+    def overlaps(self, boxes: Floats) -> Mask:
+        """Which of ``boxes`` ((N, 4) float64) the circle touches, as (N,) bool."""
+        dx = np.maximum(np.maximum(boxes[:, 0] - self.x, self.x - boxes[:, 2]), 0.0)
+        dy = np.maximum(np.maximum(boxes[:, 1] - self.y, self.y - boxes[:, 3]), 0.0)
+        inside: Mask = dx * dx + dy * dy <= self.radius * self.radius
+        return inside
+
+
+@dataclass(frozen=True, slots=True)
+class AutowareSquare:
+    """Autoware's area test, to the letter: a square of half-side ``radius``.
+
+    Autoware calls it a cylinder, but its first clause (box grown by the radius, closed borders)
+    already contains the second (`cylinder_and_box_overlap_exists`, autoware_map_loader
+    utils.cpp).  Centre, radius and boxes are rounded to float32 as in its messages; the
+    arithmetic is double.
+    """
+
+    x: float
+    y: float
+    radius: float
+    z: ZRange | None = None
+
+    def __post_init__(self) -> None:
+        _check_radius("square", self.x, self.y, self.radius)
+        if max(abs(self.x), abs(self.y), self.radius) > float(np.finfo(np.float32).max):
+            raise BadRequest("square: a coordinate does not fit Autoware's float32")
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Box that contains every box the square touches, float32 rounding included."""
+        x, y, radius = (float(np.float32(v)) for v in (self.x, self.y, self.radius))
+        return x - radius, y - radius, x + radius, y + radius
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Where distance is measured from."""
+        return self.x, self.y
+
+    def overlaps(self, boxes: Floats) -> Mask:
+        """Which of ``boxes`` ((N, 4) float64) the square touches, as (N,) bool."""
+        x, y, radius = (float(np.float32(v)) for v in (self.x, self.y, self.radius))
+        rounded = boxes.astype(np.float32).astype(np.float64)
+        inside: Mask = (
+            (rounded[:, 0] - radius <= x)
+            & (x <= rounded[:, 2] + radius)
+            & (rounded[:, 1] - radius <= y)
+            & (y <= rounded[:, 3] + radius)
+        )
+        return inside
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Axis-aligned rectangle."""
+
+    min_x: float
+    min_y: float
+    max_x: float
+    max_y: float
+    z: ZRange | None = None
+
+    def __post_init__(self) -> None:
+        _finite("box", min_x=self.min_x, min_y=self.min_y, max_x=self.max_x, max_y=self.max_y)
+        if self.min_x > self.max_x or self.min_y > self.max_y:
+            raise BadRequest(
+                f"box: need min <= max, not x {self.min_x!r}..{self.max_x!r},"
+                f" y {self.min_y!r}..{self.max_y!r}",
+                hint="the order is min_x, min_y, max_x, max_y",
+            )
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The box itself."""
+        return self.min_x, self.min_y, self.max_x, self.max_y
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Where distance is measured from."""
+        return (self.min_x + self.max_x) / 2, (self.min_y + self.max_y) / 2
+
+    def overlaps(self, boxes: Floats) -> Mask:
+        """Which of ``boxes`` ((N, 4) float64) the rectangle touches, as (N,) bool."""
+        inside: Mask = (
+            (boxes[:, 0] <= self.max_x)
+            & (boxes[:, 2] >= self.min_x)
+            & (boxes[:, 1] <= self.max_y)
+            & (boxes[:, 3] >= self.min_y)
+        )
+        return inside
+
+
+Area: TypeAlias = Circle | AutowareSquare | Box
+
+
+def distance_to_boxes(x: float, y: float, boxes: Floats) -> Floats:
+    """Distance in metres from a point to the nearest point of each box ((N, 4) float64), as (N,)."""
+    dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
+    dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
+    distance: Floats = np.hypot(dx, dy)
+    return distance

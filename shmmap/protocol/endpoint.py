@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the daemon listens, and where clients look for it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from shmmap.errors import BadRequest
+
+__all__ = ["DEFAULT_INSTANCE", "SYSTEM_RUNTIME_DIR", "endpoint_path", "runtime_dirs", "socket_path"]
+
+DEFAULT_INSTANCE: Final = "default"
+SYSTEM_RUNTIME_DIR: Final = "/run/shmmap"
+_SUN_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) - 1 on Linux
+
+
+def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
+    """Directories a client looks in, in order: the user's own, then the system's."""
+    own = environ.get("XDG_RUNTIME_DIR", "")
+    return (*([f"{own}/shmmap"] if own else []), SYSTEM_RUNTIME_DIR)
+
+
+def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:
+    """Path of the instance's request socket."""
+    return f"{runtime_dir.rstrip('/')}/{instance}.sock"
+
+
+def endpoint_path(endpoint: str) -> str:
+    """Return the absolute socket path of an endpoint given as path or ``ipc://`` URL.
+
+    Raises
+    ------
+    BadRequest
+        For another transport, or a path longer than a socket address can hold (107 bytes).
+    """
+    path = endpoint.removeprefix("ipc://")
+    if "://" in path or not path or path.startswith("@"):
+        raise BadRequest(f"endpoint {endpoint!r} is not usable", hint="give a socket path or an ipc:// URL")
+    absolute = str(Path(path).absolute())
+    if len(os.fsencode(absolute)) > _SUN_PATH_BYTES:
+        raise BadRequest(
+            f"socket path {absolute} is longer than the {_SUN_PATH_BYTES} bytes a socket address holds",
+            hint="use a shorter --runtime-dir or --endpoint",
+        )
+    return absolute

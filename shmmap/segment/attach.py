@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Attaching to a segment: read-only numpy views over shared memory.
+
+A mapping lives exactly as long as any array over it: every view's ``base`` chain ends at the
+mapping object, whose end unmaps.  Nothing is ever unmapped under a live view.  No file descriptor
+is kept (Python's own ``mmap`` keeps one each, which ends at RLIMIT_NOFILE), so the mapping is made
+with the C library's ``mmap``; the kernel keeps the open file, and the session's lock on it, for as
+long as the mapping lives.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import posix_ipc
+from numpy.typing import NDArray
+
+from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.layout import PublishBlock, SegmentHeader, unpack_header, unpack_publish_block
+from shmmap.segment.pins import lock_slot
+
+__all__ = ["AttachedSegment", "Unmap", "attach", "unmap"]
+
+Unmap = Callable[[int, int], object]
+
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+_mmap: Final = _libc.mmap
+_mmap.restype = ctypes.c_void_p
+_mmap.argtypes = (
+    ctypes.c_void_p,
+    ctypes.c_size_t,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.c_long,
+)
+_munmap: Final = _libc.munmap
+_munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
+
+_PROT_READ: Final = 1
+_MAP_SHARED: Final = 1
+_MAP_POPULATE: Final = 0x8000
+_MAP_FAILED: Final = ctypes.c_void_p(-1).value
+
+
+def unmap(address: int, nbytes: int) -> None:
+    """Give a mapping back to the kernel."""
+    _munmap(address, nbytes)
+
+
+class _Mapping:
+    """Owns one read-only mapping; the root of the base chain of every array over it."""
+
+    __slots__ = ("__array_interface__", "_address", "_nbytes", "_unmap")
+
+    def __init__(self, fd: int, nbytes: int, populate: bool, on_unmap: Unmap) -> None:
+        self._nbytes = 0
+        address = _mmap(None, nbytes, _PROT_READ, _MAP_SHARED | (_MAP_POPULATE if populate else 0), fd, 0)
+        if address == _MAP_FAILED or address is None:
+            number = ctypes.get_errno()
+            raise SegmentError(
+                f"cannot map {nbytes} bytes: {os.strerror(number)}",
+                hint="vm.max_map_count or RLIMIT_AS may be too low",
+            )
+        self._address = address
+        self._nbytes = nbytes
+        self._unmap = on_unmap
+        # True: read-only; numpy then refuses to make any view of it writeable
+        self.__array_interface__ = {
+            "data": (address, True),
+            "shape": (nbytes,),
+            "typestr": "|u1",
+            "version": 3,
+        }
+
+    def __del__(self) -> None:
+        if self._nbytes:
+            self._unmap(self._address, self._nbytes)
+
+
+class AttachedSegment:
+    """A verified, read-only view of one segment.
+
+    Attributes
+    ----------
+    header : SegmentHeader
+        What the segment says about itself.
+    raw : (total_bytes,) uint8
+        All of its bytes.
+    """
+
+    __slots__ = ("header", "raw")
+
+    def __init__(self, header: SegmentHeader, raw: NDArray[np.uint8]) -> None:
+        self.header = header
+        self.raw = raw
+
+    def column(self, index: int) -> NDArray[np.generic]:
+        """Return column number ``index`` as a read-only, zero-copy array."""
+        column = self.header.columns[index]
+        flat = self.raw[column.offset : column.offset + column.nbytes].view(column.dtype)
+        return flat if len(column.shape) == 1 else flat.reshape(column.shape)
+
+    @property
+    def published(self) -> PublishBlock | None:
+        """The publish block; None for bytes that no daemon published."""
+        return unpack_publish_block(self.raw.data, self.header.header_bytes)
+
+    def verify(self) -> None:
+        """Check every column against its checksum (about 10 ms per 100 MB).
+
+        Raises
+        ------
+        SegmentCorrupt
+            Naming the first column whose bytes changed.
+        """
+        import xxhash
+
+        for index, column in enumerate(self.header.columns):
+            if (
+                xxhash.xxh3_64_intdigest(self.raw[column.offset : column.offset + column.nbytes].data)
+                != column.checksum
+            ):
+                raise SegmentCorrupt(
+                    f"column {column.name!r} of {self.header.cell_id} does not match its checksum"
+                )
+
+
+def _open(name: str, shm_dir: str) -> int:
+    if shm_dir == DEFAULT_SHM_DIR:
+        # no size=: passing one would resize the segment under everybody's feet
+        return int(posix_ipc.SharedMemory(name, read_only=True).fd)
+    return os.open(f"{shm_dir}/{name.lstrip('/')}", os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+
+
+def attach(
+    name: str,
+    *,
+    offset: int = 0,
+    nbytes: int = 0,
+    shm_dir: str = DEFAULT_SHM_DIR,
+    slot: int | None = None,
+    populate: bool = False,
+    on_unmap: Unmap = unmap,
+) -> AttachedSegment:
+    """Map a segment read-only and verify its header.
+
+    Parameters
+    ----------
+    name
+        As a handle gives it, leading slash included.
+    offset, nbytes
+        Where in the shared-memory object the segment lies; 0 bytes means all of it.
+    shm_dir
+        Directory of the segments, as the daemon's ``hello`` names it.
+    slot
+        The session's slot: tells the daemon who uses the segment.
+    populate
+        Let the kernel map every page now (``MAP_POPULATE``) instead of at first touch.
+    on_unmap
+        Called with address and bytes when the last array over the mapping is gone; the default
+        unmaps on the spot.
+
+    Raises
+    ------
+    StaleHandle
+        The segment is gone.
+    SegmentCorrupt
+        Its bytes are not a segment of a layout this program reads.
+    SegmentError
+        It may not be opened by this user, or cannot be mapped.
+    """
+    try:
+        fd = _open(name, shm_dir)
+    except (FileNotFoundError, posix_ipc.ExistentialError) as error:
+        raise StaleHandle(f"segment {name} is gone", hint="ask the daemon again") from error
+    except (PermissionError, posix_ipc.PermissionsError) as error:
+        raise SegmentError(
+            f"segment {name}: this user may not read it",
+            hint="join the daemon's group (`shmmap doctor` names it)",
+        ) from error
+    except OSError as error:
+        raise SegmentError(f"segment {name}: {error.strerror}") from error
+    try:
+        if slot is not None:
+            lock_slot(fd, slot)
+        available = os.fstat(fd).st_size
+        end = offset + nbytes if nbytes else available
+        if end > available or end == 0:
+            raise SegmentCorrupt(f"segment {name} has {available} bytes, the handle needs {end}")
+        mapping = _Mapping(fd, end, populate, on_unmap)
+    finally:
+        os.close(fd)
+    raw: NDArray[np.uint8] = np.asarray(mapping)
+    if offset:
+        raw = raw[offset:]
+    return AttachedSegment(unpack_header(raw.data, len(raw)), raw)

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shared-memory directory as the daemon uses it: make, publish, retire, list and remove segments.
+
+Nothing here maps a segment or keeps it open: the kernel's word on who still uses a segment
+(`shmmap.segment.pins`) counts every open file, the daemon's own included.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from shmmap.errors import ConfigError
+from shmmap.segment.layout import PublishBlock, pack_publish_block
+
+__all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
+
+DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108  where shm_open puts segments on Linux
+
+
+def measured_bytes(fd: int) -> int:
+    """Bytes of memory the file really occupies (``st_blocks`` counts 512-byte units)."""
+    return os.fstat(fd).st_blocks * 512
+
+
+class ShmDirectory:
+    """One directory on a tmpfs, by default the one of POSIX shared memory.
+
+    Raises
+    ------
+    ConfigError
+        If it is missing, not writable, or its file system has no unnamed temporary files
+        (``O_TMPFILE``; every tmpfs has them).
+    """
+
+    def __init__(self, path: str = DEFAULT_SHM_DIR) -> None:
+        self.path = str(Path(path).absolute())
+        try:
+            self._fd = os.open(self.path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise ConfigError(
+                f"shared-memory directory {self.path}: {error.strerror}",
+                key="shm_dir",
+                hint="name a directory on a tmpfs",
+            ) from error
+        try:
+            os.close(self.create())
+        except OSError as error:
+            os.close(self._fd)
+            raise ConfigError(
+                f"shared-memory directory {self.path}: cannot create a file there: {error.strerror}",
+                key="shm_dir",
+                hint="name a writable directory on a tmpfs",
+            ) from error
+
+    def close(self) -> None:
+        """Close the directory; its files stay."""
+        os.close(self._fd)
+
+    def create(self) -> int:
+        """Open an unnamed file; it vanishes with its last descriptor unless published."""
+        return os.open(self.path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o400)
+
+    def publish(
+        self, fd: int, name: str, *, block: PublishBlock, header_bytes: int, mode: int, gid: int
+    ) -> int:
+        """Stamp, chmod and name a finished segment; returns the bytes it occupies.
+
+        The name appears only when everything else is done, so whoever can open the segment sees
+        it whole.
+        """
+        os.pwrite(fd, pack_publish_block(block), header_bytes - 64)
+        if gid >= 0:
+            os.fchown(fd, -1, gid)
+        os.fchmod(fd, mode)
+        # src_dir_fd makes CPython call linkat(2); link(2) would try to link the symlink in /proc
+        os.link(
+            f"/proc/self/fd/{fd}",
+            name.lstrip("/"),
+            src_dir_fd=self._fd,
+            dst_dir_fd=self._fd,
+            follow_symlinks=True,
+        )
+        return measured_bytes(fd)
+
+    def open(self, name: str) -> int:
+        """Open a segment for reading; close it at once, an open file looks like a pin."""
+        return os.open(name.lstrip("/"), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=self._fd)
+
+    def rename(self, old: str, new: str) -> bool:
+        """Rename a segment; False if it is gone."""
+        try:
+            os.rename(old.lstrip("/"), new.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def unlink(self, name: str) -> bool:
+        """Remove a name; False if it is gone already."""
+        try:
+            os.unlink(name.lstrip("/"), dir_fd=self._fd)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def names(self, prefix: str) -> list[str]:
+        """Names that start with ``prefix`` (slash included), sorted."""
+        bare = prefix.lstrip("/")
+        with os.scandir(self.path) as entries:
+            return sorted("/" + entry.name for entry in entries if entry.name.startswith(bare))
+
+    def free_bytes(self) -> int:
+        """Bytes the file system has left for us; very large where it sets no limit."""
+        state = os.statvfs(self._fd)
+        return state.f_bavail * state.f_frsize if state.f_blocks else 1 << 62
+
+    def size_bytes(self) -> int:
+        """Size of the file system; very large where it sets no limit."""
+        state = os.statvfs(self._fd)
+        return state.f_blocks * state.f_frsize if state.f_blocks else 1 << 62
+
+
+def is_full(error: OSError) -> bool:
+    """Whether ``error`` says that the file system is full."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.ENOMEM)

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bytes of a segment: one header, then columns.  ``LAYOUT.md`` is the byte-exact document.
+
+A segment is one layer of one cell at one version.  Its header carries everything a reader needs
+(a handle names only segment, offset and size), and is immutable but for the 64-byte *publish
+block* at its end, which the daemon fills in when it gives the segment a name.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from shmmap.columns import ColumnSpec
+from shmmap.errors import SegmentCorrupt
+
+__all__ = [
+    "LAYOUT_VERSION",
+    "Column",
+    "PublishBlock",
+    "SegmentHeader",
+    "SourceStamp",
+    "pack_header",
+    "pack_publish_block",
+    "plan_columns",
+    "unpack_header",
+    "unpack_publish_block",
+]
+
+MAGIC: Final = b"SHMMAP\x00\x01"
+LAYOUT_VERSION: Final = (1, 0)
+BYTE_ORDER: Final = 0x01020304
+PAGE_BYTES: Final = 4096
+ALIGNMENT_BYTES: Final = 64
+COLUMNS_OFFSET: Final = 512
+TAIL_BYTES: Final = 72  # header CRC, padding, publish block
+PUBLISH_BYTES: Final = 64
+MAX_DIMENSIONS: Final = 4
+
+FIXED: Final = struct.Struct("<8sHHIQQQQQQqq16s4d2d3dIIIIIIIIIIII")
+COLUMN: Final = struct.Struct("<40s8s16sII4QQQQ")
+PUBLISH: Final = struct.Struct("<8sQQ32xI4x")
+PUBLISH_MAGIC: Final = b"PUBLISH\x00"
+CRC: Final = struct.Struct("<II")
+
+
+class SourceStamp(NamedTuple):
+    """What identifies one state of a source file: size in bytes, mtime and ctime in nanoseconds."""
+
+    size: int
+    mtime_ns: int
+    ctime_ns: int
+
+
+NO_SOURCE: Final = SourceStamp(0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One named array of a segment.
+
+    Attributes
+    ----------
+    name
+        At most 40 bytes of UTF-8.
+    dtype
+        Little-endian numpy type of one element.
+    shape
+        Up to four dimensions; rows first.
+    offset, nbytes
+        Where the C-contiguous array lies, counted from the start of the segment.
+    unit
+        SI unit of the values, empty where unknown.
+    checksum
+        XXH3-64 of the column's bytes.
+    """
+
+    name: str
+    dtype: np.dtype[np.generic]
+    shape: tuple[int, ...]
+    offset: int
+    nbytes: int
+    unit: str = ""
+    checksum: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentHeader:
+    """Everything a segment says about itself; metres, map frame.
+
+    ``box`` is the cell's (min_x, min_y, max_x, max_y); ``z_min``/``z_max`` bound the points and are
+    NaN for an empty cell.  Coordinates in columns are relative to ``origin`` ((0, 0, 0) for
+    `points`, which keeps the source's bits).  ``rows`` counts the points kept,
+    ``source_points`` those in the file, ``dropped_points`` those left out as not finite.
+    """
+
+    cell_id: str
+    layer: str
+    columns: tuple[Column, ...]
+    rows: int
+    box: tuple[float, float, float, float]
+    header_bytes: int
+    total_bytes: int
+    z_min: float = math.nan
+    z_max: float = math.nan
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    source_points: int = 0
+    dropped_points: int = 0
+    source: SourceStamp = NO_SOURCE
+    source_digest: bytes = bytes(16)
+    builder_version: int = 0
+    frame_id: str = "map"
+
+
+class PublishBlock(NamedTuple):
+    """Which daemon life published the segment, and as which version of its cell."""
+
+    epoch: int
+    version: int
+
+
+def _up(value: int, step: int) -> int:
+    return -(-value // step) * step
+
+
+def header_size(column_count: int, cell_id: str, layer: str, frame_id: str) -> int:
+    """Bytes of the header of such a segment: a whole number of pages."""
+    strings = len(cell_id.encode()) + len(layer.encode()) + len(frame_id.encode())
+    return _up(COLUMNS_OFFSET + column_count * COLUMN.size + strings + TAIL_BYTES, PAGE_BYTES)
+
+
+def plan_columns(specs: Sequence[ColumnSpec], rows: int, header_bytes: int) -> tuple[tuple[Column, ...], int]:
+    """Place one column after the other, each 64-byte aligned; returns them and the total bytes."""
+    columns = []
+    offset = header_bytes
+    for spec in specs:
+        shape = (rows,) if spec.components == 1 else (rows, spec.components)
+        nbytes = rows * spec.row_bytes
+        columns.append(Column(spec.name, spec.dtype, shape, offset, nbytes, spec.unit))
+        offset = _up(offset + nbytes, ALIGNMENT_BYTES)
+    return tuple(columns), offset
+
+
+def pack_header(header: SegmentHeader) -> bytes:
+    """Return the header's bytes, publish block empty.
+
+    Raises
+    ------
+    ValueError
+        If a name or unit is too long, a dtype is not little-endian numeric, or the strings do not
+        fit ``header_bytes``.
+    """
+    page = bytearray(header.header_bytes)
+    at = COLUMNS_OFFSET
+    for column in header.columns:
+        name, unit = column.name.encode(), column.unit.encode()
+        dtype = column.dtype.newbyteorder("<").str.encode()
+        if len(name) > 40 or len(unit) > 16 or len(dtype) > 8 or len(column.shape) > MAX_DIMENSIONS:
+            raise ValueError(f"column {column.name!r} does not fit the layout's row")
+        if column.dtype.kind not in "fiu":
+            raise ValueError(f"column {column.name!r}: dtype {column.dtype} is not numeric")
+        shape = (*column.shape, *(0,) * (MAX_DIMENSIONS - len(column.shape)))
+        COLUMN.pack_into(
+            page, at, name, dtype, unit, len(column.shape), 0, *shape,
+            column.offset, column.nbytes, column.checksum,
+        )  # fmt: skip
+        at += COLUMN.size
+    places: list[int] = []
+    for text in (header.cell_id.encode(), header.layer.encode(), header.frame_id.encode()):
+        if at + len(text) > header.header_bytes - TAIL_BYTES:
+            raise ValueError("the header's strings do not fit its pages")
+        page[at : at + len(text)] = text
+        places += (at, len(text))
+        at += len(text)
+    FIXED.pack_into(
+        page, 0, MAGIC, *LAYOUT_VERSION, BYTE_ORDER, header.header_bytes, header.total_bytes,
+        header.rows, header.source_points, header.dropped_points, *header.source,
+        header.source_digest, *header.box, header.z_min, header.z_max, *header.origin,
+        header.builder_version, len(header.columns), COLUMNS_OFFSET, COLUMN.size, *places, 0, 0,
+    )  # fmt: skip
+    end = header.header_bytes - TAIL_BYTES
+    CRC.pack_into(page, end, zlib.crc32(memoryview(page)[:end]), 0)
+    return bytes(page)
+
+
+def pack_publish_block(block: PublishBlock) -> bytes:
+    """Return the 64 bytes the daemon writes when it publishes a segment."""
+    packed = PUBLISH.pack(PUBLISH_MAGIC, block.epoch, block.version, 0)
+    return packed[:56] + CRC.pack(zlib.crc32(packed[:56]), 0)
+
+
+def unpack_publish_block(header_page: memoryview, header_bytes: int) -> PublishBlock | None:
+    """Read the publish block; None while the segment was never published.
+
+    Raises
+    ------
+    SegmentCorrupt
+        If it is neither empty nor whole.
+    """
+    raw = bytes(header_page[header_bytes - PUBLISH_BYTES : header_bytes])
+    magic, epoch, version, crc = PUBLISH.unpack(raw)
+    if magic == bytes(8):
+        return None
+    if magic != PUBLISH_MAGIC or crc != zlib.crc32(raw[:56]):
+        raise SegmentCorrupt("the publish block is damaged")
+    return PublishBlock(epoch, version)
+
+
+_DTYPES: dict[bytes, np.dtype[np.generic]] = {
+    np.dtype(f"<{kind}{size}").str.encode(): np.dtype(f"<{kind}{size}")
+    for kind, sizes in (("f", (2, 4, 8)), ("i", (1, 2, 4, 8)), ("u", (1, 2, 4, 8)))
+    for size in sizes
+}
+
+
+def check_start(start: memoryview, available_bytes: int) -> tuple[int, int]:
+    """Check magic, version and sizes of a segment's first bytes; returns (header, total) bytes.
+
+    ``available_bytes`` is how much is really there (fstat): everything the header claims must lie
+    inside it.
+    """
+    if len(start) < FIXED.size:
+        raise SegmentCorrupt(f"a segment of {len(start)} bytes is shorter than its header")
+    magic, major, minor, order, header_bytes, total_bytes = struct.unpack_from("<8sHHIQQ", start)
+    if magic != MAGIC:
+        raise SegmentCorrupt(f"not a shmmap segment: it starts with {bytes(magic)!r}")
+    if major != LAYOUT_VERSION[0]:
+        raise SegmentCorrupt(
+            f"segment layout {major}.{minor}, this program reads {LAYOUT_VERSION[0]}.x",
+            hint="update the older of daemon and client",
+        )
+    if order != BYTE_ORDER:
+        raise SegmentCorrupt("the segment was written on a machine of other byte order")
+    if header_bytes % PAGE_BYTES or not PAGE_BYTES <= header_bytes <= total_bytes <= available_bytes:
+        raise SegmentCorrupt(
+            f"the segment claims {header_bytes} header and {total_bytes} total bytes; it has {available_bytes}"
+        )
+    return header_bytes, total_bytes
+
+
+def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
+    """Read and verify a header.
+
+    Parameters
+    ----------
+    page
+        The segment's bytes, from its start, at least the whole header.
+    available_bytes
+        How many bytes the segment really has.
+
+    Raises
+    ------
+    SegmentCorrupt
+        Wrong magic, other major layout version, bad CRC, or a column outside the segment.
+    """
+    header_bytes, total_bytes = check_start(page, available_bytes)
+    if len(page) < header_bytes:
+        raise SegmentCorrupt(f"only {len(page)} of {header_bytes} header bytes are there")
+    end = header_bytes - TAIL_BYTES
+    if zlib.crc32(page[:end]) != int.from_bytes(page[end : end + 4], "little"):
+        raise SegmentCorrupt("the header's checksum does not match")
+    (
+        _magic, _major, _minor, _order, _header_bytes, _total_bytes,
+        rows, source_points, dropped_points, source_size, source_mtime_ns, source_ctime_ns, digest,
+        min_x, min_y, max_x, max_y, z_min, z_max, origin_x, origin_y, origin_z,
+        builder_version, count, columns_offset, row_bytes,
+        id_at, id_bytes, layer_at, layer_bytes, frame_at, frame_bytes, _flags, _reserved,
+    ) = FIXED.unpack_from(page)  # fmt: skip
+    if row_bytes < COLUMN.size or columns_offset + count * row_bytes > end:
+        raise SegmentCorrupt("the column table does not fit the header")
+    columns = []
+    for index in range(count):
+        name, dtype, unit, ndim, _, s0, s1, s2, s3, offset, nbytes, checksum = COLUMN.unpack_from(
+            page, columns_offset + index * row_bytes
+        )
+        kind = _DTYPES.get(dtype.rstrip(b"\0"))
+        shape = (s0, s1, s2, s3)[:ndim]
+        if (
+            kind is None
+            or ndim > MAX_DIMENSIONS
+            or math.prod(shape) * kind.itemsize != nbytes
+            or offset < header_bytes
+            or offset % ALIGNMENT_BYTES
+            or offset + nbytes > total_bytes
+        ):
+            raise SegmentCorrupt(f"column {index} ({bytes(name)!r}) contradicts the layout")
+        columns.append(
+            Column(
+                name.rstrip(b"\0").decode(),
+                kind,
+                shape,
+                offset,
+                nbytes,
+                unit.rstrip(b"\0").decode(),
+                checksum,
+            )
+        )
+    if max(id_at + id_bytes, layer_at + layer_bytes, frame_at + frame_bytes) > end:
+        raise SegmentCorrupt("a string lies outside the header")
+    return SegmentHeader(
+        cell_id=str(page[id_at : id_at + id_bytes], "utf-8"),
+        layer=str(page[layer_at : layer_at + layer_bytes], "utf-8"),
+        columns=tuple(columns),
+        rows=rows,
+        box=(min_x, min_y, max_x, max_y),
+        header_bytes=header_bytes,
+        total_bytes=total_bytes,
+        z_min=z_min,
+        z_max=z_max,
+        origin=(origin_x, origin_y, origin_z),
+        source_points=source_points,
+        dropped_points=dropped_points,
+        source=SourceStamp(source_size, source_mtime_ns, source_ctime_ns),
+        source_digest=digest,
+        builder_version=builder_version,
+        frame_id=str(page[frame_at : frame_at + frame_bytes], "utf-8"),
+    )

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names in the shared-memory directory.
+
+``/shmmap.<instance>.<unique>`` is a published segment; ``<unique>`` is 64 random bits, handed out
+by the daemon and never used again.  ``/shmmap.<instance>.<unique>.zombie`` is the same segment once
+retired: new readers cannot find it, old ones keep it.  ``/shmmap.<instance>.statistics`` is the one
+name that can be derived.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from typing import Final
+
+from shmmap.errors import ConfigError
+
+__all__ = [
+    "check_instance",
+    "is_zombie",
+    "new_segment_name",
+    "segment_prefix",
+    "statistics_name",
+    "zombie_name",
+]
+
+_INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_ZOMBIE: Final = ".zombie"
+
+
+def check_instance(instance: str) -> str:
+    """Return ``instance``, or raise `ConfigError` if it cannot be part of a name."""
+    if not _INSTANCE.fullmatch(instance):
+        raise ConfigError(
+            f"instance name {instance!r} is not usable",
+            key="instance",
+            hint="use 1 to 64 letters, digits, '-' or '_'",
+        )
+    return instance
+
+
+def segment_prefix(instance: str) -> str:
+    """Return what every name of this instance starts with, slash included."""
+    return f"/shmmap.{instance}."
+
+
+def statistics_name(instance: str) -> str:
+    """Return the name of the instance's statistics segment."""
+    return f"/shmmap.{instance}.statistics"
+
+
+def new_segment_name(instance: str) -> str:
+    """Return a name that was never used before."""
+    return f"/shmmap.{instance}.{secrets.token_hex(8)}"
+
+
+def zombie_name(name: str) -> str:
+    """Return the name a segment gets when it is retired."""
+    return name + _ZOMBIE
+
+
+def is_zombie(name: str) -> bool:
+    """Whether ``name`` is that of a retired segment."""
+    return name.endswith(_ZOMBIE)
