@@ -1,0 +1,403 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The header of a PCD file: read liberally, checked against the file's size before anything is allocated.
+
+The format is that of the Point Cloud Library (https://pointclouds.org/documentation/tutorials/pcd_file_format.html).
+Accepted beyond it, because such files exist: any order of lines, lower-case keys, a byte order mark,
+CRLF, comments, unknown lines, missing VERSION, COUNT, VIEWPOINT, POINTS or WIDTH and HEIGHT.
+What is merely odd becomes a warning; what leaves the meaning open is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Final, NoReturn
+
+import numpy as np
+
+from shmmap.formats.causes import refusal
+
+__all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdField", "PcdHeader", "parse_header"]
+
+HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within these
+MAX_POINTS: Final = (1 << 32) - 1  # WIDTH and HEIGHT are uint32 in PCL
+MAX_POINT_BYTES: Final = 1 << 20
+MAX_FIELDS: Final = 1024
+MAX_NAME_BYTES: Final = 40  # of a column in a segment
+ENCODINGS: Final = ("ascii", "binary", "binary_compressed")
+IDENTITY_VIEWPOINT: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+PADDING: Final = "_"
+
+_DTYPES: Final[dict[tuple[str, int], np.dtype[np.generic]]] = {
+    (kind.upper(), size): np.dtype(f"<{kind}{size}")
+    for kind, sizes in (("f", (4, 8)), ("u", (1, 2, 4, 8)), ("i", (1, 2, 4, 8)))
+    for size in sizes
+}
+_KEYS: Final = frozenset(
+    (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
+)
+_ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # the name of FIELDS in the oldest files; PCL reads it too
+_BOM: Final = b"\xef\xbb\xbf"
+_LFS: Final = b"version https://git-lfs"
+_INTEGER: Final = re.compile(rb"[+-]?[0-9]{1,19}\Z")
+
+
+@dataclass(frozen=True, slots=True)
+class PcdField:
+    """One field of the header.
+
+    Attributes
+    ----------
+    name
+        Unique name: duplicates carry a number, ``x``, ``y`` and ``z`` are in lower case.
+    dtype
+        Little-endian type of one value.
+    count
+        Values per point; 0 only for padding.
+    padding
+        True for fields named ``_``, whose bytes mean nothing.
+    file_name
+        The name as the file has it.
+    """
+
+    name: str
+    dtype: np.dtype[np.generic]
+    count: int
+    padding: bool
+    file_name: str
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one point's values."""
+        return self.dtype.itemsize * self.count
+
+
+@dataclass(frozen=True, slots=True)
+class PcdHeader:
+    """What a PCD header says, after all checks.
+
+    Attributes
+    ----------
+    fields
+        In file order, padding included.
+    width, height, points
+        As in the file; where they disagree, ``points`` counts and a warning says so.
+    encoding
+        ``ascii``, ``binary`` or ``binary_compressed``.
+    viewpoint
+        Translation x y z in metres, then quaternion w x y z.  Never applied to the points.
+    version
+        The text after VERSION, empty if missing.
+    data_offset
+        Byte offset of the first byte after the DATA line.
+    point_bytes
+        Bytes of one point in ``binary``, padding included.
+    warnings
+        Oddities that did not prevent reading.
+    """
+
+    fields: tuple[PcdField, ...]
+    width: int
+    height: int
+    points: int
+    encoding: str
+    viewpoint: tuple[float, float, float, float, float, float, float]
+    version: str
+    data_offset: int
+    point_bytes: int
+    warnings: tuple[str, ...]
+
+
+def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
+    """Parse the header at the start of ``head``.
+
+    Parameters
+    ----------
+    head
+        The file's first bytes, at least min(file_bytes, `HEADER_LIMIT_BYTES`) of them unless the
+        whole header lies in fewer.
+    path
+        For messages.
+    file_bytes
+        Size of the whole file.
+
+    Raises
+    ------
+    MapDataError
+        With a cause from `shmmap.formats.causes`.
+    """
+    if file_bytes == 0 or not head:
+        raise refusal("empty_file", "the file is empty (0 bytes)", path=path, offset=0)
+    if head.startswith(_LFS):
+        raise refusal(
+            "lfs_pointer",
+            "a git-lfs pointer instead of the data",
+            path=path,
+            offset=0,
+            hint="run git lfs pull",
+        )
+    return _HeaderParser(head, path, file_bytes).parse()
+
+
+class _HeaderParser:
+    """The lines of one header, and the checks between them."""
+
+    def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
+        self.head = head
+        self.path = path
+        self.file_bytes = file_bytes
+        self.values: dict[bytes, list[bytes]] = {}
+        self.offsets: dict[bytes, int] = {}
+        self.warnings: list[str] = []
+
+    def parse(self) -> PcdHeader:
+        data_offset = self._read_lines()
+        fields = self._fields()
+        width, height, points = self._extent()
+        encoding = self._encoding()
+        point_bytes = sum(field.row_bytes for field in fields)
+        if point_bytes > MAX_POINT_BYTES:
+            self._refuse(b"COUNT", f"a point of {point_bytes} bytes; the limit is {MAX_POINT_BYTES}")
+        header = PcdHeader(
+            fields=fields,
+            width=width,
+            height=height,
+            points=points,
+            encoding=encoding,
+            viewpoint=self._viewpoint(),
+            version=b" ".join(self.values.get(b"VERSION", [])).decode("latin-1"),
+            data_offset=data_offset,
+            point_bytes=point_bytes,
+            warnings=tuple(self.warnings),
+        )
+        _check_size(header, self.path, self.file_bytes)
+        return header
+
+    def _refuse(self, key: bytes, message: str, cause: str = "bad_header") -> NoReturn:
+        raise refusal(cause, message, path=self.path, offset=self.offsets.get(key, 0))
+
+    def _read_lines(self) -> int:
+        """Collect the header's lines; returns the offset of the first data byte."""
+        offset = self._collect_lines()
+        if offset is None:
+            self._refuse_without_data_line()
+        return offset
+
+    def _collect_lines(self) -> int | None:
+        """Fill ``values``; None where the header stops without a DATA line."""
+        head, at, lower, unknown = self.head[:HEADER_LIMIT_BYTES], 0, False, 0
+        if head.startswith(_BOM):
+            at = len(_BOM)
+            self.warnings.append("the file starts with a UTF-8 byte order mark")
+        while at < len(head):
+            end = head.find(b"\n", at)
+            stop = len(head) if end < 0 else end
+            words = head[at:stop].split()
+            start, at = at, stop + 1
+            if end < 0 and len(self.head) < self.file_bytes:
+                break
+            if not words or words[0].startswith(b"#"):
+                continue
+            key = words[0].upper()
+            key = _ALIASES.get(key, key)
+            if key not in _KEYS:
+                if not self.values:
+                    break
+                unknown += 1
+                if unknown <= 3:
+                    text = words[0][:40].decode("latin-1")
+                    self.warnings.append(f"unknown header line {text!r} at byte {start} ignored")
+                continue
+            lower = lower or words[0] != words[0].upper()
+            if key in self.values:
+                if self.values[key] != words[1:]:
+                    self._refuse(key, f"two different {key.decode()} lines, the second at byte {start}")
+                self.warnings.append(f"the {key.decode()} line is there twice")
+            self.values[key] = words[1:]
+            self.offsets[key] = start
+            if key == b"DATA":
+                if lower:
+                    self.warnings.append("header keys are in lower case")
+                return min(at, len(self.head))
+        return None
+
+    def _refuse_without_data_line(self) -> NoReturn:
+        if not self.head.strip(b"\0"):
+            raise refusal("zero_filled", "nothing but zero bytes", path=self.path, offset=0)
+        if not self.values:
+            raise refusal(
+                "not_pcd", "not a PCD file: no PCD header line at its start", path=self.path, offset=0
+            )
+        if len(self.head) < HEADER_LIMIT_BYTES:
+            raise refusal(
+                "truncated",
+                "the file ends inside its header: no DATA line",
+                path=self.path,
+                offset=len(self.head),
+            )
+        raise refusal(
+            "bad_header",
+            f"no DATA line within {HEADER_LIMIT_BYTES} bytes",
+            path=self.path,
+            offset=HEADER_LIMIT_BYTES,
+        )
+
+    def _need(self, key: bytes) -> list[bytes]:
+        if key not in self.values:
+            self._refuse(key, f"the header has no {key.decode()} line")
+        return self.values[key]
+
+    def _integer(self, key: bytes, word: bytes, low: int) -> int:
+        if not _INTEGER.match(word):
+            self._refuse(key, f"{key.decode()}: {word[:40].decode('latin-1')!r} is not an integer")
+        value = int(word)
+        if value < low:
+            self._refuse(key, f"{key.decode()} is {value}, at least {low} is needed")
+        return value
+
+    def _single(self, key: bytes) -> int | None:
+        words = self.values.get(key)
+        if words is None:
+            return None
+        if len(words) != 1:
+            self._refuse(key, f"{key.decode()} has {len(words)} values instead of one")
+        return self._integer(key, words[0], 0)
+
+    def _fields(self) -> tuple[PcdField, ...]:
+        names = self._need(b"FIELDS")
+        if not 0 < len(names) <= MAX_FIELDS:
+            self._refuse(b"FIELDS", f"{len(names)} fields; 1 to {MAX_FIELDS} can be read")
+        columns = [self._need(b"SIZE"), self._need(b"TYPE"), self.values.get(b"COUNT", [b"1"] * len(names))]
+        for key, words in zip((b"SIZE", b"TYPE", b"COUNT"), columns, strict=True):
+            if len(words) != len(names):
+                self._refuse(key, f"{len(names)} FIELDS, but {len(words)} values in {key.decode()}")
+        decoded = [_field_name(name) for name in names]
+        unique = self._unique_names(decoded)
+        fields = []
+        for file_name, name, size, kind, count in zip(decoded, unique, *columns, strict=True):
+            padding = file_name == PADDING
+            dtype = _DTYPES.get((kind.upper().decode("latin-1"), self._integer(b"SIZE", size, 0)))
+            if dtype is None:
+                text = f"{kind[:8].decode('latin-1')}{size.decode()}"
+                self._refuse(
+                    b"TYPE", f"field {file_name!r} is of type {text!r}, which PCD does not have", "bad_type"
+                )
+            fields.append(
+                PcdField(name, dtype, self._integer(b"COUNT", count, 0 if padding else 1), padding, file_name)
+            )
+        self._check_xyz(fields)
+        return tuple(fields)
+
+    def _unique_names(self, names: list[str]) -> list[str]:
+        """Lower-case x, y and z, number duplicates, cut names to what a segment holds; warn of each."""
+        for name in names:
+            if not name.isprintable():
+                self._refuse(b"FIELDS", f"field name {name!r} has unprintable characters")
+        renamed = list(names)
+        for axis in ("x", "y", "z"):
+            if axis not in names and axis.upper() in names:
+                renamed[names.index(axis.upper())] = axis
+                self.warnings.append(f"field {axis.upper()!r} is taken as {axis!r}")
+        taken = {"xyz"}  # the name of the column that x, y and z become
+        original = set(renamed)
+        for index, name in enumerate(renamed):
+            if name == PADDING:
+                continue
+            short = name.encode()[:MAX_NAME_BYTES].decode(errors="ignore")
+            number, new = 2, short
+            while new in taken or (new != name and new in original):
+                suffix = f"_{number}"
+                new = short.encode()[: MAX_NAME_BYTES - len(suffix)].decode(errors="ignore") + suffix
+                number += 1
+            taken.add(new)
+            renamed[index] = new
+            if new != name:
+                self.warnings.append(f"field {name!r} renamed {new!r}: the name is in use or too long")
+        return renamed
+
+    def _check_xyz(self, fields: list[PcdField]) -> None:
+        counts = {field.name: field.count for field in fields if field.name in ("x", "y", "z")}
+        missing = [axis for axis in ("x", "y", "z") if axis not in counts]
+        if missing:
+            self._refuse(
+                b"FIELDS", f"no field {', '.join(missing)}: not a cloud of points in space", "no_xyz"
+            )
+        if any(count != 1 for count in counts.values()):
+            self._refuse(b"COUNT", "x, y and z need COUNT 1", "no_xyz")
+
+    def _extent(self) -> tuple[int, int, int]:
+        width, height, points = self._single(b"WIDTH"), self._single(b"HEIGHT"), self._single(b"POINTS")
+        if points is None:
+            if width is None:
+                self._refuse(b"POINTS", "neither POINTS nor WIDTH: the number of points is unknown")
+            height = 1 if height is None else height
+            points = width * height
+        elif width is None:
+            width, height = points, 1
+        else:
+            height = 1 if height is None else height
+            if width * height != points:
+                self.warnings.append(f"WIDTH {width} x HEIGHT {height} is not POINTS {points}: POINTS counts")
+        if points > MAX_POINTS:
+            self._refuse(b"POINTS", f"{points} points; the format ends at {MAX_POINTS}", "too_many_points")
+        return width, height, points
+
+    def _encoding(self) -> str:
+        words = self.values[b"DATA"]
+        name = words[0].decode("latin-1").lower() if words else ""
+        if name not in ENCODINGS:
+            self._refuse(
+                b"DATA", f"DATA {name[:40]!r} is not one of {', '.join(ENCODINGS)}", "unknown_encoding"
+            )
+        if len(words) > 1:
+            self.warnings.append("something follows the encoding on the DATA line")
+        return name
+
+    def _viewpoint(self) -> tuple[float, float, float, float, float, float, float]:
+        words = self.values.get(b"VIEWPOINT")
+        if words is None:
+            return IDENTITY_VIEWPOINT
+        if len(words) != 7:
+            self._refuse(b"VIEWPOINT", f"VIEWPOINT has {len(words)} numbers instead of 7")
+        numbers = []
+        for word in words:
+            try:
+                number = float(word) if b"_" not in word else math.nan
+            except ValueError:
+                number = math.nan
+            if not math.isfinite(number):
+                self._refuse(
+                    b"VIEWPOINT", f"VIEWPOINT: {word[:40].decode('latin-1')!r} is not a finite number"
+                )
+            numbers.append(number)
+        x, y, z, qw, qx, qy, qz = numbers
+        if (x, y, z, abs(qw), qx, qy, qz) != IDENTITY_VIEWPOINT:
+            self.warnings.append("VIEWPOINT is not the identity; the points are left as they are")
+        return x, y, z, qw, qx, qy, qz
+
+
+def _field_name(name: bytes) -> str:
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        return name.decode("latin-1")
+
+
+def _check_size(header: PcdHeader, path: str, file_bytes: int) -> None:
+    """Refuse a header that promises more than the file can hold, before anybody allocates for it."""
+    left = file_bytes - header.data_offset
+    if header.encoding == "binary":
+        needed, what = header.points * header.point_bytes, "bytes of points"
+    elif header.encoding == "ascii":
+        values = sum(field.count for field in header.fields)
+        needed, what = header.points * 2 * values - 1, "characters at least"
+    else:
+        needed, what = 8 if header.points else 0, "bytes of sizes"
+    if needed > left:
+        raise refusal(
+            "truncated",
+            f"{header.points} points need {needed} {what}, but {left} bytes follow the header",
+            path=path,
+            offset=file_bytes,
+        )

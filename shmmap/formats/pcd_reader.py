@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads a PCD file straight into columns, block by block, in bounded memory.
+
+The first column is ``xyz``, (N, 3); every other field follows as a column of its own, with its own
+dtype.  Points whose x, y or z is not finite are left out and counted.  While reading, the bounds of
+the points and the XXH3-128 digest of the whole file are taken along.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.columns import ColumnSpec
+from shmmap.formats.causes import refusal
+from shmmap.formats.finite import Bounds
+from shmmap.formats.pcd_ascii import ascii_blocks
+from shmmap.formats.pcd_binary import binary_blocks, compressed_blocks
+from shmmap.formats.pcd_header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
+from shmmap.formats.pcd_table import FieldTable
+from shmmap.formats.source_file import SourceFile
+
+__all__ = ["Block", "PcdReader"]
+
+Block = tuple[NDArray[Any], ...]
+
+_FIRST_READ_BYTES: Final = 2048  # holds nearly every header
+_DATA_LINE: Final = re.compile(rb"^[ \t]*DATA[^\n]*\n", re.MULTILINE | re.IGNORECASE)
+_TAIL_READ_BYTES: Final = 1 << 18
+
+
+class PcdReader:
+    """A PCD file, opened and its header checked; `blocks` reads the points.
+
+    Parameters
+    ----------
+    file
+        A path, or an open file descriptor (which stays open and whose position does not matter).
+    keep_non_finite
+        Keep points whose x, y or z is NaN or infinite.
+    block_points
+        Upper limit of rows per block; blocks of wide points are smaller.
+    path
+        The name used in messages when ``file`` is a descriptor.
+
+    Attributes
+    ----------
+    header
+        The checked `PcdHeader`.
+    columns
+        What `blocks` yields, in order.  ``xyz`` has the file's own type, float32 or float64;
+        mixed and integer coordinates are promoted to the smallest of both that holds every value
+        (8 and 16-bit integers float32, wider ones float64).
+    kept, dropped
+        Points yielded and left out so far.
+    digest
+        XXH3-128 of the whole file (16 bytes, canonical order); empty until `blocks` is exhausted.
+
+    Raises
+    ------
+    MapDataError
+        From the constructor and from `blocks`, with a cause from `shmmap.formats.causes`.
+    """
+
+    def __init__(
+        self,
+        file: str | os.PathLike[str] | int,
+        *,
+        keep_non_finite: bool = False,
+        block_points: int = 1 << 14,
+        path: str = "",
+    ) -> None:
+        self.path = path or (f"<descriptor {file}>" if isinstance(file, int) else os.fspath(file))
+        self._owned = not isinstance(file, int)
+        self._fd = file if isinstance(file, int) else _open(self.path)
+        try:
+            self._source = SourceFile(self._fd, self.path)
+            self.header: PcdHeader = self._read_header()
+        except BaseException:
+            self.close()
+            raise
+        self._keep = keep_non_finite
+        self._block_points = max(1, block_points)
+        self._table = FieldTable(self.header)
+        self._bounds = Bounds()
+        self._warnings: list[str] = []
+        self.columns: tuple[ColumnSpec, ...] = self._table.columns
+        self.kept = 0
+        self.dropped = 0
+        self.digest = b""
+
+    def __enter__(self) -> PcdReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file if this reader opened it."""
+        if self._owned and self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(min_xyz, max_xyz) of the finite points read so far, metres, map frame; NaN when there are none."""
+        return self._bounds.result()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Oddities of the header and of the data read so far."""
+        return (*self.header.warnings, *self._warnings)
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the points, one C-contiguous array per column, all with the same number of rows.
+
+        The arrays are reused: a consumer that keeps one copies it.  Another call reads the file
+        again from its start.
+        """
+        header, source = self.header, self._source
+        self.kept = self.dropped = 0
+        self.digest = b""
+        self._bounds = Bounds()
+        self._warnings.clear()
+        source.start(header.data_offset)
+        if header.encoding == "binary":
+            raw = binary_blocks(source, self._table, self._block_points)
+        elif header.encoding == "ascii":
+            raw = ascii_blocks(source, self._table, self._block_points, self._warnings)
+        else:
+            raw = compressed_blocks(source, self._table, self._block_points)
+        for block in raw:
+            mask = self._bounds.add(block[0])
+            if mask is None or self._keep:
+                kept = block
+            else:
+                kept = tuple(column[mask] for column in block)
+                self.dropped += len(mask) - len(kept[0])
+            if len(kept[0]):
+                self.kept += len(kept[0])
+                yield kept
+        left = source.left
+        if left and header.encoding != "ascii":
+            self._warnings.append(f"{left} bytes after the last point ignored")
+        while source.left:
+            source.read(min(source.left, _TAIL_READ_BYTES))
+        self.digest = source.digest()
+
+    def _read_header(self) -> PcdHeader:
+        size = self._source.size
+        head = self._source.peek(min(size, _FIRST_READ_BYTES))
+        if len(head) < size and not _DATA_LINE.search(head):
+            head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
+        return parse_header(head, path=self.path, file_bytes=size)
+
+
+def _open(path: str) -> int:
+    """Open a file for reading; a pipe must not block, so O_NONBLOCK until we know what it is."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise refusal("missing", "no such file", path=path) from None
+    except (OSError, ValueError) as error:
+        raise refusal("unreadable", f"cannot be opened: {error}", path=path) from error
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        with contextlib.suppress(OSError):
+            os.close(fd)
+        raise refusal("not_regular", "not a regular file", path=path)
+    return fd

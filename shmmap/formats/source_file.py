@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A file read once from front to back, digested on the way."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NoReturn
+
+import numpy as np
+import xxhash
+from numpy.typing import NDArray
+
+from shmmap.formats.causes import refusal
+
+__all__ = ["SourceFile"]
+
+
+class SourceFile:
+    """Sequential reads of an open file by ``pread``, every byte passing through XXH3-128 once.
+
+    Attributes
+    ----------
+    size
+        Bytes of the file when it was opened.
+    at
+        Offset of the next byte to be read.
+    """
+
+    def __init__(self, fd: int, path: str) -> None:
+        self._fd = fd
+        self.path = path
+        try:
+            self.size = os.fstat(fd).st_size
+        except OSError as error:
+            raise refusal("unreadable", f"cannot be read: {error}", path=path) from error
+        self.at = 0
+        self._hash = xxhash.xxh3_128()
+        self._buffer: NDArray[np.uint8] = np.empty(0, np.uint8)
+
+    @property
+    def left(self) -> int:
+        """Bytes not read yet."""
+        return self.size - self.at
+
+    def peek(self, count: int) -> bytes:
+        """Return up to ``count`` bytes from the start of the file, without digesting them."""
+        try:
+            return os.pread(self._fd, count, 0)
+        except OSError as error:
+            self._unreadable(error)
+
+    def start(self, offset: int) -> None:
+        """Digest everything before ``offset`` and go on from there."""
+        self.at = 0
+        self._hash.reset()
+        self.read(offset)
+
+    def read(self, count: int) -> NDArray[np.uint8]:
+        """Return the next ``count`` bytes in a buffer that the next call reuses.
+
+        Raises
+        ------
+        MapDataError
+            ``truncated`` if the file has become shorter than it was when opened.
+        """
+        if len(self._buffer) < count:
+            self._buffer = np.empty(count, np.uint8)
+        part = self._buffer[:count]
+        self._read_into(part.data)
+        return part
+
+    def read_bytes(self, count: int) -> bytes:
+        """Return the next ``count`` bytes as an object of their own."""
+        try:
+            data = os.pread(self._fd, count, self.at)
+        except OSError as error:
+            self._unreadable(error)
+        if len(data) < count:  # one pread returns at most 2 GiB
+            rest = bytearray(data)
+            rest.extend(bytes(count - len(data)))
+            self.at += len(data)
+            self._hash.update(data)
+            self._read_into(memoryview(rest)[len(data) :])
+            return bytes(rest)
+        self.at += count
+        self._hash.update(data)
+        return data
+
+    def digest(self) -> bytes:
+        """XXH3-128 of everything read so far."""
+        return bytes(self._hash.digest())
+
+    def _read_into(self, view: memoryview[Any]) -> None:
+        at = 0
+        while at < len(view):
+            try:
+                got = os.preadv(self._fd, [view[at:]], self.at + at)
+            except OSError as error:
+                self._unreadable(error)
+            if got == 0:
+                raise refusal(
+                    "truncated",
+                    "the file became shorter while being read",
+                    path=self.path,
+                    offset=self.at + at,
+                )
+            at += got
+        self._hash.update(view)
+        self.at += at
+
+    def _unreadable(self, error: OSError) -> NoReturn:
+        raise refusal("unreadable", f"cannot be read: {error}", path=self.path, offset=self.at) from error
