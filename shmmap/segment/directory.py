@@ -74,6 +74,11 @@ class ShmDirectory:
         if gid >= 0:
             os.fchown(fd, -1, gid)
         os.fchmod(fd, mode)
+        self.link(fd, name)
+        return measured_bytes(fd)
+
+    def link(self, fd: int, name: str) -> None:
+        """Give an unnamed file a name; FileExistsError if there is such a name."""
         # src_dir_fd makes CPython call linkat(2); link(2) would try to link the symlink in /proc
         os.link(
             f"/proc/self/fd/{fd}",
@@ -82,7 +87,6 @@ class ShmDirectory:
             dst_dir_fd=self._fd,
             follow_symlinks=True,
         )
-        return measured_bytes(fd)
 
     def open(self, name: str) -> int:
         """Open a segment for reading; close it at once, an open file looks like a pin."""

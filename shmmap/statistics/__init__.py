@@ -1,1 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
+"""What the daemon tells about itself without being asked: counters and resident cells in shared memory."""

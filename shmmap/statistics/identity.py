@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which daemon writes the statistics, and whether that very process still lives.
+
+A process id alone may belong to somebody else by now; with the process's start time it cannot.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from typing import Final, Literal, TypeAlias
+
+from shmmap.errors import SegmentCorrupt
+
+__all__ = ["DaemonIdentity", "DaemonState", "judge", "pid_namespace", "process_state", "start_time_ticks"]
+
+DaemonState: TypeAlias = Literal["healthy", "stopped", "hung", "dead"]
+
+BEAT_INTERVAL_S: Final = 0.5
+"""The daemon beats at least this often, however idle it is."""
+
+HUNG_AFTER_S: Final = 5.0
+"""A running daemon without a beat for this long is called hung."""
+
+
+def _stat_fields(pid: int) -> list[str]:
+    with open(f"/proc/{pid}/stat", "rb") as file:
+        text = file.read().decode("utf-8", "replace")
+    return text[text.rindex(")") + 2 :].split()  # the command before it may hold spaces and brackets
+
+
+def start_time_ticks(pid: int) -> int:
+    """Return when a process started, in clock ticks since boot (field 22 of ``/proc/PID/stat``)."""
+    return int(_stat_fields(pid)[19])
+
+
+def pid_namespace() -> int:
+    """Return the inode of this process's pid namespace; 0 where /proc does not tell."""
+    try:
+        return os.stat("/proc/self/ns/pid").st_ino
+    except OSError:
+        return 0
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonIdentity:
+    """One life of the daemon and what it serves.
+
+    Attributes
+    ----------
+    pid, start_time_ticks, pid_namespace
+        The process: id, start in clock ticks since boot, inode of the namespace the id is valid in.
+    epoch
+        64-bit number of this life.
+    instance, endpoint, shm_dir
+        Name of the instance, path of its socket, directory of its segments.
+    map_path, map_version, frame_id
+        The map as configured, 64-bit hash of its catalogue, frame of its coordinates.
+    id_prefix
+        What the ids of the cell table lack in front.
+    library_version
+        Version of shmmap the daemon runs.
+    started_unix_ns
+        Wall-clock start of this life.
+    """
+
+    pid: int
+    start_time_ticks: int
+    pid_namespace: int
+    epoch: int
+    instance: str
+    endpoint: str
+    map_path: str
+    map_version: int
+    shm_dir: str
+    id_prefix: str
+    library_version: str
+    started_unix_ns: int
+    frame_id: str = "map"
+
+    def to_bytes(self) -> bytes:
+        """Return name and value of every attribute, each ended by a NUL."""
+        parts = []
+        for field in fields(self):
+            parts += [field.name.encode(), os.fsencode(str(getattr(self, field.name)))]
+        return b"".join(part + b"\0" for part in parts)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> DaemonIdentity:
+        """Return the identity; names this version does not know are left out.
+
+        Raises
+        ------
+        SegmentCorrupt
+            If a name is missing or a number is none.
+        """
+        parts = data.split(b"\0")
+        found = {
+            name.decode("utf-8", "replace"): os.fsdecode(value)
+            for name, value in zip(parts[::2], parts[1::2], strict=False)
+        }
+        try:
+            return cls(
+                pid=int(found["pid"]),
+                start_time_ticks=int(found["start_time_ticks"]),
+                pid_namespace=int(found["pid_namespace"]),
+                epoch=int(found["epoch"]),
+                instance=found["instance"],
+                endpoint=found["endpoint"],
+                map_path=found["map_path"],
+                map_version=int(found["map_version"]),
+                shm_dir=found["shm_dir"],
+                id_prefix=found["id_prefix"],
+                library_version=found["library_version"],
+                started_unix_ns=int(found["started_unix_ns"]),
+                frame_id=found.get("frame_id", "map"),
+            )
+        except (KeyError, ValueError) as error:
+            raise SegmentCorrupt(f"the statistics' identity is damaged: {error}") from error
+
+
+def process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", "dead", "unknown"]:
+    """Return what the kernel says of the process that had this id and start time.
+
+    ``unknown`` where /proc hides other users' processes.
+    """
+    try:
+        found = _stat_fields(pid)
+    except (FileNotFoundError, ProcessLookupError):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return "dead"
+        except PermissionError:
+            pass
+        return "unknown"
+    except PermissionError:
+        return "unknown"
+    if int(found[19]) != start_ticks or found[0] in "ZXx":
+        return "dead"
+    return "stopped" if found[0] in "Tt" else "running"
+
+
+def judge(identity: DaemonIdentity, beat_age_s: float) -> DaemonState:
+    """Return how the daemon is, from its process and the age of its last beat in seconds."""
+    if identity.pid_namespace and identity.pid_namespace != pid_namespace():
+        process: str = "unknown"  # its pid means another process here: only the beat tells
+    else:
+        process = process_state(identity.pid, identity.start_time_ticks)
+    if process == "dead":
+        return "dead"
+    if process == "stopped":
+        return "stopped"
+    return "healthy" if beat_age_s <= HUNG_AFTER_S else "hung"

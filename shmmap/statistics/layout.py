@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bytes of the statistics segment; ``STATISTICS.md`` is the byte-exact document.
+
+Only the standard library is imported here: a program that shows the statistics starts fast.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from shmmap.errors import SegmentCorrupt
+from shmmap.statistics.counters import Counter
+
+__all__ = [
+    "CELL_STATES",
+    "LAYOUT_VERSION",
+    "CellRow",
+    "Header",
+    "State",
+    "pack_header",
+    "pack_identity",
+    "pack_row",
+    "pack_state",
+    "plan",
+    "unpack_header",
+    "unpack_identity",
+    "unpack_row",
+    "unpack_state",
+]
+
+MAGIC: Final = b"SHMSTAT\x01"
+LAYOUT_VERSION: Final = (1, 0)
+BYTE_ORDER: Final = 0x01020304
+PAGE_BYTES: Final = 4096
+MAX_ROWS: Final = 1 << 17  # 32 MiB of rows; more cells than that are counted, not listed
+
+START: Final = struct.Struct("<8sHHI12I")
+DESCRIPTION: Final = struct.Struct("<32s16sB111s")
+IDENTITY: Final = struct.Struct("<QII")
+IDENTITY_BYTES: Final = 16384
+STATE: Final = struct.Struct("<QqqIIII")
+CRC: Final = struct.Struct("<I4x")
+TABLE: Final = struct.Struct("<Q")
+ROW: Final = struct.Struct("<QQQ4dQqq16sBBHHH40s104sI")
+ROW_BYTES: Final = 256
+
+KINDS: Final = ("counter", "gauge")
+CELL_STATES: Final = ("free", "resident", "stale", "zombie")
+ID_BYTES: Final = 104
+LAYER_BYTES: Final = 40
+ID_CUT: Final = 1
+LAYER_CUT: Final = 2
+
+
+@dataclass(slots=True)
+class CellRow:
+    """One segment the daemon keeps.
+
+    Attributes
+    ----------
+    id
+        Cell id without the daemon's ``id_prefix``.  Of an id longer than 104 bytes of UTF-8 the
+        table keeps only the end, and ``id_cut`` says so.
+    layer
+        Layer spec; of one longer than 40 bytes only the beginning is kept (``layer_cut``).
+    version
+        64-bit version of the cell.
+    segment
+        Segment name without the prefix ``/shmmap.<instance>.``, at most 16 bytes.
+    state
+        ``resident``, ``stale`` or ``zombie``.
+    bytes
+        Memory it occupies, as measured.
+    points
+        Rows of its columns.
+    box
+        (min_x, min_y, max_x, max_y), metres, map frame.
+    hits
+        How often it was handed out.
+    last_use_monotonic_ns
+        When it was last handed out, CLOCK_MONOTONIC.
+    load_ns
+        How long loading it took.
+    """
+
+    id: str
+    layer: str
+    version: int
+    segment: str
+    state: str
+    bytes: int
+    points: int
+    box: tuple[float, float, float, float]
+    hits: int = 0
+    last_use_monotonic_ns: int = 0
+    load_ns: int = 0
+    id_cut: bool = False
+    layer_cut: bool = False
+
+
+class Header(NamedTuple):
+    """Where things lie, and what the counters mean."""
+
+    counters: tuple[Counter, ...]
+    identity_offset: int
+    identity_bytes: int
+    state_offset: int
+    state_bytes: int
+    table_offset: int
+    rows_offset: int
+    row_bytes: int
+    max_rows: int
+
+
+class State(NamedTuple):
+    """What one beat wrote."""
+
+    sequence: int
+    beat_monotonic_ns: int
+    beat_unix_ns: int
+    rows_used: int
+    rows_missing: int
+    values: tuple[int, ...]
+
+
+def _up(value: int, step: int) -> int:
+    return -(-value // step) * step
+
+
+def plan(counters: Sequence[Counter]) -> Header:
+    """Lay out a segment for these counters."""
+    identity_offset = _up(START.size + len(counters) * DESCRIPTION.size, 64)
+    state_offset = identity_offset + 2 * IDENTITY_BYTES
+    state_bytes = _up(STATE.size + 8 * len(counters) + CRC.size, 64)
+    table_offset = state_offset + 2 * state_bytes
+    return Header(
+        counters=tuple(counters),
+        identity_offset=identity_offset,
+        identity_bytes=IDENTITY_BYTES,
+        state_offset=state_offset,
+        state_bytes=state_bytes,
+        table_offset=table_offset,
+        rows_offset=_up(table_offset + 64, PAGE_BYTES),
+        row_bytes=ROW_BYTES,
+        max_rows=MAX_ROWS,
+    )
+
+
+def pack_header(header: Header) -> bytes:
+    """Return the bytes that never change: offsets and descriptions of the counters."""
+    described = b"".join(
+        DESCRIPTION.pack(c.name.encode(), c.unit.encode(), KINDS.index(c.kind), c.help.encode())
+        for c in header.counters
+    )
+    start = START.pack(
+        MAGIC, *LAYOUT_VERSION, BYTE_ORDER, START.size, len(header.counters), DESCRIPTION.size,
+        *header[1:], 0,
+    )[:-4]  # fmt: skip
+    return start + struct.pack("<I", zlib.crc32(described, zlib.crc32(start))) + described
+
+
+def unpack_header(data: bytes) -> Header:
+    """Read the start of a statistics segment.
+
+    Raises
+    ------
+    SegmentCorrupt
+        If it is none, has another major layout version, or contradicts itself.
+    """
+    if len(data) < START.size:
+        raise SegmentCorrupt(f"a statistics segment of {len(data)} bytes is shorter than its header")
+    magic, major, minor, order, at, count, row, *places, crc = START.unpack_from(data)
+    if magic != MAGIC:
+        raise SegmentCorrupt(f"not a statistics segment: it starts with {magic!r}")
+    if major != LAYOUT_VERSION[0]:
+        raise SegmentCorrupt(
+            f"statistics layout {major}.{minor}, this program reads {LAYOUT_VERSION[0]}.x",
+            hint="update the older of daemon and program",
+        )
+    if order != BYTE_ORDER:
+        raise SegmentCorrupt("the statistics were written on a machine of other byte order")
+    end = at + count * row
+    if at < START.size or row < DESCRIPTION.size or end > len(data):
+        raise SegmentCorrupt("the statistics' counter table lies outside the segment")
+    if crc != zlib.crc32(data[at:end], zlib.crc32(data[: START.size - 4])):
+        raise SegmentCorrupt("the statistics' header checksum does not match")
+    counters = []
+    for index in range(count):
+        name, unit, kind, text = DESCRIPTION.unpack_from(data, at + index * row)
+        counters.append(
+            Counter(
+                name.rstrip(b"\0").decode(),
+                "gauge" if kind else "counter",
+                unit.rstrip(b"\0").decode(),
+                text.rstrip(b"\0").decode(),
+            )
+        )
+    return Header(tuple(counters), *places)
+
+
+def pack_identity(sequence: int, payload: bytes, size: int) -> bytes:
+    """Return one of the two identity blocks.
+
+    Raises
+    ------
+    ValueError
+        If the payload does not fit ``size`` bytes.
+    """
+    if IDENTITY.size + len(payload) > size:
+        raise ValueError(f"an identity of {len(payload)} bytes does not fit {size}")
+    crc = zlib.crc32(payload, zlib.crc32(struct.pack("<QI", sequence, len(payload))))
+    return IDENTITY.pack(sequence, len(payload), crc) + payload
+
+
+def unpack_identity(data: bytes) -> tuple[int, bytes] | None:
+    """Return sequence and payload of an identity block; None if it was never written or is torn."""
+    sequence, length, crc = IDENTITY.unpack_from(data)
+    payload = data[IDENTITY.size : IDENTITY.size + length]
+    if not sequence or len(payload) != length:
+        return None
+    if crc != zlib.crc32(payload, zlib.crc32(struct.pack("<QI", sequence, length))):
+        return None
+    return sequence, payload
+
+
+def pack_state(state: State, packer: struct.Struct) -> bytes:
+    """Return one of the two state blocks; ``packer`` packs the counters' values."""
+    body = STATE.pack(
+        state.sequence, state.beat_monotonic_ns, state.beat_unix_ns,
+        state.rows_used, state.rows_missing, len(state.values), 0,
+    ) + packer.pack(*state.values)  # fmt: skip
+    return body + CRC.pack(zlib.crc32(body))
+
+
+def unpack_state(data: bytes) -> State | None:
+    """Return a state block; None if it was never written or is torn."""
+    sequence, beat, unix, used, missing, count, _ = STATE.unpack_from(data)
+    end = STATE.size + 8 * count
+    if not sequence or end + CRC.size > len(data):
+        return None
+    if CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
+        return None
+    return State(sequence, beat, unix, used, missing, struct.unpack_from(f"<{count}q", data, STATE.size))
+
+
+def _fit(text: str, limit: int, *, keep_end: bool) -> tuple[bytes, bool]:
+    data = text.encode("utf-8", "surrogateescape")
+    if len(data) <= limit:
+        return data, False
+    if keep_end:
+        data = data[-limit:]
+        while data and data[0] & 0xC0 == 0x80:  # never begin inside a character
+            data = data[1:]
+        return data, True
+    return data[:limit].decode("utf-8", "ignore").encode(), True
+
+
+def pack_row(row: CellRow) -> bytes:
+    """Return the 256 bytes of one cell row."""
+    cell_id, id_cut = _fit(row.id, ID_BYTES, keep_end=True)
+    layer, layer_cut = _fit(row.layer, LAYER_BYTES, keep_end=False)
+    flags = id_cut * ID_CUT + layer_cut * LAYER_CUT
+    packed = ROW.pack(
+        row.version, row.bytes, row.points, *row.box, row.hits, row.last_use_monotonic_ns, row.load_ns,
+        row.segment.encode(), CELL_STATES.index(row.state), flags, len(cell_id), len(layer), 0,
+        layer, cell_id, 0,
+    )  # fmt: skip
+    return packed + struct.pack("<I", zlib.crc32(packed))
+
+
+def unpack_row(data: memoryview) -> CellRow | None:
+    """Return one row; None if it is free.
+
+    Raises
+    ------
+    SegmentCorrupt
+        If it is torn: the writer was changing it.
+    """
+    if zlib.crc32(data[: ROW.size]) != int.from_bytes(data[ROW.size : ROW.size + 4], "little"):
+        raise SegmentCorrupt("a row of the statistics is torn")
+    (
+        version, nbytes, points, min_x, min_y, max_x, max_y, hits, last_use, load_ns,
+        segment, state, flags, id_length, layer_length, _, layer, cell_id, _,
+    ) = ROW.unpack_from(data)  # fmt: skip
+    if not state:
+        return None
+    return CellRow(
+        id=cell_id[:id_length].decode("utf-8", "surrogateescape"),
+        layer=layer[:layer_length].decode("utf-8", "surrogateescape"),
+        version=version,
+        segment=segment.rstrip(b"\0").decode(),
+        state=CELL_STATES[state] if state < len(CELL_STATES) else "unknown",
+        bytes=nbytes,
+        points=points,
+        box=(min_x, min_y, max_x, max_y),
+        hits=hits,
+        last_use_monotonic_ns=last_use,
+        load_ns=load_ns,
+        id_cut=bool(flags & ID_CUT),
+        layer_cut=bool(flags & LAYER_CUT),
+    )

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon's side of the statistics segment.
+
+Counting costs a dictionary access; `StatisticsWriter.beat` writes what changed.  It writes with
+``pwrite`` into memory allocated before: a full file system is an error here, never SIGBUS, and a
+reader that cannot be trusted cannot stop or hurt the writer.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Hashable
+from itertools import islice
+
+from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
+from shmmap.segment.names import statistics_name
+from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS
+from shmmap.statistics.identity import DaemonIdentity
+from shmmap.statistics.layout import (
+    ROW_BYTES,
+    TABLE,
+    CellRow,
+    State,
+    pack_header,
+    pack_identity,
+    pack_row,
+    pack_state,
+    plan,
+)
+
+__all__ = ["StatisticsWriter"]
+
+_GROWTH_ROWS = 256  # 64 KiB at a time
+_FREE_ROW = pack_row(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
+
+
+class StatisticsWriter:
+    """Creates, fills and at the end removes the instance's statistics segment.
+
+    Parameters
+    ----------
+    directory, instance
+        Where the segment goes; a leftover of a dead predecessor is replaced atomically.  The
+        caller holds the instance lock.
+    identity
+        Who writes.
+    mode, gid
+        Access of the segment; ``gid`` -1 leaves the group alone.
+
+    Attributes
+    ----------
+    values : dict of int
+        Counters by name (`shmmap.statistics.counters`); may be changed in place.
+
+    Raises
+    ------
+    OSError
+        If the directory is full.
+    """
+
+    def __init__(
+        self,
+        directory: ShmDirectory,
+        instance: str,
+        identity: DaemonIdentity,
+        *,
+        mode: int = 0o400,
+        gid: int = -1,
+    ) -> None:
+        self.values: dict[str, int] = dict.fromkeys(COUNTER_NAMES, 0)
+        self.name = statistics_name(instance)
+        self._directory = directory
+        self._layout = plan(COUNTERS)
+        self._packer = struct.Struct(f"<{len(COUNTERS)}q")
+        self._sequence = 0
+        self._identity_sequence = 0
+        self._table_sequence = 0
+        self._slots: dict[Hashable, int] = {}
+        self._free: list[int] = []
+        self._used = 0
+        self._allocated = 0
+        self._changed: dict[Hashable, CellRow] = {}
+        self._missing: dict[Hashable, CellRow] = {}  # there was no room for these
+        self._removed: list[int] = []
+        self._fd = directory.create()
+        try:
+            os.posix_fallocate(self._fd, 0, self._layout.rows_offset)
+            os.pwrite(self._fd, pack_header(self._layout), 0)
+            self.update_identity(identity)
+            self.beat()
+            if gid >= 0:
+                os.fchown(self._fd, -1, gid)
+            os.fchmod(self._fd, mode)
+            self._publish()
+        except BaseException:
+            os.close(self._fd)
+            raise
+
+    def _publish(self) -> None:
+        """Give the finished segment its name in one step, over a predecessor's."""
+        interim = self.name + ".next"
+        self._directory.unlink(interim)
+        self._directory.link(self._fd, interim)
+        self._directory.rename(interim, self.name)
+
+    def set(self, name: str, value: int) -> None:
+        """Set a gauge."""
+        self.values[name] = value
+
+    def add(self, name: str, n: int = 1) -> None:
+        """Add to a counter."""
+        self.values[name] += n
+
+    def cell_changed(self, key: Hashable, row: CellRow) -> None:
+        """Show ``row`` under ``key`` from one of the next beats on; it is read only then."""
+        (self._missing if key in self._missing else self._changed)[key] = row
+
+    def cell_removed(self, key: Hashable) -> None:
+        """Show the row no more; unknown keys are ignored."""
+        self._changed.pop(key, None)
+        self._missing.pop(key, None)
+        slot = self._slots.pop(key, None)
+        if slot is not None:
+            self._removed.append(slot)
+
+    def update_identity(self, identity: DaemonIdentity) -> None:
+        """Replace what the segment says of its writer, as after a reload.
+
+        Raises
+        ------
+        ValueError
+            If its strings need more than 16 kB.
+        """
+        self._identity_sequence += 1
+        block = self._layout.identity_offset + self._identity_sequence % 2 * self._layout.identity_bytes
+        packed = pack_identity(self._identity_sequence, identity.to_bytes(), self._layout.identity_bytes)
+        os.pwrite(self._fd, packed, block)
+
+    def beat(self, *, max_rows: int = 256) -> None:
+        """Write the time, all counters and at most ``max_rows`` changed rows (the rest at later beats)."""
+        if self._changed or self._removed or self._missing:
+            self._write_rows(max_rows)
+        self._sequence += 1
+        state = State(
+            self._sequence,
+            time.monotonic_ns(),
+            time.time_ns(),
+            self._used,
+            len(self._missing),
+            tuple(self.values.values()),
+        )
+        block = self._layout.state_offset + self._sequence % 2 * self._layout.state_bytes
+        os.pwrite(self._fd, pack_state(state, self._packer), block)
+
+    def _write_rows(self, max_rows: int) -> None:
+        self._mark_table()
+        for _ in range(min(max_rows, len(self._removed))):
+            slot = self._removed.pop()
+            self._write_row(slot, _FREE_ROW)
+            self._free.append(slot)
+        for key in list(islice(self._changed, max_rows)):
+            row = self._changed.pop(key)
+            if not self._place(key, row):
+                self._missing[key] = row
+        for key in list(islice(self._missing, max_rows)):
+            if not self._place(key, self._missing[key]):
+                break
+            del self._missing[key]
+        self._mark_table()
+
+    def _place(self, key: Hashable, row: CellRow) -> bool:
+        slot = self._slot(key)
+        if slot is not None:
+            self._write_row(slot, pack_row(row))
+        return slot is not None
+
+    def _mark_table(self) -> None:
+        """Make the table's sequence number odd while rows change, and even again."""
+        self._table_sequence += 1
+        os.pwrite(self._fd, TABLE.pack(self._table_sequence), self._layout.table_offset)
+
+    def _write_row(self, slot: int, packed: bytes) -> None:
+        os.pwrite(self._fd, packed, self._layout.rows_offset + slot * ROW_BYTES)
+
+    def _slot(self, key: Hashable) -> int | None:
+        """Return the row of ``key``, a new one if needed; None when there is no room."""
+        slot = self._slots.get(key)
+        if slot is None:
+            if self._free:
+                slot = self._free.pop()
+            elif self._used < self._allocated or self._grow():
+                slot = self._used
+                self._used += 1
+            else:
+                return None
+            self._slots[key] = slot
+        return slot
+
+    def _grow(self) -> bool:
+        rows = min(self._allocated + _GROWTH_ROWS, self._layout.max_rows)
+        if rows == self._allocated:
+            return False
+        start = self._layout.rows_offset + self._allocated * ROW_BYTES
+        try:
+            os.posix_fallocate(self._fd, start, (rows - self._allocated) * ROW_BYTES)
+        except OSError as error:
+            if is_full(error):
+                return False
+            raise
+        self._allocated = rows
+        return True
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory the segment occupies, to be counted with the segments of cells."""
+        return measured_bytes(self._fd)
+
+    def close(self) -> None:
+        """Remove the segment; a successor's of the same name stays."""
+        mine = os.fstat(self._fd)
+        try:
+            named = os.stat(f"{self._directory.path}{self.name}")
+        except FileNotFoundError:
+            named = None
+        if named is not None and (named.st_dev, named.st_ino) == (mine.st_dev, mine.st_ino):
+            self._directory.unlink(self.name)
+        os.close(self._fd)
