@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.layout import PublishBlock, SegmentHeader, unpack_header, unpack_publish_block
+from shmmap.segment.layout import (
+    ColumnRow,
+    PublishBlock,
+    SegmentHeader,
+    read_columns,
+    unpack_header,
+    unpack_publish_block,
+)
 from shmmap.segment.pins import lock_slot
 
 __all__ = ["AttachedSegment", "Unmap", "attach", "unmap"]
@@ -88,23 +95,32 @@ class AttachedSegment:
 
     Attributes
     ----------
-    header : SegmentHeader
-        What the segment says about itself.
+    columns : list of tuple
+        The column table (`shmmap.segment.layout.ColumnRow`).
     raw : (total_bytes,) uint8
         All of its bytes.
     """
 
-    __slots__ = ("header", "raw")
+    __slots__ = ("_header", "columns", "raw")
 
-    def __init__(self, header: SegmentHeader, raw: NDArray[np.uint8]) -> None:
-        self.header = header
+    def __init__(self, columns: list[ColumnRow], raw: NDArray[np.uint8]) -> None:
+        self.columns = columns
         self.raw = raw
+        self._header: SegmentHeader | None = None
+
+    @property
+    def header(self) -> SegmentHeader:
+        """What the segment says about itself; read when first asked for."""
+        header = self._header
+        if header is None:
+            header = self._header = unpack_header(self.raw.data, len(self.raw))
+        return header
 
     def column(self, index: int) -> NDArray[np.generic]:
         """Return column number ``index`` as a read-only, zero-copy array."""
-        column = self.header.columns[index]
-        flat = self.raw[column.offset : column.offset + column.nbytes].view(column.dtype)
-        return flat if len(column.shape) == 1 else flat.reshape(column.shape)
+        _name, dtype, shape, offset, _nbytes, _unit, _checksum = self.columns[index]
+        view: NDArray[np.generic] = np.ndarray(shape, dtype, self.raw, offset)
+        return view
 
     @property
     def published(self) -> PublishBlock | None:
@@ -121,7 +137,7 @@ class AttachedSegment:
         """
         import xxhash
 
-        for index, column in enumerate(self.header.columns):
+        for column in self.header.columns:
             if (
                 xxhash.xxh3_64_intdigest(self.raw[column.offset : column.offset + column.nbytes].data)
                 != column.checksum
@@ -199,4 +215,4 @@ def attach(
     raw: NDArray[np.uint8] = np.asarray(mapping)
     if offset:
         raw = raw[offset:]
-    return AttachedSegment(unpack_header(raw.data, len(raw)), raw)
+    return AttachedSegment(read_columns(raw.data, len(raw))[1], raw)

@@ -13,7 +13,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,12 +23,14 @@ from shmmap.errors import SegmentCorrupt
 __all__ = [
     "LAYOUT_VERSION",
     "Column",
+    "ColumnRow",
     "PublishBlock",
     "SegmentHeader",
     "SourceStamp",
     "pack_header",
     "pack_publish_block",
     "plan_columns",
+    "read_columns",
     "unpack_header",
     "unpack_publish_block",
 ]
@@ -45,6 +47,8 @@ MAX_DIMENSIONS: Final = 4
 
 FIXED: Final = struct.Struct("<8sHHIQQQQQQqq16s4d2d3dIIIIIIIIIIII")
 COLUMN: Final = struct.Struct("<40s8s16sII4QQQQ")
+TABLE: Final = struct.Struct("<III")  # column count, offset of the table, bytes of a row
+TABLE_AT: Final = FIXED.size - 11 * 4
 PUBLISH: Final = struct.Struct("<8sQQ32xI4x")
 PUBLISH_MAGIC: Final = b"PUBLISH\x00"
 CRC: Final = struct.Struct("<II")
@@ -88,6 +92,10 @@ class Column:
     nbytes: int
     unit: str = ""
     checksum: int = 0
+
+
+ColumnRow: TypeAlias = tuple[str, "np.dtype[np.generic]", tuple[int, ...], int, int, str, int]
+"""The fields of a `Column`, in order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,9 +247,58 @@ def check_start(start: memoryview, available_bytes: int) -> tuple[int, int]:
         raise SegmentCorrupt("the segment was written on a machine of other byte order")
     if header_bytes % PAGE_BYTES or not PAGE_BYTES <= header_bytes <= total_bytes <= available_bytes:
         raise SegmentCorrupt(
-            f"the segment claims {header_bytes} header and {total_bytes} total bytes; it has {available_bytes}"
+            f"the segment claims {header_bytes} header and {total_bytes} total bytes, has {available_bytes}"
         )
     return header_bytes, total_bytes
+
+
+def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[ColumnRow]]:
+    """Verify a header and read its column table: the part of it that every reader needs.
+
+    Parameters and errors are those of `unpack_header`, which also reads the rest.
+
+    Returns
+    -------
+    header_bytes : int
+        Size of the header.
+    rows : list of tuple
+        One for each column: what `Column` takes, in order.
+    """
+    header_bytes, total_bytes = check_start(page, available_bytes)
+    if len(page) < header_bytes:
+        raise SegmentCorrupt(f"only {len(page)} of {header_bytes} header bytes are there")
+    end = header_bytes - TAIL_BYTES
+    if zlib.crc32(page[:end]) != int.from_bytes(page[end : end + 4], "little"):
+        raise SegmentCorrupt("the header's checksum does not match")
+    count, columns_offset, row_bytes = TABLE.unpack_from(page, TABLE_AT)
+    if row_bytes < COLUMN.size or columns_offset + count * row_bytes > end:
+        raise SegmentCorrupt("the column table does not fit the header")
+    rows: list[ColumnRow] = []
+    for at in range(columns_offset, columns_offset + count * row_bytes, row_bytes):
+        name, dtype, unit, ndim, _, s0, s1, s2, s3, offset, nbytes, checksum = COLUMN.unpack_from(page, at)
+        kind = _DTYPES.get(dtype.rstrip(b"\0"))
+        shape = (s0, s1, s2, s3)[:ndim]
+        if (
+            kind is None
+            or ndim > MAX_DIMENSIONS
+            or math.prod(shape) * kind.itemsize != nbytes
+            or offset < header_bytes
+            or offset % ALIGNMENT_BYTES
+            or offset + nbytes > total_bytes
+        ):
+            raise SegmentCorrupt(f"column {len(rows)} ({bytes(name)!r}) contradicts the layout")
+        rows.append(
+            (
+                name.rstrip(b"\0").decode(),
+                kind,
+                shape,
+                offset,
+                nbytes,
+                unit.rstrip(b"\0").decode(),
+                checksum,
+            )
+        )
+    return header_bytes, rows
 
 
 def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
@@ -259,54 +316,21 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
     SegmentCorrupt
         Wrong magic, other major layout version, bad CRC, or a column outside the segment.
     """
-    header_bytes, total_bytes = check_start(page, available_bytes)
-    if len(page) < header_bytes:
-        raise SegmentCorrupt(f"only {len(page)} of {header_bytes} header bytes are there")
+    header_bytes, columns = read_columns(page, available_bytes)
     end = header_bytes - TAIL_BYTES
-    if zlib.crc32(page[:end]) != int.from_bytes(page[end : end + 4], "little"):
-        raise SegmentCorrupt("the header's checksum does not match")
     (
-        _magic, _major, _minor, _order, _header_bytes, _total_bytes,
+        _magic, _major, _minor, _order, _header_bytes, total_bytes,
         rows, source_points, dropped_points, source_size, source_mtime_ns, source_ctime_ns, digest,
         min_x, min_y, max_x, max_y, z_min, z_max, origin_x, origin_y, origin_z,
-        builder_version, count, columns_offset, row_bytes,
+        builder_version, _count, _columns_offset, _row_bytes,
         id_at, id_bytes, layer_at, layer_bytes, frame_at, frame_bytes, _flags, _reserved,
     ) = FIXED.unpack_from(page)  # fmt: skip
-    if row_bytes < COLUMN.size or columns_offset + count * row_bytes > end:
-        raise SegmentCorrupt("the column table does not fit the header")
-    columns = []
-    for index in range(count):
-        name, dtype, unit, ndim, _, s0, s1, s2, s3, offset, nbytes, checksum = COLUMN.unpack_from(
-            page, columns_offset + index * row_bytes
-        )
-        kind = _DTYPES.get(dtype.rstrip(b"\0"))
-        shape = (s0, s1, s2, s3)[:ndim]
-        if (
-            kind is None
-            or ndim > MAX_DIMENSIONS
-            or math.prod(shape) * kind.itemsize != nbytes
-            or offset < header_bytes
-            or offset % ALIGNMENT_BYTES
-            or offset + nbytes > total_bytes
-        ):
-            raise SegmentCorrupt(f"column {index} ({bytes(name)!r}) contradicts the layout")
-        columns.append(
-            Column(
-                name.rstrip(b"\0").decode(),
-                kind,
-                shape,
-                offset,
-                nbytes,
-                unit.rstrip(b"\0").decode(),
-                checksum,
-            )
-        )
     if max(id_at + id_bytes, layer_at + layer_bytes, frame_at + frame_bytes) > end:
         raise SegmentCorrupt("a string lies outside the header")
     return SegmentHeader(
         cell_id=str(page[id_at : id_at + id_bytes], "utf-8"),
         layer=str(page[layer_at : layer_at + layer_bytes], "utf-8"),
-        columns=tuple(columns),
+        columns=tuple(Column(*column) for column in columns),
         rows=rows,
         box=(min_x, min_y, max_x, max_y),
         header_bytes=header_bytes,
