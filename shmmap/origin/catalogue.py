@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cells of one map at one moment: ids, boxes, stamps, versions, and which of them touch an area."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from xxhash import xxh3_64, xxh3_64_intdigest
+
+from shmmap.errors import MapDataError
+from shmmap.geometry import Area
+from shmmap.origin.cell_names import CellNames
+from shmmap.origin.spatial_index import SpatialIndex
+from shmmap.origin.stamp import Stamp, cell_version
+
+__all__ = ["Catalogue", "CatalogueChange", "compare"]
+
+Indices = NDArray[np.intp]
+
+# Stamps are hashed in blocks of this many cells, so that one changed stamp costs one block.
+_BLOCK_CELLS = 4096
+
+
+class Catalogue:
+    """The cells of one map, numbered 0..n-1 in ascending byte order of their ids.
+
+    Ids and boxes never change.  A stamp may be corrected in place (`set_stamp`) when a loader finds
+    that a file changed since the map was scanned; the cell's version and the map version follow.
+
+    Parameters
+    ----------
+    id_prefix
+        Directory that every id starts with, ending in "/".
+    names
+        (N,) bytes, the rest of each id, ascending and unique.
+    boxes
+        (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame.
+    stamps
+        (N, 3) int64, size in bytes, mtime_ns, ctime_ns.
+    problems
+        Oddities found while reading the map, one sentence each, for the log and `shmmap status`.
+
+    Raises
+    ------
+    MapDataError
+        A box is not finite or has its minimum above its maximum.
+    """
+
+    frame_id = "map"
+
+    def __init__(
+        self,
+        *,
+        id_prefix: str,
+        names: NDArray[np.bytes_],
+        boxes: NDArray[np.float64],
+        stamps: NDArray[np.int64],
+        problems: Sequence[str] = (),
+    ) -> None:
+        self._names = CellNames(id_prefix, names)
+        bad = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)
+        if bad.any():
+            first = int(np.flatnonzero(bad)[0])
+            raise MapDataError(
+                f"the box {tuple(boxes[first].tolist())} is no rectangle",
+                path=self.id(first),
+                cause="bad_box",
+            )
+        self._index = SpatialIndex(boxes)
+        self._stamps = stamps
+        self._versions: dict[int, int] = {}
+        self._block_digests: NDArray[np.uint64] | None = None
+        self._fixed_digest = 0
+        self._map_version: int | None = None
+        self.problems = tuple(problems)
+
+    @classmethod
+    def from_cells(
+        cls,
+        cells: Iterable[tuple[str, tuple[float, float, float, float], Stamp]],
+        problems: Sequence[str] = (),
+    ) -> Catalogue:
+        """Build from (id, box, stamp) of each cell, in any order; ids are absolute paths."""
+        ordered = sorted(cells, key=lambda cell: os.fsencode(cell[0]))
+        prefix = common_directory([cell_id for cell_id, _, _ in ordered])
+        return cls(
+            id_prefix=prefix,
+            names=np.array(
+                [os.fsencode(cell_id[len(prefix) :]) for cell_id, _, _ in ordered], dtype=np.bytes_
+            ),
+            boxes=np.array([box for _, box, _ in ordered], dtype=np.float64).reshape(-1, 4),
+            stamps=np.array([stamp for _, _, stamp in ordered], dtype=np.int64).reshape(-1, 3),
+            problems=problems,
+        )
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    @property
+    def id_prefix(self) -> str:
+        """What all ids start with, e.g. ``/maps/city/pointcloud_map.pcd/``."""
+        return self._names.prefix
+
+    @property
+    def names(self) -> NDArray[np.bytes_]:
+        """(N,) bytes, what follows `id_prefix` in each id; do not write."""
+        return self._names.names
+
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame; do not write."""
+        return self._index.boxes
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """(N, 3) int64, size in bytes, mtime_ns, ctime_ns; written by `set_stamp` only."""
+        return self._stamps
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the tables (names, boxes, stamps, index), without lazily built lookups."""
+        return int(self.names.nbytes + self._stamps.nbytes) + self._index.nbytes
+
+    def id(self, index: int) -> str:
+        """Id of a cell: the absolute path of its file."""
+        return self._names.id(index)
+
+    def ids(self, indices: Indices) -> list[str]:
+        """Ids of several cells, in the order given."""
+        return self._names.ids(indices)
+
+    def find(self, cell: str) -> int | None:
+        """Index of the cell with this id, or with this base name where only one has it; None if none.
+
+        Raises
+        ------
+        BadRequest
+            Several cells have this base name.
+        """
+        return self._names.find(cell)
+
+    def box(self, index: int) -> tuple[float, float, float, float]:
+        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+        min_x, min_y, max_x, max_y = self.boxes[index].tolist()
+        return min_x, min_y, max_x, max_y
+
+    def path(self, index: int) -> str:
+        """File to load for a cell."""
+        return self.id(index)
+
+    def stamp(self, index: int) -> Stamp:
+        """Stamp of a cell's file as last known."""
+        return Stamp(*self._stamps[index].tolist())
+
+    def set_stamp(self, index: int, stamp: Stamp) -> None:
+        """Correct a cell's stamp in place; its version and the map version follow.  Cheap at any size."""
+        self._stamps[index] = stamp
+        self._versions.pop(index, None)
+        if self._block_digests is not None:
+            block = index // _BLOCK_CELLS
+            self._block_digests[block] = self._digest_block(block)
+        self._map_version = None
+
+    def version(self, index: int) -> int:
+        """64-bit version of a cell, see `shmmap.origin.stamp.cell_version`."""
+        version = self._versions.get(index)
+        if version is None:
+            version = self._versions[index] = cell_version(self.id(index), self.stamp(index))
+        return version
+
+    @property
+    def map_version(self) -> int:
+        """64-bit version of the whole catalogue: equal after a restart, other after any change.
+
+        The recipe (XXH3, 64 bit, seed 0, little-endian throughout): *fixed* is the hash of
+        ``b"shmmap map 1"``, a zero byte, `id_prefix`, a zero byte, all `names` padded with zero bytes
+        to the longest, then all min_x, all min_y, all max_x, all max_y as float64.  For each run of
+        4096 cells, *block* is the hash of their stamps (size, mtime_ns, ctime_ns as int64).  The
+        version is the hash of *fixed* and every *block* as uint64.
+        """
+        if self._map_version is None:
+            if self._block_digests is None:
+                fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
+                fixed.update(np.ascontiguousarray(self.names).view(np.uint8).data)
+                fixed.update(np.ascontiguousarray(self.boxes.T).data)
+                self._fixed_digest = fixed.intdigest()
+                blocks = range(-(-len(self) // _BLOCK_CELLS))
+                self._block_digests = np.array([self._digest_block(i) for i in blocks], dtype=np.uint64)
+            self._map_version = xxh3_64_intdigest(
+                self._fixed_digest.to_bytes(8, "little") + self._block_digests.tobytes()
+            )
+        return self._map_version
+
+    def _digest_block(self, block: int) -> int:
+        cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]
+        return xxh3_64_intdigest(np.ascontiguousarray(cells).data)
+
+    def query(self, area: Area) -> Indices:
+        """Cells whose box touches ``area``, ascending (which is id order).
+
+        Borders are closed.  The area's z range plays no part: heights are known only after loading.
+        """
+        return self._index.query(area)
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueChange:
+    """What differs between two catalogues of a map; ids in id order."""
+
+    added: tuple[str, ...]
+    """In the new one only."""
+    removed: tuple[str, ...]
+    """In the old one only."""
+    changed: tuple[str, ...]
+    """In both with different stamps: another version."""
+    moved: tuple[str, ...]
+    """In both with different boxes (the metadata was edited); the version may be the same."""
+
+    def __bool__(self) -> bool:
+        return bool(self.added or self.removed or self.changed or self.moved)
+
+
+def compare(old: Catalogue, new: Catalogue) -> CatalogueChange:
+    """Find what changed from ``old`` to ``new``, without visiting every cell in Python."""
+    if old.id_prefix == new.id_prefix and np.array_equal(old.names, new.names):
+        in_old = in_new = np.arange(len(new))
+    else:
+        prefix = common_directory([old.id_prefix, new.id_prefix])
+        _, in_old, in_new = np.intersect1d(
+            _names_below(prefix, old), _names_below(prefix, new), assume_unique=True, return_indices=True
+        )
+    differs = (old.stamps[in_old] != new.stamps[in_new]).any(axis=1)
+    moved = (old.boxes[in_old] != new.boxes[in_new]).any(axis=1)
+    return CatalogueChange(
+        added=tuple(new.ids(np.setdiff1d(np.arange(len(new)), in_new, assume_unique=True))),
+        removed=tuple(old.ids(np.setdiff1d(np.arange(len(old)), in_old, assume_unique=True))),
+        changed=tuple(new.ids(in_new[differs])),
+        moved=tuple(new.ids(in_new[moved])),
+    )
+
+
+def _names_below(prefix: str, catalogue: Catalogue) -> NDArray[np.bytes_]:
+    between = os.fsencode(catalogue.id_prefix[len(prefix) :])
+    return np.char.add(between, catalogue.names) if between else catalogue.names
+
+
+def common_directory(paths: Sequence[str]) -> str:
+    """Longest directory, with its final "/", that all ``paths`` start with; empty if none."""
+    if not paths:
+        return ""
+    # what the least and the greatest share, all share
+    least, greatest = min(paths), max(paths)
+    shared = next((i for i, (a, b) in enumerate(zip(least, greatest, strict=False)) if a != b), len(least))
+    return least[: least.rfind("/", 0, shared) + 1]

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lists the PCD files of a map and their stamps, for up to millions of files."""
+
+from __future__ import annotations
+
+import array
+import os
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import MapMissing
+from shmmap.origin.catalogue import common_directory
+from shmmap.origin.metadata_entries import list_some
+
+__all__ = ["ScannedFiles", "is_pcd", "scan"]
+
+_BLOCK_FILES = 1 << 15
+
+
+@dataclass(frozen=True, slots=True)
+class ScannedFiles:
+    """PCD files in ascending order of their paths.
+
+    Attributes
+    ----------
+    prefix
+        Directory that all paths start with, ending in "/".
+    names
+        (N,) bytes, the rest of each path.
+    stamps
+        (N, 3) int64, size in bytes, mtime_ns, ctime_ns.
+    directories
+        Every directory that was listed, absolute, with its status just before.
+    problems
+        What was passed over, one sentence each.
+    """
+
+    prefix: str
+    names: NDArray[np.bytes_]
+    stamps: NDArray[np.int64]
+    directories: dict[str, os.stat_result]
+    problems: tuple[str, ...]
+
+
+def is_pcd(name: bytes) -> bool:
+    """Whether a file name ends in .pcd, in upper or lower case."""
+    return name[-4:].lower() == b".pcd"
+
+
+@dataclass(slots=True)
+class _Found:
+    """Growing table of files; names are packed block by block, stamps as bare integers."""
+
+    blocks: list[NDArray[np.bytes_]] = field(default_factory=list)
+    names: list[bytes] = field(default_factory=list)
+    stamps: array.array[int] = field(default_factory=lambda: array.array("q"))
+
+    def add(self, name: bytes, status: os.stat_result) -> None:
+        self.names.append(name)
+        self.stamps.append(status.st_size)
+        self.stamps.append(status.st_mtime_ns)
+        self.stamps.append(status.st_ctime_ns)
+        if len(self.names) == _BLOCK_FILES:
+            self.pack()
+
+    def pack(self) -> None:
+        self.blocks.append(np.array(self.names, dtype=np.bytes_))
+        self.names = []
+
+
+def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
+    """List the PCD files in and among ``roots`` (absolute paths of directories and files).
+
+    A file that is reached twice counts once.  Symbolic links are followed and keep their own names;
+    a directory reached twice is listed once.  Hidden directories are passed over when recursing.
+
+    Raises
+    ------
+    MapMissing
+        One of the roots cannot be read.
+    """
+    prefix = common_directory([os.path.join(root, "") if os.path.isdir(root) else root for root in roots])
+    skip = len(os.fsencode(prefix))
+    found = _Found()
+    problems: dict[str, list[str]] = {}
+    directories: dict[str, os.stat_result] = {}
+    seen: set[tuple[int, int]] = set()
+    pending: list[bytes] = []
+    for root in roots:
+        path = os.fsencode(root)
+        try:
+            status = os.stat(path)
+            if stat.S_ISDIR(status.st_mode):
+                os.scandir(path).close()
+                pending.append(path)
+            else:
+                found.add(path[skip:], status)
+        except OSError as error:
+            raise MapMissing(f"cannot read {root}: {error.strerror}") from error
+    while pending:
+        directory = pending.pop()
+        try:
+            status = os.stat(directory)
+            if (status.st_dev, status.st_ino) in seen:
+                continue
+            seen.add((status.st_dev, status.st_ino))
+            inner = _list_directory(directory, skip, found, problems)
+        except OSError as error:
+            problems.setdefault(f"cannot be listed ({error.strerror})", []).append(os.fsdecode(directory))
+            continue
+        directories[os.fsdecode(directory)] = status
+        if recursive:
+            pending.extend(inner)
+    found.pack()
+    names, first = np.unique(np.concatenate(found.blocks), return_index=True)
+    stamps = np.frombuffer(found.stamps, dtype=np.int64).reshape(-1, 3)[first]
+    reports = tuple(f"{what}: {list_some(sorted(paths))}" for what, paths in problems.items())
+    return ScannedFiles(prefix, names, stamps, directories, reports)
+
+
+def _list_directory(
+    directory: bytes, skip: int, found: _Found, problems: dict[str, list[str]]
+) -> list[bytes]:
+    """Add a directory's PCD files to ``found``; return the directories in it."""
+    inner: list[bytes] = []
+    below = os.path.join(directory, b"")[skip:]
+    with os.scandir(directory) as entries:
+        for entry in entries:
+            name = entry.name
+            if entry.is_dir():
+                if not name.startswith(b"."):
+                    inner.append(entry.path)
+            elif is_pcd(name):
+                try:
+                    status = entry.stat()
+                except OSError as error:
+                    what = f"cannot be read ({error.strerror})"
+                    problems.setdefault(what, []).append(os.fsdecode(entry.path))
+                    continue
+                if stat.S_ISREG(status.st_mode):
+                    found.add(below + name, status)
+                else:
+                    problems.setdefault("no regular file", []).append(os.fsdecode(entry.path))
+    return inner

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opens a map on disk: Autoware's divided format in all its layouts, or a single PCD file."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import MapDataError, MapMissing
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.directory_scan import ScannedFiles, scan
+from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
+from shmmap.origin.metadata_entries import MapMetadata, list_some
+from shmmap.origin.metadata_yaml import read_metadata
+from shmmap.origin.sidecar import Source, default_cache_directory, load_sidecar, save_sidecar, sidecar_file
+from shmmap.origin.single_pcd import load_single_pcd
+
+__all__ = ["MapDirectory", "open_map"]
+
+# Smaller maps are scanned in a few milliseconds: a cached catalogue would only be less fresh.
+_CACHED_FROM_CELLS = 2000
+
+
+def open_map(
+    path: str | os.PathLike[str],
+    *,
+    metadata: str | os.PathLike[str] | None = None,
+    pcd_paths: Sequence[str | os.PathLike[str]] = (),
+    strict: bool = False,
+    cache_dir: str | os.PathLike[str] | None = None,
+) -> MapDirectory:
+    """Find the map at ``path``; `MapDirectory.load` then reads its catalogue.
+
+    Parameters
+    ----------
+    path
+        A map directory, a directory of cells, one PCD file, or a metadata file.
+    metadata
+        The metadata file, where it is not beside or among the cells.
+    pcd_paths
+        PCD files and directories to use instead of what is found at ``path``.
+    strict
+        Behave like Autoware's loader: integer corners only, no unknown keys, an entry without its
+        file is an error, directories are not searched recursively.
+    cache_dir
+        Where the catalogue of a large map is cached; default `default_cache_directory()`.
+
+    Raises
+    ------
+    MapMissing
+        There is no map at ``path``.
+    """
+    return MapDirectory(
+        path=absolute_path(path),
+        metadata=None if metadata is None else absolute_path(metadata),
+        pcd_paths=tuple(absolute_path(p) for p in pcd_paths),
+        strict=strict,
+        cache_dir=default_cache_directory() if cache_dir is None else os.path.abspath(cache_dir),
+    ).checked()
+
+
+@dataclass(frozen=True, slots=True)
+class MapDirectory:
+    """A map on disk; all paths are absolute.  See `open_map` for the fields.
+
+    ``cached_from_cells`` is the number of cells from which a catalogue is worth caching.
+    """
+
+    path: str
+    metadata: str | None = None
+    pcd_paths: tuple[str, ...] = ()
+    strict: bool = False
+    cache_dir: str = ""
+    cached_from_cells: int = _CACHED_FROM_CELLS
+
+    def checked(self) -> MapDirectory:
+        """Return self, or raise `MapMissing` if there is no map."""
+        find_layout(self.path, self.metadata, self.pcd_paths)
+        return self
+
+    def load(self, *, fresh: bool = False) -> Catalogue:
+        """Read which cells there are now, with their boxes and their files' stamps.
+
+        A large map's catalogue comes from the cache while the metadata and the directories are
+        unchanged; stamps may then be older than the files.  ``fresh`` looks at every file.
+
+        Raises
+        ------
+        MapMissing
+            There is no map, or no PCD file in it.
+        MapDataError
+            The metadata is wrong, fits none of the files, or (strict) lacks some of them.
+        """
+        layout = find_layout(self.path, self.metadata, self.pcd_paths)
+        key = json.dumps([layout.roots, layout.metadata, self.strict])
+        sidecar = sidecar_file(self.cache_dir, key)
+        if not fresh:
+            cached = load_sidecar(sidecar, key)
+            if cached is not None:
+                return cached
+        scanned_ns = time.time_ns()
+        files = scan(layout.roots, recursive=not self.strict)
+        if not len(files.names):
+            raise MapMissing(f"there is no PCD file in {', '.join(layout.roots)}")
+        if layout.metadata is None:
+            return _without_metadata(files)
+        # looked at before it is read: a change meanwhile then differs from what is written down
+        metadata_source = Source.of(layout.metadata, os.stat(layout.metadata))
+        entries = read_metadata(layout.metadata, strict=self.strict)
+        catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
+        if len(catalogue) >= self.cached_from_cells and all(os.path.isdir(root) for root in layout.roots):
+            directories = [Source.of(path, status) for path, status in files.directories.items()]
+            save_sidecar(sidecar, key, [metadata_source, *directories], catalogue, scanned_ns)
+        return catalogue
+
+
+def _without_metadata(files: ScannedFiles) -> Catalogue:
+    if len(files.names) > 1:
+        raise MapDataError(
+            f"{len(files.names)} PCD files but no pointcloud_map_metadata.yaml, in or beside it",
+            path=files.prefix,
+            cause="no_metadata",
+            hint="name the metadata file, or one of the PCD files to serve it alone",
+        )
+    return load_single_pcd(files.prefix + os.fsdecode(bytes(files.names[0])))
+
+
+def _joined(
+    layout: MapLayout, metadata: str, files: ScannedFiles, entries: MapMetadata, *, strict: bool
+) -> Catalogue:
+    """Match entries with files by base name, as Autoware does."""
+    if not len(entries.names):
+        raise MapDataError("it lists no cells", path=metadata, cause="no_cells")
+    bases = _base_names(files.names)
+    order = np.argsort(entries.names, kind="stable")
+    ascending = entries.names[order]
+    at = np.minimum(ascending.searchsorted(bases), len(ascending) - 1)
+    has_entry = ascending[at] == bases
+    entry = order[at[has_entry]]
+    lacks_file = np.ones(len(entries.names), dtype=np.bool_)
+    lacks_file[entry] = False
+    problems = [*layout.problems, *files.problems, *(f"{metadata}: {text}" for text in entries.problems)]
+    if lacks_file.any():
+        listed = list_some([os.fsdecode(name) for name in entries.names[lacks_file].tolist()])
+        if strict or len(entry) == 0:
+            raise MapDataError(
+                f"these entries have no file in {', '.join(layout.roots)}: {listed}",
+                path=metadata,
+                cause="missing_files",
+            )
+        problems.append(f"{metadata}: entries without a file, not served: {listed}")
+    names = files.names[has_entry]
+    if not has_entry.all():
+        listed = list_some([os.fsdecode(name) for name in files.names[~has_entry].tolist()])
+        problems.append(f"{metadata}: files without an entry, not served: {listed}")
+    if len(names) > len(entries.names) - int(lacks_file.sum()):
+        problems.append("some base names stand for several files, all served with the same box")
+    lower = entries.corners[entry]
+    upper = lower + np.array((entries.x_resolution, entries.y_resolution))
+    return Catalogue(
+        id_prefix=files.prefix,
+        # as narrow as the longest: the catalogue's version covers the padded table
+        names=names.astype(f"S{int(np.char.str_len(names).max())}", copy=False),
+        boxes=np.hstack((lower, upper)),
+        stamps=files.stamps[has_entry],
+        problems=problems,
+    )
+
+
+def _base_names(names: NDArray[np.bytes_]) -> NDArray[np.bytes_]:
+    if int(np.char.find(names, b"/").max()) < 0:
+        return names
+    return np.array([name.rpartition(b"/")[2] for name in names.tolist()], dtype=np.bytes_)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds a map's PCD files and its metadata, in every layout that is in use.
+
+========================================================  =============================================
+``map/pointcloud_map.pcd/*.pcd``, YAML beside the folder  Autoware's; the divider writes it
+the same with the YAML inside the folder                  older maps
+a folder of PCD files, YAML inside or beside it           the inner folder given directly
+``.../pointcloud_map.pcd/<gx>_<gy>/*.pcd``                the divider's large grid (not when strict)
+``map/pointcloud_map.pcd`` (a file), or any one PCD       a map that was never divided
+========================================================  =============================================
+
+Paths become absolute as `os.path.abspath` does it: relative spellings, ``.``, ``..`` and doubled
+slashes vanish.  Symbolic links stay as given, as in Autoware: a link such as ``maps/current`` can be
+switched to another map, and a reload then finds the cells changed rather than renamed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from shmmap.errors import MapDataError, MapMissing
+from shmmap.origin.directory_scan import is_pcd
+
+__all__ = ["MapLayout", "absolute_path", "find_layout"]
+
+_CELLS_NAME = "pointcloud_map.pcd"
+# the second is how the divider's own README calls it
+_METADATA_NAMES = ("pointcloud_map_metadata.yaml", "pointcloud_data_metadata.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class MapLayout:
+    """Where the parts of a map are.
+
+    Attributes
+    ----------
+    roots
+        Absolute paths of the directories and files that hold the cells.
+    metadata
+        Absolute path of the metadata file, or None when there is none.
+    problems
+        Paths that were named but do not exist.
+    """
+
+    roots: tuple[str, ...]
+    metadata: str | None
+    problems: tuple[str, ...] = ()
+
+
+def absolute_path(path: str | os.PathLike[str]) -> str:
+    """Return ``path`` absolute and normalised, links kept.
+
+    Raises
+    ------
+    MapDataError
+        The path is no UTF-8, so that no client could name the cells.
+    """
+    text = os.path.abspath(os.fspath(path))
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise MapDataError("the path is no UTF-8", path=ascii(text), cause="bad_path") from error
+    try:
+        same = os.path.samefile(path, text)
+    except OSError:
+        return text
+    # "link/.." is where the link leads, not where it lies
+    return text if same else os.path.realpath(path)
+
+
+def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> MapLayout:
+    """Find the parts of the map at ``path``; all arguments are absolute.
+
+    Parameters
+    ----------
+    path
+        A map directory, a directory of cells, one PCD file, or a metadata file.
+    metadata
+        The metadata file, where it is somewhere else.
+    pcd_paths
+        Files and directories to use instead of what is found at ``path``.
+
+    Raises
+    ------
+    MapMissing
+        There is nothing at ``path``, or nothing that could be a map.
+    """
+    if not os.path.exists(path):
+        raise MapMissing(f"there is no map at {path}: no such file or directory")
+    if metadata is not None and not os.path.isfile(metadata):
+        raise MapMissing(f"there is no metadata file at {metadata}")
+    if os.path.isfile(path) and path.lower().endswith((".yaml", ".yml")):
+        metadata = metadata or path
+        path = os.path.dirname(path)
+    cells = os.path.join(path, _CELLS_NAME)
+    root = cells if os.path.exists(cells) else path
+    if pcd_paths:
+        roots = tuple(p for p in pcd_paths if os.path.exists(p))
+        if not roots:
+            raise MapMissing(f"none of the PCD paths exists: {', '.join(pcd_paths)}")
+        problems = tuple(f"invalid path: {p}" for p in pcd_paths if p not in roots)
+    else:
+        roots, problems = (root,), ()
+    if metadata is None and os.path.isdir(path):
+        metadata = _find_metadata(path, root)
+    return MapLayout(roots, metadata, problems)
+
+
+def _find_metadata(path: str, root: str) -> str | None:
+    folders = [path, root]
+    if os.path.basename(path) == _CELLS_NAME or _holds_pcd(path):
+        folders.append(os.path.dirname(path))
+    for folder in folders:
+        for name in _METADATA_NAMES:
+            candidate = os.path.join(folder, name)
+            if os.path.isfile(candidate):
+                return candidate
+    return None
+
+
+def _holds_pcd(directory: str) -> bool:
+    try:
+        with os.scandir(directory) as entries:
+            return any(is_pcd(os.fsencode(entry.name)) and entry.is_file() for entry in entries)
+    except OSError:
+        return False

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every place that cells come from offers."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from shmmap.origin.catalogue import Catalogue
+
+__all__ = ["MapOrigin"]
+
+
+class MapOrigin(Protocol):
+    """Where the cells of one map come from."""
+
+    @property
+    def path(self) -> str:
+        """The map as a person would name it."""
+
+    def load(self, *, fresh: bool = False) -> Catalogue:
+        """Find out which cells there are now.
+
+        ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.
+        """

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads a divided map's metadata file (``pointcloud_map_metadata.yaml``)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from shmmap.errors import MapDataError, MapMissing
+from shmmap.origin.metadata_entries import EntryCollector, MapMetadata
+from shmmap.origin.metadata_lines import collect_lines
+
+__all__ = ["parse_metadata", "read_metadata"]
+
+# The C parser where PyYAML was built with it; both report the same events.
+_LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+
+
+def read_metadata(path: str, *, strict: bool = False) -> MapMetadata:
+    """Read the metadata file at ``path``.
+
+    Raises
+    ------
+    MapMissing
+        There is no such file, or it may not be read.
+    MapDataError
+        It is not what Autoware's loader reads (``strict``), or not even close to it.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read()
+    except OSError as error:
+        raise MapMissing(f"cannot read the map's metadata {path}: {error.strerror}") from error
+    return parse_metadata(data, path=path, strict=strict)
+
+
+def parse_metadata(data: bytes, *, path: str, strict: bool = False, lines: bool = True) -> MapMetadata:
+    """Parse the bytes of a metadata file; ``path`` is for messages.
+
+    ``lines=False`` goes straight to the YAML parser: slower, with the same result.
+    """
+    entries = EntryCollector(strict)
+    if not (lines and collect_lines(data, entries)):
+        entries = EntryCollector(strict)
+        _collect_events(data, entries, path)
+    metadata = entries.metadata()
+    if metadata is None:
+        missing = " and ".join(
+            key for key in ("x_resolution", "y_resolution") if key.encode() not in entries.resolutions
+        )
+        raise MapDataError(f"{missing} missing", path=path, cause="no_resolution")
+    return metadata
+
+
+def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
+    """Read YAML of any style, from parser events: nothing recurses, however deep the file nests."""
+    depth = 0
+    key: str | None = None
+    value: list[str] | str = []
+    nested = False
+
+    def refuse(message: str, mark: Any, cause: str) -> MapDataError:
+        return MapDataError(
+            f"line {mark.line + 1}: {message}", path=path, offset=_line_offset(data, mark.line), cause=cause
+        )
+
+    try:
+        for event in yaml.parse(data, Loader=_LOADER):
+            if isinstance(event, yaml.AliasEvent):
+                raise refuse("aliases are not read", event.start_mark, "bad_yaml")
+            if isinstance(event, yaml.DocumentEndEvent):
+                return  # like yaml-cpp's LoadFile: the first document only
+            if isinstance(event, yaml.CollectionStartEvent):
+                is_mapping = isinstance(event, yaml.MappingStartEvent)
+                if (depth == 0) != is_mapping and depth == 0:
+                    raise refuse("the file is no mapping", event.start_mark, "bad_yaml")
+                if depth == 1 and key is None:
+                    raise refuse("a key must be a name", event.start_mark, "bad_yaml")
+                nested = depth > 1 or (depth == 1 and is_mapping)
+                depth += 1
+            elif isinstance(event, yaml.CollectionEndEvent):
+                depth -= 1
+            elif isinstance(event, yaml.ScalarEvent):
+                if depth == 0:
+                    raise refuse("the file is no mapping", event.start_mark, "bad_yaml")
+                if depth == 1 and key is None:
+                    key, value, nested = event.value, [], False
+                    continue
+                if depth == 1:
+                    value = event.value
+                elif isinstance(value, list):
+                    value.append(event.value)
+            if depth == 1 and key is not None:
+                _take(entries, key, None if nested else value, refuse, event.start_mark)
+                key = None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        if mark is None:
+            raise MapDataError(f"no YAML: {error.problem}", path=path, cause="bad_yaml") from error
+        raise refuse(f"no YAML: {error.problem}", mark, "bad_yaml") from error
+    except yaml.YAMLError as error:
+        raise MapDataError(f"no YAML: {error}", path=path, cause="bad_yaml") from error
+
+
+def _take(entries: EntryCollector, key: str, value: list[str] | str | None, refuse: Any, mark: Any) -> None:
+    name = key.encode()
+    if isinstance(value, str):
+        if entries.scalar(name, value):
+            return
+        if key in ("x_resolution", "y_resolution"):
+            raise refuse(f"{key} must be a positive number of metres, not {value!r}", mark, "no_resolution")
+        raise refuse(f"{key} is no [x, y] corner", mark, "unknown_key")
+    if value is None:
+        if entries.strict:
+            raise refuse(f"{key} is no [x, y] corner", mark, "unknown_key")
+        entries.report("unknown key ignored", name)
+        return
+    if len(value) < 2:
+        raise refuse(f"{key} needs two values, x and y", mark, "bad_corner")
+    if len(value) > 2:
+        entries.report("values after x and y ignored", name)
+    if not entries.entry(name, value[0], value[1]):
+        kind = "integers" if entries.strict else "numbers"
+        raise refuse(
+            f"{key}: the corner must be two {kind}, not [{', '.join(value[:2])}]", mark, "bad_corner"
+        )
+
+
+def _line_offset(data: bytes, line: int) -> int:
+    """Byte offset at which the 0-based ``line`` starts."""
+    offset = 0
+    for _ in range(line):
+        offset = data.find(b"\n", offset) + 1
+        if not offset:
+            return len(data)
+    return offset

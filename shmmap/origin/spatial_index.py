@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells touch an area, in time that does not grow with the number of cells.
+
+Every cell is filed under the bucket ``floor(min corner / bucket size)`` of a grid whose buckets are
+as large as the largest cell; the buckets are sorted integer keys ``iy << 32 | ix``.  A cell that
+touches a query has its min corner at most one cell size before the query's, so each bucket row holds
+its candidates in one contiguous run that two binary searches find.  The area's exact test then runs
+on the candidates.  Cells need not form a lattice.  Cells of very different sizes go into several such
+grids, one per power of two, so that one huge cell does not widen the search for all others.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.geometry import Area
+
+__all__ = ["SpatialIndex"]
+
+Indices = NDArray[np.intp]
+Floats = NDArray[np.float64]
+
+# Below this many cells the exact test on all of them is faster than any search.
+_LINEAR_CELLS = 5000
+
+# float32 keeps 24 bits: an area test on float32-rounded values (Autoware's) may move a border by half
+# a unit in the last place, 2**-24 of its magnitude; twice that on the box and on the query side.
+_ROUNDING = 2.0**-22
+
+# Keys hold 31 bits per axis; wider extents get larger buckets.
+_MAX_BUCKETS = 2**31 - 2
+
+
+class _Grid:
+    """Cells of similar size, sorted by the bucket of their min corner."""
+
+    def __init__(self, cells: Indices, boxes: Floats) -> None:
+        min_x, min_y, max_x, max_y = boxes.T
+        self._width, self._height = float((max_x - min_x).max()), float((max_y - min_y).max())
+        self._min_x, self._min_y = float(min_x.min()), float(min_y.min())
+        span_x, span_y = float(min_x.max()) - self._min_x, float(min_y.max()) - self._min_y
+        larger = max(self._width, self._height) or 1.0
+        self._bucket_x = max(self._width or larger, span_x / _MAX_BUCKETS)
+        self._bucket_y = max(self._height or larger, span_y / _MAX_BUCKETS)
+        ix = np.floor((min_x - self._min_x) / self._bucket_x).astype(np.int64)
+        iy = np.floor((min_y - self._min_y) / self._bucket_y).astype(np.int64)
+        self._columns, self._rows = int(ix.max()) + 1, int(iy.max()) + 1
+        keys = iy << 32 | ix
+        order = np.argsort(keys, kind="stable")
+        self._keys = keys[order]
+        self._cells = cells[order]
+
+    @property
+    def nbytes(self) -> int:
+        return int(self._keys.nbytes + self._cells.nbytes)
+
+    def candidates(self, bounds: tuple[float, float, float, float]) -> Indices:
+        """Cells whose box may touch ``bounds``, unordered; all of the grid's if that is about as quick."""
+        x0 = (bounds[0] - self._width - self._min_x) / self._bucket_x
+        y0 = (bounds[1] - self._height - self._min_y) / self._bucket_y
+        x1 = (bounds[2] - self._min_x) / self._bucket_x
+        y1 = (bounds[3] - self._min_y) / self._bucket_y
+        if x1 < 0 or y1 < 0 or x0 >= self._columns or y0 >= self._rows:
+            return self._cells[:0]
+        # clipped before the conversion: a finite area may reach 1e308, no integer does
+        ix0, ix1 = math.floor(max(x0, 0.0)), math.floor(min(x1, self._columns - 1.0))
+        iy0, iy1 = math.floor(max(y0, 0.0)), math.floor(min(y1, self._rows - 1.0))
+        if (iy1 - iy0 + 1) * 8 > len(self._cells):
+            return self._cells
+        rows = np.arange(iy0 << 32, (iy1 + 1) << 32, 1 << 32, dtype=np.int64)
+        starts = self._keys.searchsorted(rows + ix0).tolist()
+        stops = self._keys.searchsorted(rows + (ix1 + 1)).tolist()
+        cells = self._cells
+        return np.concatenate([cells[i:j] for i, j in zip(starts, stops, strict=True)])
+
+
+class SpatialIndex:
+    """Answers which of a fixed set of boxes touch an area.
+
+    Parameters
+    ----------
+    boxes
+        (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame, finite, min <= max.
+    """
+
+    def __init__(self, boxes: Floats) -> None:
+        # column-major: the exact test reads one coordinate of many cells at a time
+        self.boxes: Floats = np.asfortranarray(boxes)
+        self._grids: list[_Grid] = []
+        if len(boxes) > _LINEAR_CELLS:
+            extent = np.maximum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
+            level = np.frexp(extent)[1]
+            for exponent in np.unique(level):
+                cells = np.flatnonzero(level == exponent)
+                self._grids.append(_Grid(cells, boxes[cells]))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the boxes and the search structure."""
+        return int(self.boxes.nbytes) + sum(grid.nbytes for grid in self._grids)
+
+    def query(self, area: Area) -> Indices:
+        """Rows of ``boxes`` that touch ``area`` (closed borders, its z range ignored), ascending."""
+        if not self._grids:
+            return np.flatnonzero(area.overlaps(self.boxes))
+        min_x, min_y, max_x, max_y = area.bounds
+        slack = _ROUNDING * max(abs(min_x), abs(min_y), abs(max_x), abs(max_y))
+        bounds = (min_x - slack, min_y - slack, max_x + slack, max_y + slack)
+        found = [grid.candidates(bounds) for grid in self._grids]
+        candidates = found[0] if len(found) == 1 else np.concatenate(found)
+        hit = candidates[area.overlaps(self.boxes.T.take(candidates, axis=1).T)]
+        hit.sort()
+        return hit
