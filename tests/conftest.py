@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures every kind of test may use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs root where we are not."""
+    if os.geteuid() != 0:
+        for item in items:
+            if item.get_closest_marker("root"):
+                item.add_marker(pytest.mark.skip(reason="needs root (other user accounts, private tmpfs)"))
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Directory of real maps and scans; the test is skipped where SHMMAP_TEST_DATA does not name it."""
+    path = os.environ.get("SHMMAP_TEST_DATA", "")
+    if not path:
+        pytest.skip("SHMMAP_TEST_DATA is not set")
+    return Path(path)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A segment reader written from ``shmmap/segment/LAYOUT.md`` alone."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass
+class SegmentBytes:
+    """Everything a segment says, and its columns as copies or views of ``data``."""
+
+    fields: dict[str, Any]
+    columns: dict[str, NDArray[Any]]
+    units: dict[str, str]
+    checksums: dict[str, int]
+    epoch: int | None
+    version: int | None
+
+
+def parse(data: bytes | mmap.mmap) -> SegmentBytes:
+    """Read a segment; AssertionError where it contradicts the document."""
+    assert data[0:8] == b"SHMMAP\x00\x01"
+    major, _minor, order = struct.unpack_from("<HHI", data, 8)
+    assert (major, order) == (1, 0x01020304)
+    header_bytes, total_bytes, rows, source_points, dropped = struct.unpack_from("<QQQQQ", data, 16)
+    size, mtime_ns, ctime_ns = struct.unpack_from("<Qqq", data, 56)
+    digest = bytes(data[80:96])
+    min_x, min_y, max_x, max_y, z_min, z_max, ox, oy, oz = struct.unpack_from("<9d", data, 96)
+    builder, count, table, row_bytes = struct.unpack_from("<IIII", data, 168)
+    texts = []
+    for at in (184, 192, 200):
+        where, length = struct.unpack_from("<II", data, at)
+        texts.append(bytes(data[where : where + length]).decode())
+    crc_at = header_bytes - 72
+    assert struct.unpack_from("<I", data, crc_at)[0] == zlib.crc32(data[0:crc_at])
+    columns: dict[str, NDArray[Any]] = {}
+    units: dict[str, str] = {}
+    checksums: dict[str, int] = {}
+    for index in range(count):
+        at = table + index * row_bytes
+        name = bytes(data[at : at + 40]).rstrip(b"\0").decode()
+        dtype = bytes(data[at + 40 : at + 48]).rstrip(b"\0").decode()
+        units[name] = bytes(data[at + 48 : at + 64]).rstrip(b"\0").decode()
+        (dimensions,) = struct.unpack_from("<I", data, at + 64)
+        shape = struct.unpack_from("<4Q", data, at + 72)[:dimensions]
+        offset, nbytes, checksums[name] = struct.unpack_from("<QQQ", data, at + 104)
+        assert offset % 64 == 0
+        assert header_bytes <= offset
+        assert offset + nbytes <= total_bytes
+        columns[name] = np.frombuffer(data, dtype, nbytes // np.dtype(dtype).itemsize, offset).reshape(shape)
+    publish = header_bytes - 64
+    epoch = version = None
+    if bytes(data[publish : publish + 8]) != bytes(8):
+        assert bytes(data[publish : publish + 8]) == b"PUBLISH\0"
+        assert struct.unpack_from("<I", data, publish + 56)[0] == zlib.crc32(data[publish : publish + 56])
+        epoch, version = struct.unpack_from("<QQ", data, publish + 8)
+    fields = {
+        "header_bytes": header_bytes, "total_bytes": total_bytes, "rows": rows,
+        "source_points": source_points, "dropped_points": dropped,
+        "source": (size, mtime_ns, ctime_ns), "digest": digest,
+        "box": (min_x, min_y, max_x, max_y), "z": (z_min, z_max), "origin": (ox, oy, oz),
+        "builder_version": builder, "cell_id": texts[0], "layer": texts[1], "frame_id": texts[2],
+    }  # fmt: skip
+    return SegmentBytes(fields, columns, units, checksums, epoch, version)
+
+
+def map_segment(path: str | Path) -> mmap.mmap:
+    """Map a segment the way any other program would: plain open and mmap."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        return mmap.mmap(fd, 0, prot=mmap.PROT_READ)
+    finally:
+        os.close(fd)
+
+
+def read_segment(path: str | Path) -> SegmentBytes:
+    """Read a copy of a segment: nothing stays open or mapped."""
+    return parse(Path(path).read_bytes())
