@@ -8,6 +8,7 @@ finite pays for a mask.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -15,34 +16,35 @@ from numpy.typing import NDArray
 
 __all__ = ["Bounds", "row_extremes"]
 
-_GROUP: Final = 256  # rows folded into one long row, so that numpy reduces with vector instructions
+_GROUP: Final = 512  # rows folded into one long row, so that numpy reduces with vector instructions
 
 
-def row_extremes(rows: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def row_extremes(rows: NDArray[Any]) -> tuple[list[float], list[float]]:
     """Return minimum and maximum of each column of a C-contiguous (N, k) array, N > 0; NaN wins."""
+    with np.errstate(invalid="ignore"):  # signalling NaNs
+        return _reduce(np.minimum, rows), _reduce(np.maximum, rows)
+
+
+def _reduce(extreme: np.ufunc, rows: NDArray[Any]) -> list[float]:
     count, width = rows.shape
     whole = count - count % _GROUP
-    parts = []
     if whole:
-        parts.append(rows[:whole].reshape(-1, _GROUP * width))
-    with np.errstate(invalid="ignore"):  # signalling NaNs
-        low = [part.min(axis=0).reshape(-1, width).T.min(axis=1) for part in parts]
-        high = [part.max(axis=0).reshape(-1, width).T.max(axis=1) for part in parts]
-        if whole < count:
-            rest = np.ascontiguousarray(rows[whole:].T)
-            low.append(rest.min(axis=1))
-            high.append(rest.max(axis=1))
-        if len(low) == 1:
-            return low[0], high[0]
-        return np.minimum(low[0], low[1]), np.maximum(high[0], high[1])
+        folded = extreme.reduce(rows[:whole].reshape(-1, _GROUP * width), axis=0).reshape(_GROUP, width)
+        rest = count - whole
+        if rest:
+            extreme(folded[:rest], rows[whole:], out=folded[:rest])
+        rows = folded
+    # transposed first: numpy would reduce along the short rows one by one
+    values: list[float] = extreme.reduce(np.ascontiguousarray(rows.T), axis=1).tolist()
+    return values
 
 
 class Bounds:
     """Bounds of all finite points seen so far, float64, metres."""
 
     def __init__(self) -> None:
-        self._low = np.full(3, np.inf)
-        self._high = np.full(3, -np.inf)
+        self._low = [math.inf] * 3
+        self._high = [-math.inf] * 3
 
     def add(self, xyz: NDArray[Any]) -> NDArray[np.bool_] | None:
         """Take a block of (N, 3) points in.
@@ -54,7 +56,7 @@ class Bounds:
         if not len(xyz):
             return None
         low, high = row_extremes(xyz)
-        if np.isfinite(low).all() and np.isfinite(high).all():
+        if all(map(math.isfinite, low + high)):
             self._take(low, high)
             return None
         mask: NDArray[np.bool_] = np.isfinite(xyz).all(axis=1)
@@ -62,12 +64,12 @@ class Bounds:
             self._take(*row_extremes(np.ascontiguousarray(xyz[mask])))
         return mask
 
-    def _take(self, low: NDArray[Any], high: NDArray[Any]) -> None:
-        np.minimum(self._low, low, out=self._low)
-        np.maximum(self._high, high, out=self._high)
+    def _take(self, low: list[float], high: list[float]) -> None:
+        self._low = list(map(min, self._low, low))
+        self._high = list(map(max, self._high, high))
 
     def result(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (min_xyz, max_xyz); NaN when no finite point was seen."""
-        if (self._low > self._high).any():
+        if self._low[0] > self._high[0]:
             return np.full(3, np.nan), np.full(3, np.nan)
-        return self._low.copy(), self._high.copy()
+        return np.array(self._low), np.array(self._high)

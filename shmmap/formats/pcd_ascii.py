@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
 from shmmap.formats.causes import refusal
+from shmmap.formats.pcd_header import PcdHeader
 from shmmap.formats.pcd_table import FieldTable
 from shmmap.formats.source_file import SourceFile
 
@@ -30,7 +31,7 @@ _NUMBER: Final = re.compile(
 
 
 def ascii_blocks(
-    source: SourceFile, table: FieldTable, block_points: int, warnings: list[str]
+    source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int, warnings: list[str]
 ) -> Iterator[tuple[NDArray[Any], ...]]:
     """Yield blocks of an ``ascii`` body: one line per point, values separated by white space.
 
@@ -41,7 +42,7 @@ def ascii_blocks(
         are fewer rows than points.
     """
     parser = _AsciiParser(source.path, table)
-    left = table.header.points
+    left = header.points
     for offset, text in _whole_lines(source):
         ends = _line_ends(text)
         line = at = 0
@@ -55,7 +56,7 @@ def ascii_blocks(
                 yield block
         parser.count_surplus(text[at:])
     if left:
-        points = table.header.points
+        points = header.points
         raise refusal(
             "truncated",
             f"{points} points announced, {points - left} rows are there",
@@ -99,13 +100,13 @@ class _AsciiParser:
     def __init__(self, path: str, table: FieldTable) -> None:
         self.path = path
         self.table = table
-        self.values = sum(field.count for field in table.header.fields)
+        self.values = table.values
         self.rows = 0
         self.skipped = 0
         self.surplus = 0
         self.places: dict[str, int] = {}
         place = 0
-        for field in table.header.fields:
+        for field in table.fields:
             if not field.padding:
                 self.places[field.name] = place
             place += field.count

@@ -14,26 +14,16 @@ import re
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
-import numpy as np
-
 from shmmap.formats.causes import refusal
+from shmmap.formats.pcd_fields import FieldProblem, PcdField, parse_fields
 
-__all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdField", "PcdHeader", "parse_header"]
+__all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
 
 HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within these
 MAX_POINTS: Final = (1 << 32) - 1  # WIDTH and HEIGHT are uint32 in PCL
-MAX_POINT_BYTES: Final = 1 << 20
-MAX_FIELDS: Final = 1024
-MAX_NAME_BYTES: Final = 40  # of a column in a segment
 ENCODINGS: Final = ("ascii", "binary", "binary_compressed")
 IDENTITY_VIEWPOINT: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-PADDING: Final = "_"
 
-_DTYPES: Final[dict[tuple[str, int], np.dtype[np.generic]]] = {
-    (kind.upper(), size): np.dtype(f"<{kind}{size}")
-    for kind, sizes in (("f", (4, 8)), ("u", (1, 2, 4, 8)), ("i", (1, 2, 4, 8)))
-    for size in sizes
-}
 _KEYS: Final = frozenset(
     (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 )
@@ -41,36 +31,6 @@ _ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # the name of FIELDS in the oldest fi
 _BOM: Final = b"\xef\xbb\xbf"
 _LFS: Final = b"version https://git-lfs"
 _INTEGER: Final = re.compile(rb"[+-]?[0-9]{1,19}\Z")
-
-
-@dataclass(frozen=True, slots=True)
-class PcdField:
-    """One field of the header.
-
-    Attributes
-    ----------
-    name
-        Unique name: duplicates carry a number, ``x``, ``y`` and ``z`` are in lower case.
-    dtype
-        Little-endian type of one value.
-    count
-        Values per point; 0 only for padding.
-    padding
-        True for fields named ``_``, whose bytes mean nothing.
-    file_name
-        The name as the file has it.
-    """
-
-    name: str
-    dtype: np.dtype[np.generic]
-    count: int
-    padding: bool
-    file_name: str
-
-    @property
-    def row_bytes(self) -> int:
-        """Bytes of one point's values."""
-        return self.dtype.itemsize * self.count
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +117,6 @@ class _HeaderParser:
         width, height, points = self._extent()
         encoding = self._encoding()
         point_bytes = sum(field.row_bytes for field in fields)
-        if point_bytes > MAX_POINT_BYTES:
-            self._refuse(b"COUNT", f"a point of {point_bytes} bytes; the limit is {MAX_POINT_BYTES}")
         header = PcdHeader(
             fields=fields,
             width=width,
@@ -265,66 +223,18 @@ class _HeaderParser:
         return self._integer(key, words[0], 0)
 
     def _fields(self) -> tuple[PcdField, ...]:
-        names = self._need(b"FIELDS")
-        if not 0 < len(names) <= MAX_FIELDS:
-            self._refuse(b"FIELDS", f"{len(names)} fields; 1 to {MAX_FIELDS} can be read")
-        columns = [self._need(b"SIZE"), self._need(b"TYPE"), self.values.get(b"COUNT", [b"1"] * len(names))]
-        for key, words in zip((b"SIZE", b"TYPE", b"COUNT"), columns, strict=True):
-            if len(words) != len(names):
-                self._refuse(key, f"{len(names)} FIELDS, but {len(words)} values in {key.decode()}")
-        decoded = [_field_name(name) for name in names]
-        unique = self._unique_names(decoded)
-        fields = []
-        for file_name, name, size, kind, count in zip(decoded, unique, *columns, strict=True):
-            padding = file_name == PADDING
-            dtype = _DTYPES.get((kind.upper().decode("latin-1"), self._integer(b"SIZE", size, 0)))
-            if dtype is None:
-                text = f"{kind[:8].decode('latin-1')}{size.decode()}"
-                self._refuse(
-                    b"TYPE", f"field {file_name!r} is of type {text!r}, which PCD does not have", "bad_type"
-                )
-            fields.append(
-                PcdField(name, dtype, self._integer(b"COUNT", count, 0 if padding else 1), padding, file_name)
+        counts = self.values.get(b"COUNT")
+        try:
+            fields, warnings = parse_fields(
+                tuple(self._need(b"FIELDS")),
+                tuple(self._need(b"SIZE")),
+                tuple(self._need(b"TYPE")),
+                None if counts is None else tuple(counts),
             )
-        self._check_xyz(fields)
-        return tuple(fields)
-
-    def _unique_names(self, names: list[str]) -> list[str]:
-        """Lower-case x, y and z, number duplicates, cut names to what a segment holds; warn of each."""
-        for name in names:
-            if not name.isprintable():
-                self._refuse(b"FIELDS", f"field name {name!r} has unprintable characters")
-        renamed = list(names)
-        for axis in ("x", "y", "z"):
-            if axis not in names and axis.upper() in names:
-                renamed[names.index(axis.upper())] = axis
-                self.warnings.append(f"field {axis.upper()!r} is taken as {axis!r}")
-        taken = {"xyz"}  # the name of the column that x, y and z become
-        original = set(renamed)
-        for index, name in enumerate(renamed):
-            if name == PADDING:
-                continue
-            short = name.encode()[:MAX_NAME_BYTES].decode(errors="ignore")
-            number, new = 2, short
-            while new in taken or (new != name and new in original):
-                suffix = f"_{number}"
-                new = short.encode()[: MAX_NAME_BYTES - len(suffix)].decode(errors="ignore") + suffix
-                number += 1
-            taken.add(new)
-            renamed[index] = new
-            if new != name:
-                self.warnings.append(f"field {name!r} renamed {new!r}: the name is in use or too long")
-        return renamed
-
-    def _check_xyz(self, fields: list[PcdField]) -> None:
-        counts = {field.name: field.count for field in fields if field.name in ("x", "y", "z")}
-        missing = [axis for axis in ("x", "y", "z") if axis not in counts]
-        if missing:
-            self._refuse(
-                b"FIELDS", f"no field {', '.join(missing)}: not a cloud of points in space", "no_xyz"
-            )
-        if any(count != 1 for count in counts.values()):
-            self._refuse(b"COUNT", "x, y and z need COUNT 1", "no_xyz")
+        except FieldProblem as problem:
+            self._refuse(problem.key, problem.message, problem.cause)
+        self.warnings += warnings
+        return fields
 
     def _extent(self) -> tuple[int, int, int]:
         width, height, points = self._single(b"WIDTH"), self._single(b"HEIGHT"), self._single(b"POINTS")
@@ -375,13 +285,6 @@ class _HeaderParser:
         if (x, y, z, abs(qw), qx, qy, qz) != IDENTITY_VIEWPOINT:
             self.warnings.append("VIEWPOINT is not the identity; the points are left as they are")
         return x, y, z, qw, qx, qy, qz
-
-
-def _field_name(name: bytes) -> str:
-    try:
-        return name.decode()
-    except UnicodeDecodeError:
-        return name.decode("latin-1")
 
 
 def _check_size(header: PcdHeader, path: str, file_bytes: int) -> None:

@@ -25,7 +25,7 @@ from shmmap.formats.finite import Bounds
 from shmmap.formats.pcd_ascii import ascii_blocks
 from shmmap.formats.pcd_binary import binary_blocks, compressed_blocks
 from shmmap.formats.pcd_header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
-from shmmap.formats.pcd_table import FieldTable
+from shmmap.formats.pcd_table import field_table
 from shmmap.formats.source_file import SourceFile
 
 __all__ = ["Block", "PcdReader"]
@@ -75,7 +75,7 @@ class PcdReader:
         file: str | os.PathLike[str] | int,
         *,
         keep_non_finite: bool = False,
-        block_points: int = 1 << 14,
+        block_points: int = 1 << 16,
         path: str = "",
     ) -> None:
         self.path = path or (f"<descriptor {file}>" if isinstance(file, int) else os.fspath(file))
@@ -83,13 +83,15 @@ class PcdReader:
         self._fd = file if isinstance(file, int) else _open(self.path)
         try:
             self._source = SourceFile(self._fd, self.path)
-            self.header: PcdHeader = self._read_header()
+            self._head = self._read_head()
+            self.header: PcdHeader = parse_header(self._head, path=self.path, file_bytes=self._source.size)
+            self._head = self._head[: self.header.data_offset]
         except BaseException:
             self.close()
             raise
         self._keep = keep_non_finite
         self._block_points = max(1, block_points)
-        self._table = FieldTable(self.header)
+        self._table = field_table(self.header.fields)
         self._bounds = Bounds()
         self._warnings: list[str] = []
         self.columns: tuple[ColumnSpec, ...] = self._table.columns
@@ -104,6 +106,10 @@ class PcdReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def fileno(self) -> int:
+        """The open file's descriptor."""
+        return self._fd
 
     def close(self) -> None:
         """Close the file if this reader opened it."""
@@ -132,13 +138,13 @@ class PcdReader:
         self.digest = b""
         self._bounds = Bounds()
         self._warnings.clear()
-        source.start(header.data_offset)
+        source.start(self._head)
         if header.encoding == "binary":
-            raw = binary_blocks(source, self._table, self._block_points)
+            raw = binary_blocks(source, header, self._table, self._block_points)
         elif header.encoding == "ascii":
-            raw = ascii_blocks(source, self._table, self._block_points, self._warnings)
+            raw = ascii_blocks(source, header, self._table, self._block_points, self._warnings)
         else:
-            raw = compressed_blocks(source, self._table, self._block_points)
+            raw = compressed_blocks(source, header, self._table, self._block_points)
         for block in raw:
             mask = self._bounds.add(block[0])
             if mask is None or self._keep:
@@ -156,12 +162,13 @@ class PcdReader:
             source.read(min(source.left, _TAIL_READ_BYTES))
         self.digest = source.digest()
 
-    def _read_header(self) -> PcdHeader:
+    def _read_head(self) -> bytes:
+        """Return the first bytes of the file, at least its whole header."""
         size = self._source.size
         head = self._source.peek(min(size, _FIRST_READ_BYTES))
         if len(head) < size and not _DATA_LINE.search(head):
             head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
-        return parse_header(head, path=self.path, file_bytes=size)
+        return head
 
 
 def _open(path: str) -> int:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -11,11 +12,10 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_header import PcdField, PcdHeader
+from shmmap.formats.pcd_fields import AXES, PcdField
 
-__all__ = ["FieldTable", "coordinate_dtype"]
+__all__ = ["FieldTable", "coordinate_dtype", "field_table"]
 
-_AXES: Final = ("x", "y", "z")
 _EXACT: Final = 1 << 53  # the largest integers that float64 holds exactly
 
 
@@ -36,27 +36,37 @@ class FieldTable:
         ``xyz`` first, then every field that is neither padding nor a coordinate, in file order.
     axes, others
         The fields behind ``xyz`` and behind the other columns.
+    record
+        Packed type of one point in a ``binary`` file; fields by their unique names, padding skipped.
+    values
+        Values per point in an ``ascii`` file, padding included.
     """
 
-    def __init__(self, header: PcdHeader) -> None:
-        self.header = header
-        by_name = {field.name: field for field in header.fields}
-        self.axes: tuple[PcdField, ...] = tuple(by_name[axis] for axis in _AXES)
+    def __init__(self, fields: tuple[PcdField, ...]) -> None:
+        self.fields = fields
+        by_name = {field.name: field for field in fields}
+        self.axes: tuple[PcdField, ...] = tuple(by_name[axis] for axis in AXES)
         self.others: tuple[PcdField, ...] = tuple(
-            field for field in header.fields if not field.padding and field.name not in _AXES
+            field for field in fields if not field.padding and field.name not in AXES
         )
         self.xyz_dtype = coordinate_dtype([field.dtype for field in self.axes])
         self.columns: tuple[ColumnSpec, ...] = (
             ColumnSpec("xyz", self.xyz_dtype, 3, "m"),
             *(ColumnSpec(field.name, field.dtype, field.count) for field in self.others),
         )
+        self.values = sum(field.count for field in fields)
+        self.record = _record_dtype(fields)
+
+    def block_shapes(self, rows: int) -> list[tuple[tuple[int, ...], np.dtype[Any]]]:
+        """Shape and type of each column in a block of ``rows`` rows."""
+        return [
+            ((rows,) if spec.components == 1 else (rows, spec.components), spec.dtype)
+            for spec in self.columns
+        ]
 
     def empty_block(self, rows: int) -> tuple[NDArray[Any], ...]:
         """Return one uninitialised array of ``rows`` rows per column."""
-        return tuple(
-            np.empty(rows if spec.components == 1 else (rows, spec.components), spec.dtype)
-            for spec in self.columns
-        )
+        return tuple(np.empty(shape, dtype) for shape, dtype in self.block_shapes(rows))
 
     def put_axis(self, xyz: NDArray[Any], axis: int, values: NDArray[Any], path: str) -> None:
         """Copy one coordinate into its place.
@@ -66,8 +76,31 @@ class FieldTable:
         MapDataError
             ``coordinate_range`` if a 64-bit integer is too large for float64.
         """
+        if values.dtype == xyz.dtype:
+            xyz[:, axis] = values
+            return
         wide = values.dtype.kind in "iu" and values.dtype.itemsize == 8 and len(values) > 0
         if wide and (int(values.max()) > _EXACT or int(values.min()) < -_EXACT):
-            raise refusal("coordinate_range", f"{_AXES[axis]} has integers beyond 2**53", path=path)
-        with np.errstate(invalid="ignore"):  # signalling NaNs, when float32 widens
+            raise refusal("coordinate_range", f"{AXES[axis]} has integers beyond 2**53", path=path)
+        with np.errstate(invalid="ignore"):  # signalling NaNs
             xyz[:, axis] = values
+
+
+def _record_dtype(fields: tuple[PcdField, ...]) -> np.dtype[Any]:
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    at = 0
+    for field in fields:
+        if not field.padding:
+            names.append(field.name)
+            formats.append(field.dtype if field.count == 1 else (field.dtype, (field.count,)))
+            offsets.append(at)
+        at += field.row_bytes
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": at})
+
+
+@lru_cache(maxsize=64)  # the cells of a map share their fields
+def field_table(fields: tuple[PcdField, ...]) -> FieldTable:
+    """Return the table for ``fields``."""
+    return FieldTable(fields)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 from shmmap.formats import lzf
-from shmmap.formats.pcd_header import ENCODINGS, IDENTITY_VIEWPOINT, PADDING
+from shmmap.formats.pcd_fields import PADDING
+from shmmap.formats.pcd_header import ENCODINGS, IDENTITY_VIEWPOINT
 
 __all__ = ["write_pcd"]
 

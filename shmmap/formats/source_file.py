@@ -49,11 +49,11 @@ class SourceFile:
         except OSError as error:
             self._unreadable(error)
 
-    def start(self, offset: int) -> None:
-        """Digest everything before ``offset`` and go on from there."""
-        self.at = 0
+    def start(self, head: bytes) -> None:
+        """Digest ``head``, the first bytes of the file, and go on after it."""
+        self.at = len(head)
         self._hash.reset()
-        self.read(offset)
+        self._hash.update(head)
 
     def read(self, count: int) -> NDArray[np.uint8]:
         """Return the next ``count`` bytes in a buffer that the next call reuses.
@@ -69,22 +69,9 @@ class SourceFile:
         self._read_into(part.data)
         return part
 
-    def read_bytes(self, count: int) -> bytes:
-        """Return the next ``count`` bytes as an object of their own."""
-        try:
-            data = os.pread(self._fd, count, self.at)
-        except OSError as error:
-            self._unreadable(error)
-        if len(data) < count:  # one pread returns at most 2 GiB
-            rest = bytearray(data)
-            rest.extend(bytes(count - len(data)))
-            self.at += len(data)
-            self._hash.update(data)
-            self._read_into(memoryview(rest)[len(data) :])
-            return bytes(rest)
-        self.at += count
-        self._hash.update(data)
-        return data
+    def read_into(self, part: NDArray[np.uint8]) -> None:
+        """Fill ``part`` with the next bytes; errors as in `read`."""
+        self._read_into(part.data)
 
     def digest(self) -> bytes:
         """XXH3-128 of everything read so far."""

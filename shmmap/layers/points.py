@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``points`` layer: the source itself, every field a column, the bits unchanged."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Final
+
+from shmmap.formats.causes import refusal
+from shmmap.formats.pcd_reader import Block, PcdReader
+from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.writer import SegmentWriter
+
+__all__ = ["BUILDER_VERSION", "LAYER", "build_points"]
+
+LAYER: Final = "points"
+BUILDER_VERSION: Final = 1  # raise it when the same source would give other bytes
+
+
+def build_points(
+    source: str | int,
+    segment_fd: int,
+    *,
+    cell_id: str,
+    box: tuple[float, float, float, float],
+    frame_id: str = "map",
+    path: str = "",
+    keep_non_finite: bool = False,
+    reserve: Callable[[int], None] | None = None,
+) -> SegmentHeader:
+    """Stream a PCD file into an empty segment file.
+
+    Blocks go from the source through a buffer into the segment, so memory does not grow with the
+    cell.  A file with points that are not finite is read twice: the first pass counts what stays.
+
+    Parameters
+    ----------
+    source
+        Path or open descriptor of the PCD file.
+    segment_fd
+        Empty file on the shared-memory file system, open for reading and writing.  After an error
+        its contents mean nothing.
+    cell_id, box, frame_id
+        For the segment's header; ``box`` is (min_x, min_y, max_x, max_y) in metres.
+    path
+        The name used in messages when ``source`` is a descriptor.
+    keep_non_finite
+        Keep points whose x, y or z is NaN or infinite.
+    reserve
+        Called with the segment's size in bytes before anything is allocated; it refuses by raising.
+
+    Returns
+    -------
+    The header as written, publish block empty.
+
+    Raises
+    ------
+    MapDataError
+        If the file cannot be read, or changed meanwhile (cause ``changed``).
+    OSError
+        ENOSPC if the file system is full.
+    """
+    with PcdReader(source, path=path, keep_non_finite=keep_non_finite) as reader:
+        stamp = _stamp(reader.fileno())
+        rows = reader.header.points
+        writer = _started(reader, rows, segment_fd, reserve, cell_id, box, frame_id)
+        for block in reader.blocks():
+            if not reader.dropped:  # else this pass can only count
+                _append(writer, block)
+        if reader.dropped:
+            rows = reader.kept
+            os.ftruncate(segment_fd, 0)
+            writer = _started(reader, rows, segment_fd, reserve, cell_id, box, frame_id)
+            for block in reader.blocks():
+                if reader.kept <= rows:
+                    _append(writer, block)
+        if reader.kept != rows or _stamp(reader.fileno()) != stamp:
+            raise refusal("changed", "the file changed while it was being read", path=reader.path)
+        low, high = reader.bounds
+        return writer.finish(
+            z_min=float(low[2]),
+            z_max=float(high[2]),
+            source=stamp,
+            source_digest=reader.digest,
+            source_points=reader.header.points,
+            dropped_points=reader.dropped,
+            builder_version=BUILDER_VERSION,
+        )
+
+
+def _started(
+    reader: PcdReader,
+    rows: int,
+    segment_fd: int,
+    reserve: Callable[[int], None] | None,
+    cell_id: str,
+    box: tuple[float, float, float, float],
+    frame_id: str,
+) -> SegmentWriter:
+    writer = SegmentWriter(reader.columns, rows, cell_id=cell_id, layer=LAYER, box=box, frame_id=frame_id)
+    if reserve is not None:
+        reserve(writer.total_bytes)
+    writer.start(segment_fd)
+    return writer
+
+
+def _append(writer: SegmentWriter, block: Block) -> None:
+    for index, column in enumerate(block):
+        writer.append(index, column)
+
+
+def _stamp(fd: int) -> SourceStamp:
+    status = os.fstat(fd)
+    return SourceStamp(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
