@@ -138,7 +138,7 @@ class MapWriter:
     ) -> None:
         self.discard()
 
-    def add(self, columns: Columns) -> None:
+    def add(self, columns: Columns, *, complete: bool = False) -> None:
         """Add points to whatever cells they fall into.
 
         Parameters
@@ -146,12 +146,14 @@ class MapWriter:
         columns
             Arrays of equal length: ``xyz`` (N, 3) float32 or float64, metres, map frame, and any
             others, (N,) or (N, k).  Every call brings the same names, dtypes and widths.
+        complete
+            These are all the points of their cells: the cells are written now, nothing is held back.
 
         Raises
         ------
         BadRequest
-            The columns are not as described, a cell was already written by `add_cell`, or a
-            coordinate is beyond 2**31 m.
+            The columns are not as described, a cell was completed before, or a coordinate is beyond
+            2**31 m.
         """
         rows = self._rows(columns)
         ix, iy = self._cell_indices(rows)
@@ -159,37 +161,15 @@ class MapWriter:
         rows = rows[order]
         for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
             where = (int(ix[order[start]]), int(iy[order[start]]))
-            if where in self._written:
-                raise BadRequest(f"the cell at {self._corner_text(where)} is complete already")
-            self._pending.setdefault(where, _Cell([])).rows.append(rows[start:stop])
-        self._pending_bytes += rows.nbytes
+            if where in self._written or (complete and where in self._pending):
+                raise BadRequest(f"the cell at {self._corner_text(where)} has points already")
+            if complete:
+                self._write(where, rows[start:stop])
+            else:
+                self._pending.setdefault(where, _Cell([])).rows.append(rows[start:stop])
+                self._pending_bytes += rows[start:stop].nbytes
         if self._pending_bytes > self._memory_bytes:
             self._spill()
-
-    def add_cell(self, ix: int, iy: int, columns: Columns) -> None:
-        """Write a whole cell at once: quicker than `add`, and holds nothing back.
-
-        Parameters
-        ----------
-        ix, iy
-            The cell ``[ix * size, (ix + 1) * size)`` and the same in y.
-        columns
-            As for `add`; all points must lie in the cell.  No points, no file.
-
-        Raises
-        ------
-        BadRequest
-            As for `add`; or a point lies outside, or the cell has points already.
-        """
-        rows = self._rows(columns)
-        if (ix, iy) in self._written or (ix, iy) in self._pending:
-            raise BadRequest(f"the cell at {self._corner_text((ix, iy))} has points already")
-        if not len(rows):
-            return
-        found_x, found_y = self._cell_indices(rows)
-        if not bool(((found_x == ix) & (found_y == iy)).all()):
-            raise BadRequest(f"points outside the cell at {self._corner_text((ix, iy))}")
-        self._write((ix, iy), rows)
 
     def finish(self) -> WrittenMap:
         """Write what is held back and the metadata, and let the map appear.
