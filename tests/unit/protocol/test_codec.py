@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is no message is refused by name; what an area says survives the wire."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap import geometry
+from shmmap.errors import BadRequest, ProtocolMismatch
+from shmmap.protocol.codec import (
+    decode_reply,
+    decode_request,
+    encode,
+    pack_versions,
+    request_number,
+    unpack_versions,
+)
+from shmmap.protocol.messages import Area, Hello, area_from_message, area_to_message
+from tests.support.message_pack import pack
+
+coordinate = st.floats(-1e7, 1e7)
+length = st.floats(0, 1e5)
+z_range = st.none() | st.tuples(coordinate, length).map(lambda p: geometry.ZRange(p[0], p[0] + p[1]))
+areas = (
+    st.builds(geometry.Circle, coordinate, coordinate, length, z_range)
+    | st.builds(geometry.AutowareSquare, coordinate, coordinate, length, z_range)
+    | st.tuples(coordinate, coordinate, length, length, z_range).map(
+        lambda b: geometry.Box(b[0], b[1], b[0] + b[2], b[1] + b[3], b[4])
+    )
+)
+
+BAD = [
+    b"",
+    b"\xc1",
+    b"\x90",
+    b"\xc0",
+    b"\x81\xa1a\x01",
+    b"\xdd\xff\xff\xff\xff",  # four thousand million elements
+    b"\xdb\xff\xff\xff\xff",
+    b"\x91" * 5000,  # nested too deep
+    pack(["hello"]),
+    pack(["nonsense", 1]),
+    pack([1, 1]),
+    pack(["hello", "one", 1, 0]),
+    pack(["area", 1, ["triangle", 1, 2, 3]]),
+    pack(["area", 1, ["circle", 1, 2]]),
+    pack(["area", 1, ["circle", "1", 2, 3]]),
+    pack(["selected", 1, "abc"]),
+    pack(["selected", 1, [1]]),
+    pack(["differential", 1, ["circle", 1, 2, 3], ["points"], [], "text"]),
+    b"\x93\xa8selected\x01\x91\xa2\xff\xfe",  # text that is no UTF-8
+]
+
+
+@pytest.mark.parametrize("data", BAD)
+def test_what_is_no_request_is_refused(data: bytes) -> None:
+    with pytest.raises(BadRequest):
+        decode_request(data)
+
+
+@pytest.mark.parametrize("data", [*BAD, encode(Hello(1, 1, 0))])
+def test_what_is_no_reply_is_refused(data: bytes) -> None:
+    with pytest.raises(ProtocolMismatch):
+        decode_reply(data)
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_message_or_refused(data: bytes) -> None:
+    for decode, refusal in ((decode_request, BadRequest), (decode_reply, ProtocolMismatch)):
+        try:
+            message = decode(data)
+        except refusal:
+            continue
+        assert message.request is not None
+
+
+@pytest.mark.parametrize(
+    ("data", "number"),
+    [
+        (pack(["nonsense", 7]), 7),
+        (pack(["area", 2**64 - 1, "bad"]), 2**64 - 1),
+        (pack(["area", -1]), 0),
+        (pack(["area", "7"]), 0),
+        (pack(["area"]), 0),
+        (pack({"area": 7}), 0),
+        (b"\xc1", 0),
+        (b"", 0),
+    ],
+)
+def test_the_id_of_a_bad_request_is_found_where_there_is_one(data: bytes, number: int) -> None:
+    assert request_number(data) == number
+
+
+@given(areas)
+def test_areas_survive_the_wire(area: geometry.Area) -> None:
+    message = decode_request(encode(Area(1, area_to_message(area))))
+    assert isinstance(message, Area)
+    assert area_from_message(message.area) == area
+
+
+@pytest.mark.parametrize(
+    "area",
+    [
+        ["circle", math.nan, 0, 1],
+        ["circle", 0, math.inf, 1],
+        ["circle", 0, 0, -1],
+        ["circle", 0, 0, math.nan],
+        ["square", 0, 0, -0.5],
+        ["square", 1e39, 0, 1],
+        ["box", 1, 0, 0, 1],
+        ["box", 0, 0, math.inf, 1],
+        ["circle", 0, 0, 1, 5, 4],
+        ["circle", 0, 0, 1, math.nan, 4],
+    ],
+)
+def test_areas_that_make_no_sense_are_refused(area: list[object]) -> None:
+    message = decode_request(pack(["area", 1, area]))
+    assert isinstance(message, Area)
+    with pytest.raises(BadRequest):
+        area_from_message(message.area)
+
+
+@given(st.lists(st.integers(0, 2**64 - 1)))
+def test_packed_versions(versions: list[int]) -> None:
+    packed = pack_versions(versions)
+    assert packed == b"".join(v.to_bytes(8, "little") for v in versions)
+    assert list(unpack_versions(packed)) == versions
+
+
+@pytest.mark.parametrize("count", [1, 7, 9, 15])
+def test_packed_versions_cut_short_are_refused(count: int) -> None:
+    with pytest.raises(BadRequest):
+        unpack_versions(bytes(count))
