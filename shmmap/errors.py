@@ -15,6 +15,7 @@
     │   └── NoAnswer           connected, but no reply before the deadline
     ├── ProtocolMismatch       client and daemon speak different versions         exit 76
     ├── InstanceBusy           another daemon owns this instance                  exit 75
+    ├── NoSession              the daemon does not know this session: say hello       exit 1
     ├── NotPermitted           the daemon refuses this to this user               exit 1
     ├── SegmentError           a segment cannot be used
     │   ├── StaleHandle        it is gone: ask again                              exit 1
@@ -48,6 +49,7 @@ __all__ = [
     "MapDataError",
     "MapMissing",
     "NoAnswer",
+    "NoSession",
     "NoSocket",
     "NoSpace",
     "NotPermitted",
@@ -188,6 +190,13 @@ class InstanceBusy(ShmmapError):
 
     code = "instance_busy"
     exit_code = 75
+
+
+class NoSession(ShmmapError):
+    """The daemon does not know the connection's session (it was restarted): say hello again."""
+
+    code = "no_session"
+    exit_code = 1
 
 
 class NotPermitted(ShmmapError):

@@ -28,6 +28,7 @@ def build_points(
     path: str = "",
     keep_non_finite: bool = False,
     reserve: Callable[[int], None] | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> SegmentHeader:
     """Stream a PCD file into an empty segment file.
 
@@ -49,6 +50,8 @@ def build_points(
         Keep points whose x, y or z is NaN or infinite.
     reserve
         Called with the segment's size in bytes before anything is allocated; it refuses by raising.
+    warn
+        Called with each oddity of the file.
 
     Returns
     -------
@@ -77,6 +80,9 @@ def build_points(
                     _append(writer, block)
         if reader.kept != rows or _stamp(reader.fileno()) != stamp:
             raise refusal("changed", "the file changed while it was being read", path=reader.path)
+        if warn is not None:
+            for warning in reader.warnings:
+                warn(warning)
         low, high = reader.bounds
         return writer.finish(
             z_min=float(low[2]),

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterable
 from typing import Final
 
 import msgspec
@@ -10,7 +12,16 @@ import msgspec
 from shmmap.errors import BadRequest, ProtocolMismatch
 from shmmap.protocol.messages import Handle, Reply, Request
 
-__all__ = ["MAX_REQUEST_BYTES", "decode_reply", "decode_request", "encode", "encode_handle"]
+__all__ = [
+    "MAX_REQUEST_BYTES",
+    "decode_reply",
+    "decode_request",
+    "encode",
+    "encode_handle",
+    "pack_versions",
+    "request_number",
+    "unpack_versions",
+]
 
 MAX_REQUEST_BYTES: Final = 4 << 20
 """Larger requests are refused by the socket itself: 10^5 packed held cells fit 800 kB."""
@@ -33,6 +44,29 @@ def decode_request(data: bytes | memoryview) -> Request:
         return _requests.decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise BadRequest(f"the request does not decode: {error}") from error
+
+
+def request_number(data: bytes | memoryview) -> int:
+    """Return the request id of a message that does not decode as a whole; 0 where there is none."""
+    try:
+        start = msgspec.msgpack.decode(data)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+        return 0
+    if isinstance(start, list) and len(start) > 1 and isinstance(start[1], int):
+        return start[1] if 0 <= start[1] < 1 << 64 else 0
+    return 0
+
+
+def pack_versions(versions: Iterable[int]) -> bytes:
+    """Return cell versions as 8 bytes little-endian each."""
+    return b"".join(version.to_bytes(8, "little") for version in versions)
+
+
+def unpack_versions(packed: bytes) -> tuple[int, ...]:
+    """Read packed cell versions; `BadRequest` if they are no multiple of 8 bytes."""
+    if len(packed) % 8:
+        raise BadRequest(f"packed versions of {len(packed)} bytes are no multiple of 8")
+    return struct.unpack(f"<{len(packed) // 8}Q", packed)
 
 
 def decode_reply(data: bytes | memoryview) -> Reply:

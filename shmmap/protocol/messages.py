@@ -18,6 +18,7 @@ __all__ = [
     "PROTOCOL_VERSION",
     "Area",
     "AreaMessage",
+    "Bye",
     "Cells",
     "Differential",
     "ErrorReply",
@@ -231,8 +232,14 @@ class Evict(msgspec.Struct, array_like=True, tag="evict"):
     ids: tuple[str, ...] | None = None
 
 
+class Bye(msgspec.Struct, array_like=True, tag="bye"):
+    """The session ends; there is no reply.  What it still maps stays pinned by the kernel's word."""
+
+    request: int
+
+
 Request: TypeAlias = (
-    Hello | Metadata | Area | Differential | Selected | Release | Stats | Show | Reload | Evict
+    Hello | Metadata | Area | Differential | Selected | Release | Stats | Show | Reload | Evict | Bye
 )
 
 

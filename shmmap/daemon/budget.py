@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much shared memory the daemon may use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from shmmap.errors import ConfigError
+from shmmap.segment.directory import ShmDirectory
+
+__all__ = ["choose_budget"]
+
+DEFAULT_CEILING_BYTES: Final = 4 << 30
+RESERVE_BYTES: Final = 256 << 20
+SMALLEST_BYTES: Final = 1 << 20
+
+
+def _available_bytes() -> int:
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return DEFAULT_CEILING_BYTES
+
+
+def choose_budget(asked_bytes: int, directory: ShmDirectory) -> int:
+    """Return the budget in bytes.
+
+    An explicit one that does not fit the file system is refused.  The default is a quarter of the
+    available memory, at most 4 GiB, less where the file system is smaller (a reserve of 5 %, at
+    most 256 MiB, stays free).
+
+    Raises
+    ------
+    ConfigError
+        The explicit budget is larger than what is free, or too small for anything.
+    """
+    size, free = directory.size_bytes(), directory.free_bytes()
+    room = free - min(size // 20, RESERVE_BYTES)
+    if asked_bytes:
+        if asked_bytes > free:
+            raise ConfigError(
+                f"a budget of {asked_bytes} bytes does not fit {directory.path}, which has {free} free",
+                key="budget",
+                hint="lower --budget, or enlarge the tmpfs (docker: --shm-size)",
+            )
+        if asked_bytes < SMALLEST_BYTES:
+            raise ConfigError(
+                f"a budget of {asked_bytes} bytes is too small", key="budget", hint="use at least 1M"
+            )
+        return asked_bytes
+    budget = min(_available_bytes() // 4, DEFAULT_CEILING_BYTES, room)
+    if budget < SMALLEST_BYTES:
+        raise ConfigError(
+            f"{directory.path} has only {free} bytes free",
+            key="shm_dir",
+            hint="free some, enlarge the tmpfs (docker: --shm-size), or name another --shm-dir",
+        )
+    return budget

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon's settings: defaults, then one TOML file, then ``SHMMAP_*`` variables, then flags."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+from shmmap.errors import ConfigError
+from shmmap.protocol.endpoint import (
+    DEFAULT_INSTANCE,
+    SYSTEM_RUNTIME_DIR,
+    endpoint_path,
+    runtime_dirs,
+    socket_path,
+)
+from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import check_instance
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = ["DaemonConfig", "load_config", "parse_bytes"]
+
+_SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
+_ENVIRONMENT: Final = "SHMMAP_"
+_NOT_SETTINGS: Final = ("SHMMAP_TEST_", "SHMMAP_ENDPOINT")
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonConfig:
+    """Every setting of the daemon.
+
+    Attributes
+    ----------
+    map_path
+        Directory of a divided map, or one PCD file.
+    metadata
+        Metadata YAML, where it lies neither beside nor in the map; empty: look there.
+    instance
+        Name of this daemon among several on one machine.
+    runtime_dir, endpoint
+        Directory of socket and lock, or the socket itself; empty: the user's or the system's.
+    shm_dir
+        Where segments live.
+    group
+        Group that may connect and read; empty: only the daemon's own user.
+    budget_bytes
+        Most shared memory the daemon uses; 0: a quarter of what is available, at most 4 GiB.
+    session_quota
+        What one client may keep for itself alone: a part of the budget (up to 1), or bytes (above 1).
+    workers
+        Most loader processes at a time.
+    load_timeout_s
+        How long loading one cell may take.
+    strict
+        Accept only what Autoware's own loader accepts.
+    cache_dir
+        Where the prepared catalogue is kept; empty: the user's cache directory.
+    eviction
+        ``distance`` or ``lru``.
+    """
+
+    map_path: str = ""
+    metadata: str = ""
+    instance: str = DEFAULT_INSTANCE
+    runtime_dir: str = ""
+    endpoint: str = ""
+    shm_dir: str = DEFAULT_SHM_DIR
+    group: str = ""
+    budget_bytes: int = 0
+    session_quota: float = 0.9
+    workers: int = 4
+    load_timeout_s: float = 60.0
+    strict: bool = False
+    cache_dir: str = ""
+    eviction: str = "distance"
+
+    def socket(self) -> str:
+        """Path of the request socket."""
+        if self.endpoint:
+            return endpoint_path(self.endpoint)
+        directory = self.runtime_dir or os.environ.get("RUNTIME_DIRECTORY", "") or _default_runtime_dir()
+        return endpoint_path(socket_path(directory, self.instance))
+
+
+def _default_runtime_dir() -> str:
+    candidates = runtime_dirs()
+    if len(candidates) > 1 or os.geteuid() == 0:
+        return candidates[0]
+    raise ConfigError(
+        "no runtime directory: XDG_RUNTIME_DIR is not set and this user may not use " + SYSTEM_RUNTIME_DIR,
+        key="runtime_dir",
+        hint="give --runtime-dir DIR, and the same to clients or SHMMAP_ENDPOINT",
+    )
+
+
+def parse_bytes(text: str) -> int:
+    """Read a size such as ``512M``, ``2GiB`` or ``1000000`` (powers of 1024)."""
+    match = _SIZE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"{text!r} is no size", hint="write for example 512M or 2G")
+    return int(float(match[1]) * 1024 ** " kmgt".index(match[2].lower() or " "))
+
+
+def _convert(name: str, value: Any, origin: str) -> Any:
+    """Check one setting's type and range."""
+    kind = type(getattr(DaemonConfig(), name))
+    try:
+        if name == "budget_bytes":
+            value = parse_bytes(value) if isinstance(value, str) else value
+        if name == "session_quota" and isinstance(value, str) and not value.replace(".", "").isdigit():
+            value = float(parse_bytes(value))
+        if kind is bool and isinstance(value, str):
+            value = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}[
+                value.lower()
+            ]
+        elif kind in (int, float) and isinstance(value, str):
+            value = kind(value)
+        elif kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise ValueError
+    except (KeyError, ValueError):
+        raise ConfigError(
+            f"{origin}: {name} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
+        ) from None
+    allowed: dict[str, Callable[[Any], bool]] = {
+        "session_quota": lambda v: v > 0,
+        "workers": lambda v: 1 <= v <= 64,
+        "load_timeout_s": lambda v: 0 < v <= 86400,
+        "budget_bytes": lambda v: v >= 0,
+        "eviction": lambda v: v in ("distance", "lru"),
+    }
+    if name in allowed and not allowed[name](value):
+        raise ConfigError(f"{origin}: {name} cannot be {value!r}", key=name, origin=origin)
+    if name == "instance":
+        check_instance(value)
+    return value
+
+
+def _unknown(name: str, origin: str) -> ConfigError:
+    names = [field.name for field in fields(DaemonConfig)]
+    near = difflib.get_close_matches(name, [*names, "budget"], n=1)
+    return ConfigError(
+        f"{origin}: unknown setting {name!r}",
+        key=name,
+        origin=origin,
+        hint=f"did you mean {near[0]!r}?" if near else f"settings are: {', '.join(names)}",
+    )
+
+
+def _from_file(path: str) -> dict[str, Any]:
+    try:
+        settings: dict[str, Any] = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}", origin=path) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}", origin=path) from error
+    return settings
+
+
+def load_config(
+    flags: Mapping[str, Any], *, file: str = "", environ: Mapping[str, str] = os.environ
+) -> DaemonConfig:
+    """Put the settings together; later origins override earlier ones.
+
+    Parameters
+    ----------
+    flags
+        Settings given on the command line, by attribute name (``budget`` stands for
+        ``budget_bytes``); None means not given.
+    file
+        TOML file, empty for none.
+    environ
+        Variables named ``SHMMAP_`` and the setting in capitals count.
+
+    Raises
+    ------
+    ConfigError
+        An unknown key (with a suggestion), a wrong type or an impossible value, and where it is set.
+    """
+    known = {field.name for field in fields(DaemonConfig)}
+    variables = {
+        name: value
+        for name, value in environ.items()
+        if name.startswith(_ENVIRONMENT) and not name.startswith(_NOT_SETTINGS)
+    }
+    origins: list[tuple[str, dict[str, Any]]] = [
+        (file, _from_file(file) if file else {}),
+        *((name, {name.removeprefix(_ENVIRONMENT).lower(): value}) for name, value in variables.items()),
+        ("command line", {name: value for name, value in flags.items() if value is not None}),
+    ]
+    settings: dict[str, Any] = {}
+    for origin, values in origins:
+        for given, value in values.items():
+            name = "budget_bytes" if given == "budget" else given
+            if name not in known:
+                raise _unknown(given, origin)
+            settings[name] = _convert(name, value, origin)
+    return DaemonConfig(**settings)

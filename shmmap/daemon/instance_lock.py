@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One daemon per instance: libzmq lets a second bind steal a live socket, so a lock comes first."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from pathlib import Path
+
+from shmmap.errors import ConfigError, InstanceBusy
+
+__all__ = ["InstanceLock"]
+
+
+class InstanceLock:
+    """An exclusive ``flock`` on a file, held for the daemon's life and removed with it.
+
+    Raises
+    ------
+    InstanceBusy
+        Somebody holds it; the message names the process.
+    ConfigError
+        The file cannot be made.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        while True:
+            try:
+                fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            except OSError as error:
+                raise ConfigError(f"lock file {path}: {error.strerror}", key="runtime_dir") from error
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                owner = os.pread(fd, 64, 0).decode(errors="replace").strip()
+                os.close(fd)
+                raise InstanceBusy(
+                    f"another daemon{f' (pid {owner})' if owner else ''} holds {path}",
+                    hint="stop it, or choose another --instance or --runtime-dir",
+                ) from None
+            with contextlib.suppress(FileNotFoundError):
+                if Path(path).stat().st_ino == os.fstat(fd).st_ino:
+                    break
+            os.close(fd)  # its owner removed it just before we got the lock: try the new file
+        self._fd = fd
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Remove the file and let the next daemon in."""
+        Path(self.path).unlink(missing_ok=True)
+        os.close(self._fd)

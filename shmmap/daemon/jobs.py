@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the daemon and its loader workers say to each other.
+
+One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Done` also
+carries the finished segment's file descriptor.  Both ends are always the same version of shmmap,
+so this is no public protocol.
+"""
+
+from __future__ import annotations
+
+from typing import Final, TypeAlias
+
+import msgspec
+
+__all__ = [
+    "Done",
+    "Failed",
+    "FromWorker",
+    "Grant",
+    "Job",
+    "Need",
+    "Refuse",
+    "ToWorker",
+    "decode_from_worker",
+    "decode_to_worker",
+    "encode",
+]
+
+MAX_PACKET_BYTES: Final = 1 << 16
+
+
+class Job(msgspec.Struct, array_like=True, tag="job"):
+    """Load one layer of one cell; ``granted`` bytes are reserved for it."""
+
+    number: int
+    cell_id: str
+    path: str
+    layer: str
+    box: tuple[float, float, float, float]
+    frame_id: str
+    granted: int
+
+
+class Grant(msgspec.Struct, array_like=True, tag="grant"):
+    """The bytes asked for are reserved."""
+
+    number: int
+
+
+class Refuse(msgspec.Struct, array_like=True, tag="refuse"):
+    """The bytes asked for do not fit."""
+
+    number: int
+
+
+class Need(msgspec.Struct, array_like=True, tag="need"):
+    """The segment needs more than was granted; the worker waits for `Grant` or `Refuse`."""
+
+    number: int
+    bytes: int
+
+
+class Done(msgspec.Struct, array_like=True, tag="done"):
+    """A finished segment; its descriptor comes with the packet."""
+
+    number: int
+    header_bytes: int
+    points: int
+    dropped: int
+    z_min: float
+    z_max: float
+    stamp: tuple[int, int, int]
+    load_ns: int
+    warnings: tuple[str, ...] = ()
+
+
+class Failed(msgspec.Struct, array_like=True, tag="failed"):
+    """No segment; ``stamp`` is the source's, if it could be read."""
+
+    number: int
+    code: str
+    message: str
+    stamp: tuple[int, int, int] | None = None
+
+
+ToWorker: TypeAlias = Job | Grant | Refuse
+FromWorker: TypeAlias = Need | Done | Failed
+
+encode: Final = msgspec.msgpack.Encoder().encode
+_to_worker: Final[msgspec.msgpack.Decoder[ToWorker]] = msgspec.msgpack.Decoder(ToWorker)
+_from_worker: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
+
+
+def decode_to_worker(data: bytes) -> ToWorker:
+    """Return the message for the worker."""
+    return _to_worker.decode(data)
+
+
+def decode_from_worker(data: bytes) -> FromWorker:
+    """Return the worker's message."""
+    return _from_worker.decode(data)

@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One life of the daemon: lock, open the map, serve, stop.
+
+The order matters.  The lock comes first, because binding would steal a live socket; leftovers are
+retired before anything is published; READY is said when requests are answered.  On the way out
+every name is taken away before the lock is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import grp
+import logging
+import os
+import secrets
+import signal
+import socket as sockets
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import zmq
+
+from shmmap import __version__
+from shmmap.daemon.admin import Admin
+from shmmap.daemon.budget import choose_budget
+from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.eviction import POLICIES
+from shmmap.daemon.instance_lock import InstanceLock
+from shmmap.daemon.leftovers import retire_leftovers
+from shmmap.daemon.logs import set_up_logging
+from shmmap.daemon.notify import notify
+from shmmap.daemon.reclaim import Reclaimer
+from shmmap.daemon.reloading import Reloader
+from shmmap.daemon.residency import Residency
+from shmmap.daemon.server import Server
+from shmmap.daemon.sessions import Sessions
+from shmmap.daemon.store import Store
+from shmmap.daemon.workers import WorkerPool
+from shmmap.errors import ConfigError, InternalError
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.map_directory import open_map
+from shmmap.protocol.codec import MAX_REQUEST_BYTES
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import leases_work, prepare_process
+from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["run"]
+
+_log = logging.getLogger(__name__)
+
+SEND_QUEUE: Final = 256
+"""Replies kept for a client that does not read them; further ones are dropped."""
+
+
+def run(config: DaemonConfig) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code.
+
+    Raises
+    ------
+    MapMissing, MapDataError
+        There is no map, or none that can be served.
+    ConfigError
+        A setting that cannot work on this machine.
+    InstanceBusy
+        Another daemon has this instance.
+    """
+    set_up_logging()
+    prepare_process()
+    with contextlib.ExitStack() as stack:
+        path = config.socket()
+        gid, mode = _access(config)
+        _make_runtime_dir(Path(path).parent, gid)
+        directory = ShmDirectory(config.shm_dir)
+        stack.callback(directory.close)
+        _check_leases(directory)
+        origin = open_map(
+            config.map_path,
+            metadata=config.metadata or None,
+            strict=config.strict,
+            cache_dir=config.cache_dir or None,
+        )
+        config = dataclasses.replace(config, map_path=origin.path)
+        lock = InstanceLock(path.removesuffix(".sock") + ".lock")
+        stack.callback(lock.release)
+        # a second one beside the segments: two runtime directories may share a directory of segments
+        shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
+        stack.callback(shm_lock.release)
+        started_s = time.monotonic()
+        catalogue = origin.load()
+        for problem in catalogue.problems:
+            _log.warning("%s", problem)
+        life = _Life(config, catalogue, directory, path, mode, gid)
+        stack.callback(life.close)
+        life.serve(Reloader(origin), started_s)
+    return 0
+
+
+def _access(config: DaemonConfig) -> tuple[int, int]:
+    """Group id and mode of what readers open; -1 and owner-only without a group."""
+    if not config.group:
+        return -1, 0o400
+    try:
+        return grp.getgrnam(config.group).gr_gid, 0o440
+    except KeyError:
+        if config.group.isdigit():
+            return int(config.group), 0o440
+        raise ConfigError(
+            f"there is no group {config.group!r}", key="group", hint=f"groupadd --system {config.group}"
+        ) from None
+
+
+def _make_runtime_dir(path: Path, gid: int) -> None:
+    if path.is_dir():
+        return
+    try:
+        path.mkdir(mode=0o750 if gid >= 0 else 0o700, parents=True, exist_ok=True)
+        if gid >= 0:
+            os.chown(path, -1, gid)
+    except OSError as error:
+        raise ConfigError(
+            f"runtime directory {path}: {error.strerror}", key="runtime_dir", hint="give --runtime-dir DIR"
+        ) from error
+
+
+def _check_leases(directory: ShmDirectory) -> None:
+    fd = directory.create()
+    try:
+        if not leases_work(fd):
+            raise ConfigError(
+                f"{directory.path}: its file system grants no leases, so nobody could tell what is in use",
+                key="shm_dir",
+                hint="name a directory on a tmpfs",
+            )
+    finally:
+        os.close(fd)
+
+
+class _Life:
+    """Everything the daemon has between its locks and its end."""
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        catalogue: Catalogue,
+        directory: ShmDirectory,
+        socket_path: str,
+        mode: int,
+        gid: int,
+    ) -> None:
+        self._config = config
+        self._socket_path = socket_path
+        self._gid = gid
+        self._epoch = secrets.randbits(63) | 1
+        self._directory = directory
+        self._catalogue = catalogue
+        self._identity = DaemonIdentity(
+            pid=os.getpid(),
+            start_time_ticks=start_time_ticks(os.getpid()),
+            pid_namespace=pid_namespace(),
+            epoch=self._epoch,
+            instance=config.instance,
+            endpoint=socket_path,
+            map_path=config.map_path,
+            map_version=catalogue.map_version,
+            shm_dir=directory.path,
+            id_prefix=catalogue.id_prefix,
+            library_version=__version__,
+            started_unix_ns=time.time_ns(),
+            frame_id=catalogue.frame_id,
+        )
+        self._statistics = StatisticsWriter(directory, config.instance, self._identity, mode=mode, gid=gid)
+        self._sessions = Sessions()
+        books = Residency(choose_budget(config.budget_bytes, directory))
+        books.overhead_bytes = self._statistics.size_bytes
+        reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction])
+        retire_leftovers(directory, config.instance, reclaimer, time.monotonic())
+        pool = WorkerPool(
+            config.workers,
+            directory.path,
+            config.load_timeout_s,
+            watch=lambda fd: self._running.watch_worker(fd),
+            unwatch=lambda fd: self._running.unwatch(fd),
+        )
+        self._store = Store(
+            catalogue,
+            books,
+            reclaimer,
+            pool,
+            directory,
+            self._statistics,
+            instance=config.instance,
+            epoch=self._epoch,
+            id_prefix=catalogue.id_prefix,
+            mode=mode,
+            gid=gid,
+            on_settled=lambda key: self._running.cells.settled(key),
+        )
+        self._server: Server | None = None
+
+    @property
+    def _running(self) -> Server:
+        if self._server is None:
+            raise InternalError("the server does not run yet")
+        return self._server
+
+    def serve(self, reloader: Reloader, started_s: float) -> None:
+        """Bind, say READY, answer requests until told to stop."""
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
+        socket.setsockopt(zmq.LINGER, 200)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
+        quota = self._config.session_quota
+        budget = self._store.books.budget_bytes
+        admin = Admin(self._config, self._store, self._sessions, self._statistics, epoch=self._epoch)
+        server = self._server = Server(
+            socket,
+            self._store,
+            self._sessions,
+            self._statistics,
+            admin,
+            reloader,
+            epoch=self._epoch,
+            quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
+            on_beat=self._beat,
+        )
+        try:
+            with self._signal_descriptor() as fd:
+                server.watch(fd, self._on_signals)
+                self._bind(socket)
+                self._store.pool.start_one()
+                _log.info(
+                    "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
+                    self._socket_path, self._config.instance, self._config.map_path,
+                    len(self._catalogue), budget, time.monotonic() - started_s,
+                )  # fmt: skip
+                notify("READY=1", f"STATUS=serving {len(self._catalogue)} cells", f"MAINPID={os.getpid()}")
+                server.run()
+        finally:
+            notify("STOPPING=1", "STATUS=freeing memory")
+            socket.close()
+            context.term()
+            reloader.close()
+            Path(self._socket_path).unlink(missing_ok=True)
+
+    def _bind(self, socket: zmq.Socket[bytes]) -> None:
+        # libzmq makes the socket file with the umask's mode; nobody may connect before it is right
+        mask = os.umask(0o117 if self._gid >= 0 else 0o177)
+        try:
+            socket.bind(f"ipc://{self._socket_path}")
+        except zmq.ZMQError as error:
+            raise ConfigError(
+                f"cannot listen at {self._socket_path}: {error}",
+                key="endpoint",
+                hint="choose another --endpoint",
+            ) from error
+        finally:
+            os.umask(mask)
+        if self._gid >= 0:
+            os.chown(self._socket_path, -1, self._gid)
+
+    def _beat(self) -> None:
+        version = self._store.catalogue.map_version
+        if version != self._identity.map_version:
+            self._identity = _with_map_version(self._identity, version)
+            self._statistics.update_identity(self._identity)
+
+    # --- signals ----------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _signal_descriptor(self) -> Iterator[int]:
+        """Turn signals into bytes on a descriptor; handlers do nothing themselves."""
+        ours, theirs = sockets.socketpair()
+        ours.setblocking(False)
+        theirs.setblocking(False)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda *_: None)
+        before = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+        try:
+            self._wakeup = ours
+            yield ours.fileno()
+        finally:
+            signal.set_wakeup_fd(before)
+            ours.close()
+            theirs.close()
+
+    def _on_signals(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            for number in self._wakeup.recv(64):
+                if number == signal.SIGHUP:
+                    self._running.reload()
+                elif number in (signal.SIGTERM, signal.SIGINT):
+                    _log.info("stopping on %s", signal.Signals(number).name)
+                    for again in (signal.SIGTERM, signal.SIGINT):
+                        signal.signal(again, self._quick_exit)
+                    self._running.stop()
+
+    def _quick_exit(self, number: int, frame: object) -> None:
+        """A second signal: take the names away and go, without goodbye."""
+        del number, frame
+        self.close()
+        Path(self._socket_path).unlink(missing_ok=True)
+        os._exit(0)
+
+    def close(self) -> None:
+        """Take every name away."""
+        self._store.close()
+        self._statistics.close()
+        if self._server is not None:
+            self._server.close()
+
+
+def _with_map_version(identity: DaemonIdentity, version: int) -> DaemonIdentity:
+    return dataclasses.replace(identity, map_version=version)

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Getting memory back: retire a segment by renaming it, free it once the kernel says nobody has it.
+
+Renaming first means that nobody new can open the segment; looking again on a later tick catches
+whoever was just opening it.  A segment that is still mapped stays in the books as a zombie, and is
+looked at again now and then, at once when its reader says or shows that it let go.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import os
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from shmmap.daemon.eviction import EvictionPolicy
+from shmmap.daemon.residency import Key, Residency, Resident, Zombie
+from shmmap.daemon.sessions import Sessions
+from shmmap.protocol.messages import Holder
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.names import zombie_name
+from shmmap.segment.pins import holders, is_pinned
+
+__all__ = ["Outcome", "Reclaimer"]
+
+TICK_S: Final = 0.002
+"""A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
+ZOMBIE_INTERVAL_S: Final = 0.1
+"""How often a segment that is still mapped is looked at, when nothing else gives a reason to."""
+PROBES_AT_ONCE: Final = 64
+"""Looks per turn of the serving loop (about 15 us each)."""
+PIN_MEMO_S: Final = 0.2
+"""How long a segment found pinned is not considered again for eviction."""
+
+
+class Outcome(enum.Enum):
+    """What an attempt to make room came to."""
+
+    PENDING = "room is on its way: try again later"
+    IMPOSSIBLE = "everything else is pinned"
+
+
+def _nothing(resident: Resident) -> None:
+    del resident
+
+
+class Reclaimer:
+    """Carries out what the books decide about memory.
+
+    Attributes
+    ----------
+    freed_count, evicted_count
+        Segments whose memory went back to the kernel; segments retired to make room.
+    on_retired, on_freed
+        Called with a segment that left service, and with one whose memory went back.
+    wake_s
+        When `free` is worth calling again although nothing changed (hand-out grace ends).
+    """
+
+    def __init__(
+        self, residency: Residency, directory: ShmDirectory, sessions: Sessions, policy: EvictionPolicy
+    ) -> None:
+        self._books = residency
+        self._directory = directory
+        self._sessions = sessions
+        self._policy = policy
+        self._pinned_until_s: dict[str, float] = {}
+        self._by_key: dict[Key, Zombie] = {}
+        self.on_retired: Callable[[Resident], None] = _nothing
+        self.on_freed: Callable[[Resident], None] = _nothing
+        self.freed_count = 0
+        self.evicted_count = 0
+        self.wake_s = float("inf")
+
+    # --- retiring -----------------------------------------------------------------------------
+
+    def _on_disk(self, resident: Resident) -> str:
+        return zombie_name(resident.name) if resident.name in self._books.zombies else resident.name
+
+    def is_pinned(self, resident: Resident) -> bool | None:
+        """The kernel's word on a segment; None if its name is gone."""
+        try:
+            fd = self._directory.open(self._on_disk(resident))
+        except OSError:
+            return None
+        try:
+            return is_pinned(fd)
+        finally:
+            os.close(fd)
+
+    def retire(self, resident: Resident, now_s: float) -> bool:
+        """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
+        found = self._directory.rename(resident.name, zombie_name(resident.name))
+        zombie = self._books.retire(resident)
+        self.on_retired(resident)
+        if not found:
+            self._forget(zombie)
+            return True
+        return self._watch(zombie, now_s)
+
+    def superseded(self, old: Resident, now_s: float) -> None:
+        """The books moved an old version to the zombies; do the same with its name."""
+        found = self._directory.rename(old.name, zombie_name(old.name))
+        zombie = self._books.zombies[old.name]
+        self.on_retired(old)
+        if found:
+            self._watch(zombie, now_s)
+        else:
+            self._forget(zombie)
+
+    def _watch(self, zombie: Zombie, now_s: float) -> bool:
+        self._by_key[zombie.resident.key] = zombie
+        zombie.condemned = self.is_pinned(zombie.resident) is False
+        zombie.probe_after_s = now_s + TICK_S
+        return zombie.condemned
+
+    def adopt(self, resident: Resident, now_s: float) -> None:
+        """Watch a retired segment of an earlier life of the daemon."""
+        zombie = self._books.adopt_zombie(resident)
+        zombie.probe_after_s = now_s + TICK_S
+
+    def revive(self, key: Key, version: int) -> Resident | None:
+        """Put a retired but still existing segment of exactly this version back into service."""
+        zombie = self._by_key.get(key)
+        if zombie is None or zombie.resident.version != version:
+            return None
+        if not self._directory.rename(zombie_name(zombie.resident.name), zombie.resident.name):
+            self._forget(zombie)
+            return None
+        del self._by_key[key]
+        return self._books.revive(zombie)
+
+    def _forget(self, zombie: Zombie) -> int:
+        resident = zombie.resident
+        if self._by_key.get(resident.key) is zombie:
+            del self._by_key[resident.key]
+        for slot in list(resident.sessions):
+            session = self._sessions.by_slot(slot)
+            if session is not None:
+                session.drop_resident(resident)
+        self.freed_count += 1
+        self.on_freed(resident)
+        return self._books.freed(resident.name)
+
+    # --- freeing ------------------------------------------------------------------------------
+
+    def sweep(self, now_s: float) -> int:
+        """Look at the zombies that are due and free those nobody has; returns the bytes freed."""
+        freed = 0
+        due = [z for z in self._books.zombies.values() if z.probe_after_s <= now_s]
+        for zombie in due[:PROBES_AT_ONCE]:
+            freed += self._probe(zombie, now_s)
+        return freed
+
+    def let_go(self, residents: Iterable[Resident], now_s: float) -> int:
+        """Somebody dropped these: free what nobody else has; returns the bytes freed."""
+        freed = 0
+        for resident in residents:
+            self._pinned_until_s.pop(resident.name, None)
+            zombie = self._books.zombies.get(resident.name)
+            if zombie is not None:
+                freed += self._probe(zombie, now_s)
+        return freed
+
+    def _probe(self, zombie: Zombie, now_s: float) -> int:
+        pinned = self.is_pinned(zombie.resident)
+        if pinned:
+            zombie.condemned = False
+            zombie.probe_after_s = now_s + ZOMBIE_INTERVAL_S
+            return 0
+        if pinned is False and now_s < zombie.probe_after_s:
+            zombie.condemned = True  # its tick is not over yet
+            return 0
+        self._directory.unlink(zombie_name(zombie.resident.name))
+        return self._forget(zombie)
+
+    def next_sweep_s(self) -> float:
+        """When the next zombie is due; infinity when there is none."""
+        return min((z.probe_after_s for z in self._books.zombies.values()), default=float("inf"))
+
+    def free(self, shortage: int, now_s: float) -> Outcome:
+        """Retire segments until ``shortage`` bytes are about to be freed.
+
+        Looks at a bounded number per call; `Outcome.PENDING` means that calling again later helps.
+        """
+        self.wake_s = float("inf")
+        missing = shortage - self._books.condemned_bytes()
+        if missing <= 0:
+            return Outcome.PENDING
+        candidates, grace_s = self._books.candidates(now_s)
+        self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
+        unknown = [r for r in candidates if r.name not in self._pinned_until_s]
+        ordered = self._policy(unknown, self._sessions.poses())
+        # what a session says it holds is most likely pinned: look at the others first
+        ordered.sort(key=lambda resident: bool(resident.sessions))
+        for resident in ordered[:PROBES_AT_ONCE]:
+            if self.is_pinned(resident):
+                self._pinned_until_s[resident.name] = now_s + PIN_MEMO_S
+                continue
+            missing -= resident.nbytes
+            self.retire(resident, now_s)
+            self.evicted_count += 1
+            if missing <= 0:
+                return Outcome.PENDING
+        if len(ordered) > PROBES_AT_ONCE:
+            self.wake_s = now_s
+            return Outcome.PENDING
+        if grace_s < float("inf"):
+            self.wake_s = grace_s
+            return Outcome.PENDING
+        return Outcome.PENDING if self._books.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
+
+    # --- who ----------------------------------------------------------------------------------
+
+    def slots_of(self, resident: Resident) -> list[int] | None:
+        """Slots that have a segment locked; None if its name is gone."""
+        try:
+            fd = self._directory.open(self._on_disk(resident))
+        except OSError:
+            return None
+        try:
+            return holders(fd)
+        finally:
+            os.close(fd)
+
+    def holders_of(self, residents: Iterable[Resident], *, limit: int = 512) -> tuple[Holder, ...]:
+        """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock."""
+        bytes_of: dict[int, int] = {}
+        cells_of: dict[int, int] = {}
+        for count, resident in enumerate(residents):
+            if count >= limit:
+                break
+            slots = self.slots_of(resident)
+            if slots is None:
+                continue
+            known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
+            if not known and self.is_pinned(resident):
+                known = [0]
+            for slot in known:
+                bytes_of[slot] = bytes_of.get(slot, 0) + resident.nbytes
+                cells_of[slot] = cells_of.get(slot, 0) + 1
+        found = []
+        for slot, nbytes in sorted(bytes_of.items(), key=lambda item: -item[1]):
+            session = self._sessions.by_slot(slot)
+            if session is None:
+                found.append(Holder(0, 0, -1, "unknown", nbytes, cells_of[slot]))
+            else:
+                found.append(session.as_holder(nbytes, cells_of[slot]))
+        return tuple(found)
+
+    def everything(self) -> list[Resident]:
+        """All segments in memory, retired ones included, largest first."""
+        found = [*self._books.residents(), *(z.resident for z in self._books.zombies.values())]
+        return sorted(found, key=lambda resident: -resident.nbytes)
+
+    def remove_all(self) -> None:
+        """Take every name away; memory goes back as soon as its last reader ends."""
+        for resident in self.everything():
+            with contextlib.suppress(OSError):
+                self._directory.unlink(self._on_disk(resident))

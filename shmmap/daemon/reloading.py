@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading the map's catalogue again, beside the serving loop.
+
+Looking at every file of a large map takes seconds, so it happens in a thread; the loop is told
+through an event descriptor and then changes over in one step.  Requests for another reload while
+one runs are answered by the next one, which sees everything that they could mean.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable
+
+from shmmap.errors import ShmmapError
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.map_origin import MapOrigin
+
+__all__ = ["Reloader"]
+
+_log = logging.getLogger(__name__)
+
+Answer = Callable[[Catalogue | ShmmapError], None]
+
+
+class Reloader:
+    """Loads the catalogue in a thread, one at a time.
+
+    Attributes
+    ----------
+    fd
+        Readable when a result is there: call `collect` then.
+    """
+
+    def __init__(self, origin: MapOrigin) -> None:
+        self._origin = origin
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._thread: threading.Thread | None = None
+        self._result: Catalogue | ShmmapError | None = None
+        self._asked: list[Answer] = []
+        self._next: list[Answer] = []
+
+    def ask(self, answer: Answer) -> None:
+        """Have the catalogue loaded; ``answer`` is called from `collect`."""
+        if self._thread is not None:
+            self._next.append(answer)
+            return
+        self._asked = [answer]
+        self._thread = threading.Thread(target=self._load, name="reload", daemon=True)
+        self._thread.start()
+
+    def _load(self) -> None:
+        try:
+            self._result = self._origin.load(fresh=True)
+        except ShmmapError as error:
+            self._result = error
+        except OSError as error:
+            self._result = ShmmapError(f"{self._origin.path}: {error}")
+        os.eventfd_write(self.fd, 1)
+
+    def collect(self, apply: Callable[[Catalogue], None]) -> None:
+        """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
+        os.eventfd_read(self.fd)
+        if self._thread is None:
+            return
+        self._thread.join()
+        self._thread = None
+        result, asked = self._result, self._asked
+        self._result, self._asked = None, []
+        if isinstance(result, Catalogue):
+            apply(result)
+        elif result is not None:
+            _log.error("the map could not be read again, the old state stays: %s", result)
+        if result is not None:
+            for answer in asked:
+                answer(result)
+        waiting, self._next = self._next, []
+        if waiting:
+            self.ask(waiting[0])
+            self._asked = waiting
+
+    def close(self) -> None:
+        """Forget a running load; its thread ends with the process."""
+        os.close(self.fd)

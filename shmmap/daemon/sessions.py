@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who is connected, by the kernel's word, and what each of them holds."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shmmap.daemon.residency import Resident
+from shmmap.protocol.messages import Holder, Intent
+from shmmap.segment.pins import MAX_SLOT
+
+__all__ = ["Peer", "Session", "Sessions"]
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Credentials of a connected process; -1 and 0 where the kernel does not tell."""
+
+    uid: int = -1
+    gid: int = -1
+    pid: int = 0
+
+    @classmethod
+    def parse(cls, address: str) -> Peer:
+        """Read libzmq's ``Peer-Address`` of an ipc connection, ``localhost:uid:gid:pid``."""
+        try:
+            uid, gid, pid = (int(part) for part in address.rsplit(":", 3)[-3:])
+        except ValueError:
+            return cls()
+        return cls(uid, gid, pid)
+
+    @property
+    def privileged(self) -> bool:
+        """Whether it may change what the daemon serves: root, or the daemon's own user."""
+        return self.uid in (0, os.geteuid())
+
+
+@dataclass(eq=False, slots=True)
+class Session:
+    """One client.
+
+    ``held`` is what it was handed or says it has, by version and layer: bookkeeping for quotas and for
+    naming holders.  Safety never depends on it, pins are the kernel's word.
+    """
+
+    slot: int
+    identity: bytes
+    peer: Peer
+    client: str
+    command: str
+    pidfd: int
+    held: dict[int, dict[str, Resident]] = field(default_factory=dict)
+    held_bytes: int = 0
+    intent: Intent | None = None
+    requests: int = 0
+    last_request_s: float = 0.0
+
+    def hold(self, resident: Resident) -> None:
+        """The session was handed this segment."""
+        layers = self.held.setdefault(resident.version, {})
+        old = layers.get(resident.key.layer)
+        if old is resident:
+            return
+        if old is not None:
+            self._let_go(old)
+        layers[resident.key.layer] = resident
+        self.held_bytes += resident.nbytes
+        resident.sessions.add(self.slot)
+
+    def _let_go(self, resident: Resident) -> None:
+        self.held_bytes -= resident.nbytes
+        resident.sessions.discard(self.slot)
+
+    def drop(self, version: int) -> list[Resident]:
+        """The session does not have this version any more; returns what it had of it."""
+        dropped = list(self.held.pop(version, {}).values())
+        for resident in dropped:
+            self._let_go(resident)
+        return dropped
+
+    def drop_resident(self, resident: Resident) -> None:
+        """The session cannot have this segment any more: its memory is gone."""
+        layers = self.held.get(resident.version, {})
+        if layers.get(resident.key.layer) is resident:
+            del layers[resident.key.layer]
+            self._let_go(resident)
+            if not layers:
+                del self.held[resident.version]
+
+    def drop_all(self) -> list[Resident]:
+        """The session has nothing any more; returns what it had."""
+        return [resident for version in list(self.held) for resident in self.drop(version)]
+
+    def residents(self) -> Iterator[Resident]:
+        """Everything the session holds."""
+        return (resident for layers in self.held.values() for resident in layers.values())
+
+    def exclusive_bytes(self) -> int:
+        """Bytes that nobody but this session holds."""
+        return sum(r.nbytes for r in self.residents() if len(r.sessions) == 1)
+
+    def as_holder(self, nbytes: int, cells: int) -> Holder:
+        """This session as a line in a reply."""
+        return Holder(self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells)
+
+
+def command_of(pid: int) -> str:
+    """Command name of a process, empty where it cannot be read."""
+    if pid <= 0:
+        return ""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    return ""
+
+
+class Sessions:
+    """All sessions of this epoch, by routing identity, slot and pidfd.
+
+    Slots are random 62-bit numbers, so that one is never used again, not even by a later epoch.
+    """
+
+    LIMIT = 4096
+
+    def __init__(self) -> None:
+        self._by_identity: dict[bytes, Session] = {}
+        self._by_slot: dict[int, Session] = {}
+        self._by_pidfd: dict[int, Session] = {}
+
+    def __len__(self) -> int:
+        return len(self._by_slot)
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter(self._by_slot.values())
+
+    def get(self, identity: bytes) -> Session | None:
+        """The session of a connection."""
+        return self._by_identity.get(identity)
+
+    def by_slot(self, slot: int) -> Session | None:
+        """The session whose lock byte is ``slot``."""
+        return self._by_slot.get(slot)
+
+    def by_pidfd(self, pidfd: int) -> Session | None:
+        """The session whose process this descriptor watches."""
+        return self._by_pidfd.get(pidfd)
+
+    @property
+    def full(self) -> bool:
+        """Whether no more sessions are accepted."""
+        return len(self._by_slot) >= self.LIMIT
+
+    def open(self, identity: bytes, peer: Peer, client: str, now_s: float) -> Session:
+        """Begin a session; ``pidfd`` is -1 where the process cannot be watched."""
+        slot = secrets.randbelow(MAX_SLOT) + 1
+        pidfd = -1
+        if peer.pid > 0:
+            with contextlib.suppress(OSError):
+                pidfd = os.pidfd_open(peer.pid)
+        session = Session(
+            slot, identity, peer, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s
+        )
+        self._by_identity[identity] = session
+        self._by_slot[slot] = session
+        if pidfd >= 0:
+            self._by_pidfd[pidfd] = session
+        return session
+
+    def close(self, session: Session) -> None:
+        """End a session and its bookkeeping."""
+        session.drop_all()
+        if self._by_identity.get(session.identity) is session:
+            del self._by_identity[session.identity]
+        self._by_slot.pop(session.slot, None)
+        if session.pidfd >= 0:
+            self._by_pidfd.pop(session.pidfd, None)
+            os.close(session.pidfd)
+            session.pidfd = -1
+
+    def poses(self) -> list[tuple[float, float]]:
+        """Where the clients are, metres, map frame."""
+        return [(s.intent.x, s.intent.y) for s in self if s.intent is not None]

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A loader worker: a process of its own that reads files and fills segments, one job after another.
+
+It is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish: it passes
+the finished, unnamed segment to the daemon, so that an orphan leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from shmmap.daemon import jobs
+from shmmap.errors import MapDataError
+from shmmap.layers.points import build_points
+from shmmap.segment.directory import ShmDirectory, is_full
+
+__all__ = ["main"]
+
+_NICENESS: Final = 10  # a warm request never waits for a load
+_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a worker, not the daemon
+_PR_SET_PDEATHSIG: Final = 1
+_PAGE_BYTES: Final = 4096
+
+
+class _Refused(Exception):
+    """The daemon has no room for the segment."""
+
+
+class _Worker:
+    def __init__(self, channel: socket.socket, directory: ShmDirectory) -> None:
+        self._channel = channel
+        self._directory = directory
+        self._waiting: list[jobs.Job] = []
+
+    def run(self) -> None:
+        """Work until the daemon closes the channel."""
+        while True:
+            job = self._waiting.pop(0) if self._waiting else self._receive()
+            if job is None:
+                return
+            if isinstance(job, jobs.Job):
+                self._load(job)
+
+    def _receive(self) -> jobs.ToWorker | None:
+        data = self._channel.recv(jobs.MAX_PACKET_BYTES)
+        return jobs.decode_to_worker(data) if data else None
+
+    def _send(self, message: jobs.FromWorker, fd: int | None = None) -> None:
+        packet = jobs.encode(message)
+        if fd is None:
+            self._channel.send(packet)
+        else:
+            socket.send_fds(self._channel, [packet], [fd])
+
+    def _reserve(self, job: jobs.Job, nbytes: int) -> None:
+        """Ask for more room where the segment needs more than was reserved for it."""
+        nbytes = -(-nbytes // _PAGE_BYTES) * _PAGE_BYTES
+        if nbytes > job.granted:
+            self._send(jobs.Need(job.number, nbytes))
+            while True:
+                answer = self._receive()
+                if answer is None:
+                    sys.exit(0)
+                if isinstance(answer, jobs.Job):
+                    self._waiting.append(answer)
+                elif isinstance(answer, jobs.Grant):
+                    job.granted = nbytes
+                    break
+                else:
+                    raise _Refused
+
+    def _load(self, job: jobs.Job) -> None:
+        started_ns = time.monotonic_ns()
+        _test_hook(job.path)
+        warnings: list[str] = []
+        try:
+            fd = self._directory.create()
+            try:
+                header = build_points(
+                    job.path,
+                    fd,
+                    cell_id=job.cell_id,
+                    box=job.box,
+                    frame_id=job.frame_id,
+                    reserve=lambda nbytes: self._reserve(job, nbytes),
+                    warn=warnings.append,
+                )
+                done = jobs.Done(
+                    job.number,
+                    header.header_bytes,
+                    header.rows,
+                    header.dropped_points,
+                    header.z_min,
+                    header.z_max,
+                    header.source,
+                    time.monotonic_ns() - started_ns,
+                    tuple(warning[:500] for warning in warnings[:20]),
+                )
+                self._send(done, fd)
+            finally:
+                os.close(fd)
+        except _Refused:
+            self._fail(job, "over_budget", "it does not fit in the budget")
+        except MapDataError as error:
+            self._fail(job, "load_failed", str(error))
+        except OSError as error:
+            code = "no_space" if is_full(error) else "load_failed"
+            self._fail(job, code, f"{job.path}: {error.strerror or error}")
+        except MemoryError:
+            self._fail(job, "load_failed", f"{job.path}: loading it ran out of memory")
+
+    def _fail(self, job: jobs.Job, code: str, message: str) -> None:
+        stamp = None
+        with contextlib.suppress(OSError):
+            state = os.stat(job.path)
+            stamp = (state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        self._send(jobs.Failed(job.number, code, message[:4000], stamp))
+
+
+def _test_hook(path: str) -> None:
+    """Crash or hang on a named file, for the tests of exactly that (``SHMMAP_TEST_WORKER``)."""
+    what, _, name = os.environ.get("SHMMAP_TEST_WORKER", "").partition(":")
+    if name and Path(path).name == name:
+        if what == "crash":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        elif what == "hang":
+            signal.pause()
+
+
+def _live_and_die_with(parent: int) -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    if os.getppid() != parent:
+        os._exit(0)  # the daemon was gone before the kernel knew that we care
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR``."""
+    channel_fd, parent, shm_dir = int(arguments[0]), int(arguments[1]), arguments[2]
+    _live_and_die_with(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    signal.signal(signal.SIGIO, signal.SIG_IGN)
+    os.nice(_NICENESS)
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
+        score.write(_OOM_SCORE)
+    channel = socket.socket(fileno=channel_fd)
+    try:
+        _Worker(channel, ShmDirectory(shm_dir)).run()
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ECONNRESET):
+            raise
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pool of loader workers: started on demand, fed several jobs ahead, killed at a deadline."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from shmmap.daemon import jobs
+
+__all__ = ["Worker", "WorkerPool"]
+
+_log = logging.getLogger(__name__)
+
+JOBS_AHEAD = 4
+"""Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
+
+
+@dataclass(eq=False, slots=True)
+class Worker:
+    """One worker process; ``queue`` holds its jobs, the first is the one it works on."""
+
+    process: subprocess.Popen[bytes]
+    channel: socket.socket
+    queue: OrderedDict[int, jobs.Job] = field(default_factory=OrderedDict)
+    head_since_s: float = 0.0
+
+    @property
+    def fd(self) -> int:
+        """Descriptor to poll."""
+        return self.channel.fileno()
+
+
+class WorkerPool:
+    """Up to ``limit`` worker processes.
+
+    Parameters
+    ----------
+    limit
+        Most workers at a time.
+    shm_dir
+        Where they make segments.
+    deadline_s
+        How long one load may take; then its worker is killed.
+    watch, unwatch
+        Called with a worker's descriptor when it comes and goes, for the caller's poller.
+    """
+
+    def __init__(
+        self,
+        limit: int,
+        shm_dir: str,
+        deadline_s: float,
+        *,
+        watch: Callable[[int], None],
+        unwatch: Callable[[int], None],
+    ) -> None:
+        self._limit = limit
+        self._shm_dir = shm_dir
+        self._deadline_s = deadline_s
+        self._watch = watch
+        self._unwatch = unwatch
+        self._workers: dict[int, Worker] = {}
+
+    def __len__(self) -> int:
+        return len(self._workers)
+
+    def __iter__(self) -> Iterator[Worker]:
+        return iter(list(self._workers.values()))
+
+    def by_fd(self, fd: int) -> Worker | None:
+        """The worker whose channel has this descriptor."""
+        return self._workers.get(fd)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a job can be given to somebody."""
+        return len(self._workers) < self._limit or any(
+            len(worker.queue) <= JOBS_AHEAD for worker in self._workers.values()
+        )
+
+    def start_one(self) -> Worker:
+        """Start a worker process."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            process = subprocess.Popen(
+                [
+                    sys.executable, "-m", "shmmap.daemon.worker",
+                    str(theirs.fileno()), str(os.getpid()), self._shm_dir,
+                ],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
+            )  # fmt: skip
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+        ours.setblocking(False)
+        worker = Worker(process, ours)
+        self._workers[worker.fd] = worker
+        self._watch(worker.fd)
+        return worker
+
+    def submit(self, job: jobs.Job, now_s: float) -> bool:
+        """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
+        worker = min(self._workers.values(), key=lambda w: len(w.queue), default=None)
+        if worker is None or (worker.queue and len(self._workers) < self._limit):
+            worker = self.start_one()
+        try:
+            worker.channel.send(jobs.encode(job))
+        except OSError:
+            return False  # full or dying: its end is reported by its channel
+        if not worker.queue:
+            worker.head_since_s = now_s
+        worker.queue[job.number] = job
+        return True
+
+    def answer(self, worker: Worker, message: jobs.Grant | jobs.Refuse) -> None:
+        """Answer a worker's `jobs.Need`."""
+        with contextlib.suppress(OSError):
+            worker.channel.send(jobs.encode(message))
+
+    def receive(self, worker: Worker) -> tuple[jobs.FromWorker, int] | None:
+        """Next message of a worker and the descriptor that came with it (-1: none).
+
+        None when there is nothing more to read now.
+
+        Raises
+        ------
+        EOFError
+            When the worker is gone.
+        """
+        try:
+            data, fds, _flags, _address = socket.recv_fds(worker.channel, jobs.MAX_PACKET_BYTES, 1)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise EOFError from error
+        if not data:
+            raise EOFError
+        for fd in fds:
+            os.set_inheritable(fd, False)
+        return jobs.decode_from_worker(data), fds[0] if fds else -1
+
+    def finished(self, worker: Worker, number: int, now_s: float) -> None:
+        """The worker is done with a job; its next one begins now."""
+        worker.queue.pop(number, None)
+        worker.head_since_s = now_s
+
+    def remove(self, worker: Worker) -> tuple[list[jobs.Job], str]:
+        """Forget a dead worker; returns its unfinished jobs, and how it ended, for people."""
+        self._unwatch(worker.fd)
+        self._workers.pop(worker.fd, None)
+        worker.channel.close()
+        worker.process.kill()
+        code = worker.process.wait()
+        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return list(worker.queue.values()), how
+
+    def overdue(self, now_s: float) -> list[Worker]:
+        """Workers whose current load is past its deadline."""
+        return [w for w in self._workers.values() if w.queue and now_s - w.head_since_s >= self._deadline_s]
+
+    def next_deadline_s(self) -> float:
+        """When the next load becomes overdue; infinity when nothing loads."""
+        return min(
+            (w.head_since_s + self._deadline_s for w in self._workers.values() if w.queue),
+            default=float("inf"),
+        )
+
+    def close(self) -> None:
+        """End every worker."""
+        for worker in self:
+            self.remove(worker)

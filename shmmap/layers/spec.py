@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which layers a request may name."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from shmmap.errors import BadRequest
+
+__all__ = ["LAYERS", "canonical_layer"]
+
+LAYERS: Final = ("points",)
+
+
+def canonical_layer(spec: str) -> str:
+    """Return the canonical form of a layer spec; `BadRequest` lists what exists for an unknown one."""
+    name = spec.strip()
+    if name not in LAYERS:
+        raise BadRequest(f"unknown layer {spec!r}", hint=f"layers are: {', '.join(LAYERS)}")
+    return name
