@@ -16,6 +16,9 @@ __all__ = ["parse_metadata", "read_metadata"]
 # The C parser where PyYAML was built with it; both report the same events.
 _LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
+# The parser's time grows with the square of the depth; metadata needs two levels.
+_MAX_DEPTH = 64
+
 
 def read_metadata(path: str, *, strict: bool = False) -> MapMetadata:
     """Read the metadata file at ``path``.
@@ -77,6 +80,8 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
                     raise refuse("the file is no mapping", event.start_mark, "bad_yaml")
                 if depth == 1 and key is None:
                     raise refuse("a key must be a name", event.start_mark, "bad_yaml")
+                if depth >= _MAX_DEPTH:
+                    raise refuse("nested too deeply", event.start_mark, "bad_yaml")
                 nested = depth > 1 or (depth == 1 and is_mapping)
                 depth += 1
             elif isinstance(event, yaml.CollectionEndEvent):

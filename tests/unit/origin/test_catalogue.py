@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalogue: order, lookup by id and base name, versions, and what changed between two of them."""
+
+from __future__ import annotations
+
+import random
+import struct
+
+import numpy as np
+import pytest
+import xxhash
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shmmap.errors import BadRequest, MapDataError
+from shmmap.geometry import Circle
+from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.stamp import Stamp
+
+Box = tuple[float, float, float, float]
+STAMP = Stamp(100, 2_000_000_001, 3_000_000_001)
+
+
+def catalogue(cells: dict[str, Stamp], box: Box = (0.0, 0.0, 20.0, 20.0)) -> Catalogue:
+    return Catalogue.from_cells([(cell_id, box, stamp) for cell_id, stamp in cells.items()])
+
+
+def test_order_is_that_of_a_cpp_string_map() -> None:
+    ids = [
+        "/m/a_10.pcd",
+        "/m/a_-10.pcd",
+        "/m/a_9.pcd",
+        "/m/B.pcd",
+        "/m/a.pcd",
+        "/m/ä.pcd",
+        "/m/z.pcd",
+        "/m/a/x.pcd",
+    ]
+    random.Random(1).shuffle(ids)
+    cells = catalogue(dict.fromkeys(ids, STAMP))
+    expected = sorted(ids, key=lambda text: text.encode())
+    assert [cells.id(i) for i in range(len(cells))] == expected
+    assert cells.ids(np.arange(len(cells))) == expected
+    assert cells.id_prefix == "/m/"
+    assert [cells.path(i) for i in range(len(cells))] == expected
+    assert cells.frame_id == "map"
+
+
+def test_find_by_id_and_base_name() -> None:
+    cells = catalogue(
+        dict.fromkeys(["/m/1/a.pcd", "/m/2/a.pcd", "/m/2/b.pcd", "/m/c.pcd", "/m/ü.pcd"], STAMP)
+    )
+    for index in range(len(cells)):
+        assert cells.find(cells.id(index)) == index
+    assert cells.find("b.pcd") == 2
+    assert cells.find("c.pcd") == 3
+    assert cells.find("ü.pcd") == 4
+    for _ in range(2):  # the second time from memory
+        assert cells.find("/m/2/b.pcd") == 2
+    with pytest.raises(BadRequest, match=r"2 cells are called a\.pcd: /m/1/a\.pcd, /m/2/a\.pcd"):
+        cells.find("a.pcd")
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [
+        "",
+        "x",
+        "a.pc",
+        "a.pcd ",
+        "a.pcd\0",
+        "/m/a.pcd\0",
+        "/m/",
+        "/m",
+        "/",
+        "m/a.pcd",
+        "/m/A.pcd",
+        "\udcff",
+        "n" * 5000,
+    ],
+)
+def test_find_unknown(unknown: str) -> None:
+    assert catalogue({"/m/a.pcd": STAMP, "/m/b.pcd": STAMP}).find(unknown) is None
+
+
+def test_find_in_an_empty_catalogue() -> None:
+    empty = catalogue({})
+    assert len(empty) == 0
+    assert empty.find("a.pcd") is None
+    assert empty.find("/m/a.pcd") is None
+    assert empty.query(Circle(0.0, 0.0, 1e6)).tolist() == []
+    assert empty.map_version == catalogue({}).map_version
+
+
+def test_cell_version_is_the_documented_hash() -> None:
+    cells = catalogue({"/m/ä.pcd": Stamp(5, -6, 7)})
+    expected = xxhash.xxh3_64("/m/ä.pcd".encode() + b"\0" + struct.pack("<qqq", 5, -6, 7)).intdigest()
+    assert cells.version(0) == expected
+
+
+def test_map_version_is_the_documented_hash() -> None:
+    n = 4096 + 3
+    names = [f"c{i:05d}.pcd" for i in range(n)]
+    boxes: list[Box] = [(float(i), 0.5, i + 20.0, 20.5) for i in range(n)]
+    stamps = [Stamp(i, i + 1, i + 2) for i in range(n)]
+    cells = Catalogue.from_cells(
+        (f"/map/{name}", box, stamp) for name, box, stamp in zip(names, boxes, stamps, strict=True)
+    )
+    fixed = b"shmmap map 1\0/map/\0" + "".join(names).encode()
+    for side in range(4):
+        fixed += struct.pack(f"<{n}d", *(box[side] for box in boxes))
+    digests = struct.pack("<Q", xxhash.xxh3_64(fixed).intdigest())
+    for start in (0, 4096):
+        packed = b"".join(struct.pack("<qqq", *stamp) for stamp in stamps[start : start + 4096])
+        digests += struct.pack("<Q", xxhash.xxh3_64(packed).intdigest())
+    assert cells.map_version == xxhash.xxh3_64(digests).intdigest()
+
+
+def test_versions_follow_a_corrected_stamp() -> None:
+    many = {f"/m/{i:05d}.pcd": STAMP for i in range(5000)}
+    cells = catalogue(many)
+    before, map_before = [cells.version(i) for i in (0, 4999)], cells.map_version
+    other = Stamp(101, 5, 6)
+    cells.set_stamp(4999, other)
+    assert cells.stamp(4999) == other
+    assert cells.version(0) == before[0]
+    assert cells.version(4999) != before[1]
+    assert cells.map_version == catalogue({**many, "/m/04999.pcd": other}).map_version != map_before
+    cells.set_stamp(4999, STAMP)
+    assert [cells.version(i) for i in (0, 4999)] == before
+    assert cells.map_version == map_before
+
+
+def test_every_part_of_a_stamp_and_the_id_make_the_version() -> None:
+    cells = {
+        "/m/a.pcd": Stamp(1, 2, 3),
+        "/m/b.pcd": Stamp(1, 2, 3),
+        "/m/c.pcd": Stamp(2, 2, 3),
+        "/m/d.pcd": Stamp(1, 3, 3),
+        "/m/e.pcd": Stamp(1, 2, 4),
+    }
+    made = catalogue(cells)
+    assert len({made.version(i) for i in range(len(made))}) == len(cells)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        (0.0, 0.0, float("nan"), 1.0),
+        (0.0, float("-inf"), 1.0, 1.0),
+        (2.0, 0.0, 1.0, 1.0),
+        (0.0, 2.0, 1.0, 1.0),
+    ],
+)
+def test_impossible_boxes_are_refused(box: Box) -> None:
+    with pytest.raises(MapDataError, match=r"/m/a\.pcd"):
+        catalogue({"/m/a.pcd": STAMP}, box=box)
+
+
+def test_names_must_be_ascending_and_unique() -> None:
+    with pytest.raises(ValueError, match="ascending"):
+        Catalogue.from_cells([("/m/a", (0, 0, 1, 1), STAMP), ("/m/a", (0, 0, 1, 1), STAMP)])
+
+
+def test_boxes_and_query_speak_of_the_same_cells() -> None:
+    side = 90  # large enough that the search structure is used
+    cells = [
+        (f"/m/c_{20 * x}_{20 * y}.pcd", (20.0 * x, 20.0 * y, 20.0 * x + 20, 20.0 * y + 20), STAMP)
+        for x in range(-45, side - 45)
+        for y in range(side)
+    ]
+    made = Catalogue.from_cells(cells)
+    found = made.query(Circle(310.0, 350.0, 50.0))
+    expected = sorted(
+        cell_id
+        for cell_id, (a, b, c, d), _ in cells
+        if max(a - 310.0, 310.0 - c, 0.0) ** 2 + max(b - 350.0, 350.0 - d, 0.0) ** 2 <= 2500.0
+    )
+    assert made.ids(found) == expected
+    assert len(expected) > 20
+    for index in found.tolist():
+        min_x, min_y, _, _ = made.box(index)
+        assert made.id(index) == f"/m/c_{min_x:.0f}_{min_y:.0f}.pcd"
+
+
+versions = st.dictionaries(
+    st.sampled_from([f"/m/{folder}{name}.pcd" for folder in ("", "x/", "x/y/") for name in "abcdef"]),
+    st.builds(Stamp, st.integers(0, 2), st.just(1), st.just(2)),
+)
+
+
+@given(versions, versions)
+@settings(max_examples=200, deadline=None)
+def test_compare_equals_set_differences(old: dict[str, Stamp], new: dict[str, Stamp]) -> None:
+    change = compare(catalogue(old), catalogue(new))
+    assert change.added == tuple(sorted(new.keys() - old.keys()))
+    assert change.removed == tuple(sorted(old.keys() - new.keys()))
+    assert change.changed == tuple(sorted(i for i in old.keys() & new.keys() if old[i] != new[i]))
+    assert change.moved == ()
+    assert bool(change) == (old != new)
+
+
+def test_compare_sees_moved_boxes() -> None:
+    cells = {"/m/a.pcd": STAMP, "/m/b.pcd": STAMP}
+    change = compare(catalogue(cells), catalogue(cells, box=(20.0, 0.0, 40.0, 20.0)))
+    assert change.moved == ("/m/a.pcd", "/m/b.pcd")
+    assert change.changed == ()
+    assert change
+
+
+def test_compare_of_another_directory() -> None:
+    old, new = catalogue({"/m/v1/a.pcd": STAMP}), catalogue({"/m/v2/a.pcd": STAMP, "/m/v1/a.pcd": STAMP})
+    assert compare(old, new).added == ("/m/v2/a.pcd",)
+    assert compare(new, old).removed == ("/m/v2/a.pcd",)
+    assert compare(old, old) == compare(new, new)
