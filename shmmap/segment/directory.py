@@ -74,8 +74,10 @@ class ShmDirectory:
         if gid >= 0:
             os.fchown(fd, -1, gid)
         os.fchmod(fd, mode)
+        nbytes = measured_bytes(fd)
+        os.ftruncate(fd, nbytes)  # whole pages: a handle's bytes are what can be mapped
         self.link(fd, name)
-        return measured_bytes(fd)
+        return nbytes
 
     def link(self, fd: int, name: str) -> None:
         """Give an unnamed file a name; FileExistsError if there is such a name."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import select
 import shutil
@@ -208,13 +209,9 @@ class DaemonProcess:
         return sorted(pid for pid in processes_marked(self._mark) if pid != own)
 
     def segments(self) -> list[str]:
-        """Published and retired segments, the statistics not among them, sorted."""
-        prefix = f"shmmap.{self.instance}."
-        return sorted(
-            name
-            for name in os.listdir(self.shm_dir)
-            if name.startswith(prefix) and not name.startswith(prefix + "statistics")
-        )
+        """Published and retired segments, sorted; statistics and lock are not among them."""
+        own = re.compile(rf"shmmap\.{self.instance}\.[0-9a-f]{{16}}(\.zombie)?")
+        return sorted(name for name in os.listdir(self.shm_dir) if own.fullmatch(name))
 
     def segment_bytes(self) -> int:
         """Memory the instance's segments occupy by their blocks (the statistics not counted)."""

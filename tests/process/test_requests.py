@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The requests, asked by a client made from PROTOCOL.md and read by a reader made from LAYOUT.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap
+from tests.support.message_pack import pack
+from tests.support.raw_client import DaemonError, RawClient, RawHandle, circle, square
+from tests.support.segment_reader import read_segment
+
+Connect = Callable[..., RawClient]
+
+
+def names(handles: list[RawHandle]) -> list[str]:
+    return [handle.id.rsplit("/", 1)[1] for handle in handles]
+
+
+def assert_same_points(client: RawClient, handle: RawHandle, made: DividedMap) -> None:
+    """The segment holds exactly what an independent reader finds in the file."""
+    name = handle.id.rsplit("/", 1)[1]
+    segment = read_segment(client.path(handle))
+    source = made.points(name)
+    expected = np.column_stack([source["x"], source["y"], source["z"]])
+    assert segment.columns["xyz"].tobytes() == expected.tobytes()
+    assert segment.columns["intensity"].tobytes() == source["intensity"].tobytes()
+    assert segment.fields["cell_id"] == made.id(name) == handle.id
+    assert segment.fields["box"] == made.box(name) == handle.box
+    assert (segment.epoch, segment.version) == (client.epoch, handle.version)
+    assert handle.points == segment.fields["rows"] == len(expected)
+    assert segment.fields["dropped_points"] == 0
+
+
+def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one, name="visitor")
+    assert (client.major, client.instance, client.frame_id) == (1, one.instance, "map")
+    assert client.shm_dir == one.shm_dir
+    assert client.pid == one.pid
+    assert client.cells == 36
+    assert client.bounds == [-60.0, -60.0, 60.0, 60.0]
+    assert client.layers == ["points"]
+    assert 0 < client.session < 2**62
+    assert client.budget_bytes > 0
+
+
+def test_area_answers_bit_identical_cells(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root))
+    for x, y, radius in ((0.0, 0.0, 25.0), (-60.0, 60.0, 0.0), (13.0, -7.5, 40.0), (500.0, 0.0, 10.0)):
+        reply = client.area(circle(x, y, radius))
+        assert names(reply.cells) == divided_map.in_circle(x, y, radius)
+        assert (reply.pending, reply.failed, reply.removed) == ([], [], [])
+        for handle in reply.cells:
+            assert_same_points(client, handle, divided_map)
+        squared = client.area(square(x, y, radius))
+        assert names(squared.cells) == divided_map.in_square(x, y, radius)
+
+
+def test_heights_leave_out_cells_once_they_are_known(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root))
+    assert client.area(circle(0, 0, 25, (100.0, 200.0))).cells == []  # all are loaded to find that out
+    everything = names(client.area(circle(0, 0, 25)).cells)
+    assert everything == divided_map.in_circle(0, 0, 25)
+    assert client.area(circle(0, 0, 25, (100.0, 200.0)), wait=None).cells == []
+    assert names(client.area(circle(0, 0, 25, (4.0, 4.5)), wait=None).cells) == everything
+
+
+def test_selected_keeps_order_and_duplicates(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root))
+    asked = ["20_20.pcd", divided_map.id("0_0.pcd"), "20_20.pcd", "nowhere.pcd", "-60_-60.pcd"]
+    reply = client.selected(asked)
+    assert names(reply.cells) == ["20_20.pcd", "0_0.pcd", "20_20.pcd", "-60_-60.pcd"]
+    assert reply.cells[0] == reply.cells[2]
+    assert [(f.id, f.code) for f in reply.failed] == [("nowhere.pcd", "unknown_cell")]
+    assert client.selected([]).cells == []
+
+
+def test_differential_is_the_set_difference_at_every_step(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """A drive across the map, three ways of saying what is held."""
+    client = connect(daemon(divided_map.root))
+    held: dict[str, int] = {}
+    rows: list[list[Any]]
+    for step in range(24):
+        x, y, radius = -70.0 + 6 * step, 20.0 * np.sin(step / 3), 30.0
+        wanted = set(divided_map.in_circle(x, y, radius))
+        kept = list(held)
+        if step % 3 == 0:
+            reply = client.differential(circle(x, y, radius), packed=list(held.values()))
+            by_version = {version: name for name, version in held.items()}
+            removed = [by_version[version] for version in reply.removed_versions]
+            assert reply.removed == []
+        else:
+            rows = [[divided_map.id(n), v] if step % 3 == 1 else [n] for n, v in held.items()]
+            reply = client.differential(circle(x, y, radius), rows)
+            removed = [r.rsplit("/", 1)[-1] for r in reply.removed]
+            assert reply.removed == [row[0] for row in rows if row[0].rsplit("/", 1)[-1] not in wanted]
+        assert removed == [name for name in kept if name not in wanted]
+        assert names(reply.cells) == sorted(wanted - set(kept), key=divided_map.id)
+        assert (reply.pending, reply.failed) == ([], [])
+        for name in removed:
+            del held[name]
+        for handle in reply.cells:
+            assert_same_points(client, handle, divided_map)
+            held[handle.id.rsplit("/", 1)[1]] = handle.version
+        assert set(held) == wanted
+
+
+def test_differential_removes_what_it_does_not_know(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root))
+    first = client.area(circle(0, 0, 5))
+    held = [["unknown"], ["0_0.pcd"], ["0_0.pcd"], ["60_60.pcd"], ["unknown"]]
+    reply = client.differential(circle(0, 0, 5), held)
+    assert reply.removed == ["unknown", "60_60.pcd"]
+    assert "0_0.pcd" not in names(reply.cells)
+    versions = [handle.version for handle in first.cells]
+    reply = client.differential(circle(0, 0, 5), packed=[5, *versions, versions[0], 6, 5])
+    assert (reply.cells, reply.removed_versions) == ([], [5, 6])
+    reply = client.differential(circle(0, 0, 5), [["0_0.pcd", 12345]])  # another version than ours
+    assert (len(reply.cells), reply.removed) == (len(first.cells), [])
+
+
+def test_without_waiting_the_rest_is_pending_and_comes_later(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root))
+    wanted = divided_map.in_circle(0, 0, 40)
+    first = client.area(circle(0, 0, 40), wait=None)
+    pending = {i.rsplit("/", 1)[1] for i, _ in first.pending}
+    assert pending | set(names(first.cells)) == set(wanted)
+    assert pending
+    assert names(client.area(circle(0, 0, 40)).cells) == wanted
+    again = client.area(circle(0, 0, 40), wait=None)
+    assert (names(again.cells), again.pending) == (wanted, [])
+
+
+def test_metadata_pages(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    client = connect(daemon(divided_map.root))
+    rows: list[list[Any]] = []
+    start: int | None = 0
+    while start is not None:
+        page = client.ask("metadata", None, None, start, 7)
+        assert page[0] == "metadata_page"
+        assert page[3] == client.map_version
+        assert len(page[4]) <= 7
+        rows += page[4]
+        start = page[5]
+    assert [client.id_prefix + row[0] for row in rows] == sorted(map(divided_map.id, divided_map.corners))
+    for row in rows:
+        name = (client.id_prefix + row[0]).rsplit("/", 1)[1]
+        assert tuple(row[2:6]) == divided_map.box(name)
+        assert row[6] == (divided_map.pcd_dir / name).stat().st_size
+    part = client.ask("metadata", circle(0, 0, 25))
+    assert [(client.id_prefix + r[0]).rsplit("/", 1)[1] for r in part[4]] == divided_map.in_circle(0, 0, 25)
+
+
+def test_show_and_stats(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    client = connect(daemon(divided_map.root), name="visitor")
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    shown = client.ask("show", "0_0.pcd")
+    assert shown[2:4] == [divided_map.id("0_0.pcd"), handle.version]
+    (segment,) = shown[9]
+    assert segment[:4] == ["points", handle.version, handle.segment, "resident"]
+    stats = client.ask("stats")
+    assert stats[4]["handles_sent"] == 1
+    assert stats[4]["loads_finished"] == 1
+    (session,) = stats[5]
+    assert session[0] == client.session
+    assert session[4] == "visitor"
+    with pytest.raises(DaemonError) as failure:
+        client.ask("show", "nowhere")
+    assert failure.value.code == "unknown_cell"
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        ["area", 1, ["circle", float("nan"), 0, 1]],
+        ["area", 1, ["circle", 0, 0, -1]],
+        ["area", 1, ["circle", 0, 0, 1], ["no such layer"]],
+        ["area", 1, ["circle", 0, 0, 1], []],
+        ["area", 1, ["circle", 0, 0, 1], ["points"], -1.0],
+        ["area", 1, ["circle", 0, 0, 1], ["points"], float("nan")],
+        ["differential", 1, ["circle", 0, 0, 1], ["points"], [], b"1234567"],
+        ["selected", 1, [5]],
+        ["nonsense", 1],
+    ],
+)
+def test_nonsense_is_refused_and_harms_nobody(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, request_: list[Any]
+) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    client.send_bytes(pack(request_))
+    reply = client.receive()
+    assert reply[:3] == ["error", 1, "bad_request"]
+    assert len(client.area(circle(0, 0, 5)).cells) == 4
+
+
+def test_bytes_that_are_no_message(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    rng = np.random.default_rng(5)
+    for size in (0, 1, 10, 1000, 100_000):
+        client.send_bytes(rng.bytes(size))
+        assert client.receive()[:3:2] == ["error", "bad_request"]
+    assert len(client.area(circle(0, 0, 5)).cells) == 4
+
+
+def test_no_session_and_other_versions(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root), hello=False)
+    with pytest.raises(DaemonError) as failure:
+        client.area(circle(0, 0, 5))
+    assert failure.value.code == "no_session"
+    with pytest.raises(DaemonError) as failure:
+        client.ask("hello", 2, 0, "from the future")
+    assert failure.value.code == "protocol_mismatch"
+    client.hello()
+    assert len(client.area(circle(0, 0, 5)).cells) == 4
+
+
+def test_requests_in_flight_are_told_apart(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Many questions before the first answer; each answer says which it is for."""
+    client = connect(daemon(divided_map.root))
+    asked = {
+        client.send("area", circle(20.0 * i - 50, 0, 1), ["points"], 30.0): 20.0 * i - 50 for i in range(6)
+    }
+    for _ in range(6):
+        reply = client.receive()
+        x = asked.pop(reply[1])
+        assert names(client.cells_reply(reply).cells) == divided_map.in_circle(x, 0, 1)
+
+
+def test_a_warm_handle_costs_under_200_bytes(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    client = connect(daemon(divided_map.root))
+    reply = client.area(circle(0, 0, 500))
+    assert len(reply.cells) == 36
+    assert reply.wire_bytes / 36 < 200
+
+
+def test_plain_posix_shared_memory(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    """In /dev/shm itself every segment is a POSIX shared-memory object."""
+    import posix_ipc
+
+    one: DaemonProcess = daemon(divided_map.root, shm_dir="/dev/shm")
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    memory = posix_ipc.SharedMemory(handle.segment, read_only=True)
+    try:
+        assert memory.size >= handle.offset + handle.bytes
+    finally:
+        memory.close_fd()
+    assert_same_points(client, handle, divided_map)
