@@ -62,12 +62,9 @@ def absolute_path(path: str | os.PathLike[str]) -> str:
         text.encode()
     except UnicodeEncodeError as error:
         raise MapDataError("the path is no UTF-8", path=ascii(text), cause="bad_path") from error
-    try:
-        same = os.path.samefile(path, text)
-    except OSError:
-        return text
     # "link/.." is where the link leads, not where it lies
-    return text if same else os.path.realpath(path)
+    misled = os.path.exists(path) and not (os.path.exists(text) and os.path.samefile(path, text))
+    return os.path.realpath(path) if misled else text
 
 
 def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> MapLayout:

@@ -251,7 +251,9 @@ def test_what_the_quick_way_accepts_means_the_same_to_the_parser(lines: list[str
         assert (quick.x_resolution, quick.y_resolution) == (slow.x_resolution, slow.y_resolution)
 
 
-VALUES = "[1, 2]|[1,2]|[ 1 , -2 ]|[-0, 00]|[1.5, 2]|[1, 2, 3]|5||[+1, 0x1f]|[1e2, 010]|[a, b]|[.5, 5.]|true|[1-2, 3]"
+VALUES = (
+    "[1, 2]|[1,2]|[ 1 , -2 ]|[-0, 00]|[1.5, 2]|[1, 2, 3]|5||[+1,0x1f]|[1e2, 010]|[a, b]|[.5, 5.]|yes|[1-2,3]"
+)
 line_like = st.tuples(
     st.sampled_from(["a", "b.pcd", "_1_2.pcd", "-5", "'q r'", '"q r"', "z_resolution", "é"]),
     st.sampled_from([":", ": ", ":  ", " : "]),

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps on disk in every layout, ids, liberal and strict reading, and what is reported."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shmmap.errors import MapDataError, MapMissing
+from shmmap.geometry import Circle
+from shmmap.origin.catalogue import compare
+from shmmap.origin.map_directory import MapDirectory, open_map
+from shmmap.origin.stamp import Stamp
+from tests.support.pcd_files import write_pcd
+
+NAMES = ("t_0_0.pcd", "t_20_0.pcd", "t_-20_40.pcd")
+CORNERS = {"t_0_0.pcd": (0, 0), "t_20_0.pcd": (20, 0), "t_-20_40.pcd": (-20, 40)}
+
+
+def metadata_text(names: Sequence[str] = NAMES, extra: str = "") -> str:
+    entries = "".join(f"{name}: [{CORNERS[name][0]}, {CORNERS[name][1]}]\n" for name in names)
+    return "x_resolution: 20\ny_resolution: 20\n" + entries + extra
+
+
+def put_cells(directory: Path, names: Sequence[str] = NAMES) -> None:
+    """A divided map's files are not opened before they are loaded: any bytes do."""
+    directory.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (directory / name).write_bytes(name.encode())
+
+
+def autoware_map(root: Path) -> Path:
+    put_cells(root / "pointcloud_map.pcd")
+    (root / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+    return root
+
+
+def check(map_path: Path | str, cells: Path, **options: object) -> None:
+    catalogue = open_map(map_path, **options).load()  # type: ignore[arg-type]
+    assert catalogue.ids(np.arange(len(catalogue))) == sorted(str(cells / name) for name in NAMES)
+    assert catalogue.problems == ()
+    for name in NAMES:
+        index = catalogue.find(name)
+        assert index is not None
+        x, y = CORNERS[name]
+        assert catalogue.box(index) == (x, y, x + 20, y + 20)
+        status = (cells / name).stat()
+        assert catalogue.stamp(index) == (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    assert catalogue.ids(catalogue.query(Circle(-10.0, 50.0, 1.0))) == [str(cells / "t_-20_40.pcd")]
+
+
+def test_yaml_beside_the_directory(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path)
+    check(root, root / "pointcloud_map.pcd")
+    check(root, root / "pointcloud_map.pcd", strict=True)
+    check(root / "pointcloud_map.pcd", root / "pointcloud_map.pcd")
+    check(root / "pointcloud_map_metadata.yaml", root / "pointcloud_map.pcd")
+
+
+def test_yaml_inside_the_directory(tmp_path: Path) -> None:
+    cells = tmp_path / "pointcloud_map.pcd"
+    put_cells(cells)
+    (cells / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+    check(tmp_path, cells)
+    check(cells, cells)
+
+
+def test_a_plain_directory_with_any_name(tmp_path: Path) -> None:
+    cells = tmp_path / "cells"
+    put_cells(cells)
+    (cells / "pointcloud_data_metadata.yaml").write_text(metadata_text())
+    check(cells, cells)
+    (cells / "pointcloud_data_metadata.yaml").rename(tmp_path / "pointcloud_map_metadata.yaml")
+    check(cells, cells)
+    check(tmp_path, cells)
+
+
+def test_explicit_paths(tmp_path: Path) -> None:
+    cells, elsewhere = tmp_path / "cells", tmp_path / "elsewhere"
+    put_cells(cells)
+    elsewhere.mkdir()
+    (elsewhere / "m.yaml").write_text(metadata_text())
+    check(cells, cells, metadata=elsewhere / "m.yaml")
+    files = [cells / name for name in NAMES]
+    check(elsewhere, cells, metadata=elsewhere / "m.yaml", pcd_paths=files)
+    # a file listed by itself and through its directory is one cell
+    check(elsewhere, cells, metadata=elsewhere / "m.yaml", pcd_paths=[*files, cells])
+    catalogue = open_map(
+        cells, metadata=elsewhere / "m.yaml", pcd_paths=[files[0], cells / "none.pcd"]
+    ).load()
+    assert len(catalogue) == 1
+    assert f"invalid path: {cells / 'none.pcd'}" in catalogue.problems
+
+
+def test_nested_folders_of_the_divider_s_large_grid(tmp_path: Path) -> None:
+    for name in NAMES:
+        put_cells(tmp_path / "pointcloud_map.pcd" / f"{CORNERS[name][0]}_{CORNERS[name][1]}", [name])
+    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+    catalogue = open_map(tmp_path).load()
+    assert len(catalogue) == 3
+    assert catalogue.find("t_20_0.pcd") == catalogue.find(
+        str(tmp_path / "pointcloud_map.pcd/20_0/t_20_0.pcd")
+    )
+    assert catalogue.problems == ()
+    with pytest.raises(MapMissing, match="no PCD file"):
+        open_map(tmp_path, strict=True).load()
+
+
+def test_the_same_base_name_twice_is_served_twice(tmp_path: Path) -> None:
+    put_cells(tmp_path / "a", ["t_0_0.pcd"])
+    put_cells(tmp_path / "b", ["t_0_0.pcd"])
+    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text(["t_0_0.pcd"]))
+    catalogue = open_map(tmp_path).load()
+    assert [catalogue.box(i) for i in range(2)] == [(0.0, 0.0, 20.0, 20.0)] * 2
+    assert "same box" in catalogue.problems[0]
+
+
+def test_ids_are_the_same_however_the_map_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = autoware_map(tmp_path / "city")
+    (tmp_path / "other").mkdir()
+    spellings = [
+        (tmp_path, "city"),
+        (tmp_path, "./city/"),
+        (tmp_path, "city//."),
+        (root, "."),
+        (root, ""),
+        (root / "pointcloud_map.pcd", ".."),
+        (tmp_path / "other", "../city"),
+        (Path("/"), str(root)),
+        (Path("/"), os.path.relpath(root, "/")),
+    ]
+    versions = set()
+    for directory, path in spellings:
+        monkeypatch.chdir(directory)
+        check(path or os.curdir, root / "pointcloud_map.pcd")
+        versions.add(open_map(path or os.curdir).load().map_version)
+    assert len(versions) == 1
+
+
+def test_links_keep_their_names_and_lead_where_the_kernel_says(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path / "v1")
+    (tmp_path / "current").symlink_to(root)
+    check(tmp_path / "current", tmp_path / "current" / "pointcloud_map.pcd")
+    deep = tmp_path / "x" / "y"
+    deep.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(deep)
+    # "link/.." is x, not the link's own directory
+    (tmp_path / "x" / "city").symlink_to(root)
+    check(f"{tmp_path}/link/../city", tmp_path / "v1" / "pointcloud_map.pcd")
+
+
+def test_linked_files_and_directory_loops(tmp_path: Path) -> None:
+    put_cells(tmp_path / "store")
+    cells = tmp_path / "map" / "pointcloud_map.pcd"
+    cells.mkdir(parents=True)
+    for name in NAMES:
+        (cells / name).symlink_to(tmp_path / "store" / name)
+    (cells / "loop").symlink_to(cells)
+    (tmp_path / "map" / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+    check(tmp_path / "map", cells)
+
+
+def test_entries_without_a_file_and_files_without_an_entry(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path)
+    (root / "pointcloud_map.pcd" / "t_20_0.pcd").unlink()
+    (root / "pointcloud_map.pcd" / "stray.PCD").write_bytes(b"")
+    (root / "pointcloud_map.pcd" / "notes.txt").write_bytes(b"")
+    catalogue = open_map(root).load()
+    assert [Path(catalogue.id(i)).name for i in range(len(catalogue))] == ["t_-20_40.pcd", "t_0_0.pcd"]
+    lacking, stray = catalogue.problems
+    assert lacking.endswith("entries without a file, not served: t_20_0.pcd")
+    assert stray.endswith("files without an entry, not served: stray.PCD")
+    with pytest.raises(
+        MapDataError, match=r"metadata\.yaml: these entries have no file in .*: t_20_0\.pcd"
+    ) as caught:
+        open_map(root, strict=True).load()
+    assert caught.value.cause == "missing_files"
+
+
+def test_many_missing_files_are_counted(tmp_path: Path) -> None:
+    put_cells(tmp_path, ["t_0_0.pcd"])
+    extra = "".join(f"gone_{i}.pcd: [{i}, 0]\n" for i in range(500))
+    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text(["t_0_0.pcd"], extra))
+    (problem,) = open_map(tmp_path).load().problems
+    assert problem.endswith("gone_0.pcd, gone_1.pcd, gone_2.pcd, ... (500 in all)")
+
+
+def test_no_entry_has_a_file(tmp_path: Path) -> None:
+    put_cells(tmp_path, ["other.pcd", "another.pcd"])
+    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+    with pytest.raises(MapDataError, match="have no file") as caught:
+        open_map(tmp_path).load()
+    assert caught.value.exit_code == 65
+
+
+def test_nothing_there(tmp_path: Path) -> None:
+    with pytest.raises(MapMissing, match="no such file"):
+        open_map(tmp_path / "none")
+    with pytest.raises(MapMissing, match="no metadata file"):
+        open_map(tmp_path, metadata=tmp_path / "none.yaml")
+    with pytest.raises(MapMissing, match="no PCD file"):
+        open_map(tmp_path).load()
+    with pytest.raises(MapMissing, match="none of the PCD paths"):
+        open_map(tmp_path, pcd_paths=[tmp_path / "none.pcd"])
+    assert MapMissing("x").exit_code == 66
+
+
+def test_several_files_without_metadata(tmp_path: Path) -> None:
+    put_cells(tmp_path)
+    with pytest.raises(MapDataError, match=r"3 PCD files but no pointcloud_map_metadata\.yaml") as caught:
+        open_map(tmp_path).load()
+    assert caught.value.cause == "no_metadata"
+
+
+def test_metadata_without_cells(tmp_path: Path) -> None:
+    put_cells(tmp_path)
+    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text([]))
+    with pytest.raises(MapDataError, match="lists no cells"):
+        open_map(tmp_path).load()
+
+
+def test_things_called_pcd_that_are_no_files(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path)
+    cells = root / "pointcloud_map.pcd"
+    (cells / "t_0_0.pcd").unlink()
+    os.mkfifo(cells / "t_0_0.pcd")
+    (cells / "dangling.pcd").symlink_to(cells / "nowhere")
+    (cells / "empty.pcd").mkdir()
+    catalogue = open_map(root).load()
+    assert len(catalogue) == 2
+    text = "\n".join(catalogue.problems)
+    assert f"no regular file: {cells / 't_0_0.pcd'}" in text
+    assert f"cannot be read (No such file or directory): {cells / 'dangling.pcd'}" in text
+
+
+def test_path_that_no_client_could_name(tmp_path: Path) -> None:
+    odd = os.fsencode(tmp_path) + b"/\xff"
+    os.mkdir(odd)
+    with pytest.raises(MapDataError, match="no UTF-8"):
+        open_map(os.fsdecode(odd))
+
+
+def make_single(path: Path) -> None:
+    points = [[1.5, -2.0, 3.0], [-7.25, 9.0, 1.0], [np.nan, 1e9, 0.0], [0.0, 0.0, 50.0]]
+    write_pcd(path, dict(zip("xyz", np.array(points, dtype=np.float32).T, strict=True)))
+
+
+@pytest.mark.parametrize("name", ["city.pcd", "pointcloud_map.pcd", "CITY.PCD"])
+def test_one_pcd_is_one_cell_with_the_bounds_of_its_points(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    make_single(file)
+    (tmp_path / "lanelet2_map.osm").write_text("")
+    for path in (file, tmp_path):
+        for strict in (False, True):
+            catalogue = open_map(path, strict=strict).load()
+            assert len(catalogue) == 1
+            assert catalogue.id(0) == str(file)
+            assert catalogue.box(0) == (-7.25, -2.0, 1.5, 9.0)
+            assert catalogue.stamp(0) == Stamp.of(file.stat())
+
+
+def test_one_pcd_too_large_wants_dividing(tmp_path: Path) -> None:
+    file = tmp_path / "city.pcd"
+    with open(file, "wb") as out:
+        out.truncate((256 << 20) + 1)
+    with pytest.raises(MapDataError, match="divide it") as caught:
+        open_map(file).load()
+    assert caught.value.cause == "needs_dividing"
+    assert caught.value.exit_code == 65
+
+
+def test_one_pcd_without_points_or_sense(tmp_path: Path) -> None:
+    file = tmp_path / "city.pcd"
+    write_pcd(file, dict.fromkeys("xyz", np.full(2, np.nan, dtype=np.float32)))
+    with pytest.raises(MapDataError, match="no finite point"):
+        open_map(file).load()
+    file.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(MapDataError) as caught:
+        open_map(file).load()
+    assert caught.value.cause == "lfs_pointer"
+
+
+def test_reload_sees_what_changed(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path)
+    origin = open_map(root)
+    before = origin.load()
+    cells = root / "pointcloud_map.pcd"
+    (cells / "t_0_0.pcd").write_bytes(b"another content")
+    (cells / "t_20_0.pcd").unlink()
+    put_cells(cells, ["new.pcd"])
+    (root / "pointcloud_map_metadata.yaml").write_text(metadata_text(NAMES[::2], "new.pcd: [60, 60]\n"))
+    change = compare(before, origin.load(fresh=True))
+    assert change.added == (str(cells / "new.pcd"),)
+    assert change.removed == (str(cells / "t_20_0.pcd"),)
+    assert change.changed == (str(cells / "t_0_0.pcd"),)
+    assert before.map_version != origin.load().map_version
+
+
+def test_a_map_directory_knows_its_name(tmp_path: Path) -> None:
+    assert open_map(autoware_map(tmp_path)).path == str(tmp_path)
+    assert MapDirectory(path=str(tmp_path)).load().id_prefix == f"{tmp_path}/pointcloud_map.pcd/"
