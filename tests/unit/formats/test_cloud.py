@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole clouds, descriptions, and the formats that Open3D reads."""
+
+from __future__ import annotations
+
+import builtins
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shmmap.errors import MapDataError, ShmmapError
+from shmmap.formats import open3d_reader
+from shmmap.formats.causes import CAUSES
+from shmmap.formats.cloud import describe, read_cloud, read_pcd
+from tests.support.pcd_bytes import Field, column, pcd
+
+PLY = (
+    "ply\nformat {form} 1.0\ncomment made by hand\nelement vertex {count}\n"
+    "property double x\nproperty double y\nproperty double z\nproperty float intensity\nend_header\n"
+)
+POINTS = [(589500.123456789, 2.0, 3.0, 0.5), (1.0, -2.0, 3.5, 0.25), (4.0, 5.0, 6.0, 0.125)]
+TEXT = "".join(f"{x!r} {y!r} {z!r} {i!r}\n" for x, y, z, i in POINTS)
+
+
+def ply(form: str, count: int = 3) -> bytes:
+    head = PLY.format(form=form, count=count).encode()
+    order = ">" if "big" in form else "<"
+    return head + (
+        TEXT.encode() if form == "ascii" else b"".join(struct.pack(order + "3df", *point) for point in POINTS)
+    )
+
+
+def test_a_pcd_in_memory(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.PCD"
+    fields = [column(name, "F4", [1.0, float("nan"), 3.0]) for name in "xyz"]
+    fields.append(Field("h", "I", 2, ((1, 2), (3, 4), (5, 6)), 2))
+    path.write_bytes(pcd(fields, "binary", change={"VIEWPOINT": "1 0 0 1 0 0 0"}))
+    cloud = read_pcd(path)
+    assert (cloud.points, cloud.dropped) == (3, 1)
+    assert cloud.xyz.tolist() == [[1, 1, 1], [3, 3, 3]]
+    assert cloud.columns["h"].tolist() == [[1, 2], [5, 6]]
+    assert [bound.tolist() for bound in cloud.bounds] == [[1, 1, 1], [3, 3, 3]]
+    assert cloud.viewpoint[0] == 1
+    assert len(cloud.warnings) == 1
+    assert read_cloud(path, keep_non_finite=True).dropped == 0
+    told = describe(path)
+    assert (told.format, told.encoding, told.version, told.points, told.dropped) == (
+        "pcd",
+        "binary",
+        "0.7",
+        3,
+        1,
+    )
+    assert [(c.name, c.dtype.str, c.components) for c in told.columns] == [("xyz", "<f4", 3), ("h", "<i2", 2)]
+    assert (told.width, told.height, told.file_bytes) == (3, 1, path.stat().st_size)
+    assert [bound.tolist() for bound in told.bounds] == [[1, 1, 1], [3, 3, 3]]
+    assert told.warnings == cloud.warnings
+
+
+def test_an_empty_pcd_has_its_columns(tmp_path: Path) -> None:
+    path = tmp_path / "empty.pcd"
+    fields = [*(column(name, "F8", []) for name in "xyz"), Field("h", "U", 1, (), 3)]
+    for encoding in ("ascii", "binary", "binary_compressed"):
+        path.write_bytes(pcd(fields, encoding))
+        cloud = read_pcd(path)
+        assert cloud.xyz.shape == (0, 3)
+        assert cloud.xyz.dtype == np.float64
+        assert cloud.columns["h"].shape == (0, 3)
+
+
+def test_reading_a_pcd_loads_no_open3d() -> None:
+    program = "import sys; import shmmap.formats.cloud; print('open3d' in sys.modules, 'lzf' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "columns"),
+    [
+        ("a.ply", ply("ascii"), ["xyz", "intensity"]),
+        ("a.ply", ply("binary_little_endian"), ["xyz", "intensity"]),
+        ("a.ply", ply("binary_big_endian"), ["xyz", "intensity"]),
+        ("a.xyz", "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z, _ in POINTS).encode(), ["xyz"]),
+        (
+            "a.xyzn",
+            "".join(f"{x!r} {y!r} {z!r} 0 0 1\n" for x, y, z, _ in POINTS).encode(),
+            ["xyz", "normals"],
+        ),
+        (
+            "a.xyzrgb",
+            "".join(f"{x!r} {y!r} {z!r} 1 0 1\n" for x, y, z, _ in POINTS).encode(),
+            ["xyz", "colors"],
+        ),
+        ("a.pts", b"3\n" + TEXT.encode(), ["xyz", "intensity"]),
+    ],
+)
+def test_formats_of_open3d(tmp_path: Path, name: str, data: bytes, columns: list[str]) -> None:
+    pytest.importorskip("open3d", reason="open3d is not installed", exc_type=ImportError)
+    path = tmp_path / name
+    path.write_bytes(data)
+    cloud = read_cloud(path)
+    assert list(cloud.columns) == columns
+    assert cloud.xyz.tolist() == [list(point[:3]) for point in POINTS]
+    if "intensity" in columns:
+        assert cloud.columns["intensity"].tolist() == [0.5, 0.25, 0.125]
+    told = describe(path)
+    assert (told.points, told.dropped, told.format) == (3, 0, name[2:])
+    assert [spec.name for spec in told.columns] == columns
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "cause"),
+    [
+        ("a.ply", ply("ascii", 100), "truncated"),
+        ("a.ply", ply("binary_little_endian", 100), "truncated"),
+        ("a.ply", ply("binary_little_endian", 10**11), "truncated"),
+        ("a.ply", ply("binary_little_endian", 3)[:-1], "truncated"),
+        ("a.ply", ply("ascii").replace(b"0.25", b"zero"), "bad_row"),
+        ("a.ply", b"ply\nformat\n", "bad_cloud"),
+        ("a.ply", b"", "bad_cloud"),
+        ("a.ply", ply("ascii").replace(b"property double x", b"property list uchar int x"), "bad_cloud"),
+        ("a.ply", ply("ascii").replace(b"element vertex 3", b"element face 3"), "bad_cloud"),
+        ("a.xyz", b"hello\n", "bad_row"),
+        ("a.pts", b"10\n1 2 3 4\n", "truncated"),
+        ("a.pts", b"many\n1 2 3 4\n", "bad_row"),
+        ("a.pts", b"-1\n1 2 3 4\n", "bad_cloud"),
+        ("a.las", b"LASF", "unsupported_format"),
+        ("a", b"", "unsupported_format"),
+    ],
+)
+def test_bad_files_of_other_formats(tmp_path: Path, name: str, data: bytes, cause: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(MapDataError) as caught:
+        read_cloud(path)
+    assert caught.value.cause == cause
+    assert cause in CAUSES
+
+
+@pytest.mark.parametrize("name", ["absent.ply", "absent.pts", "absent.pcd"])
+def test_missing_files(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MapDataError) as caught:
+        describe(tmp_path / name)
+    assert caught.value.cause == "missing"
+
+
+def test_lines_that_open3d_skips_are_noticed(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", reason="open3d is not installed", exc_type=ImportError)
+    path = tmp_path / "a.xyz"
+    path.write_bytes(b"1 2 3\n4 5\n6 7 8\n")
+    with pytest.raises(MapDataError) as caught:
+        read_cloud(path)
+    assert caught.value.cause == "bad_cloud"
+
+
+def test_missing_system_libraries_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "open3d":
+            raise ImportError("libEGL.so.1: cannot open shared object file")
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    (tmp_path / "a.xyz").write_bytes(b"1 2 3\n")
+    with pytest.raises(ShmmapError) as caught:
+        open3d_reader.read_with_open3d(str(tmp_path / "a.xyz"), ".xyz")
+    assert not isinstance(caught.value, MapDataError)
+    for package in ("libegl1", "libgl1", "libx11-6", "libusb-1.0-0"):
+        assert package in str(caught.value)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The points layer: a file's bits in a segment, read back by offsets from its header."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xxhash
+
+from shmmap.errors import MapDataError
+from shmmap.layers.points import BUILDER_VERSION, build_points
+from shmmap.segment.layout import unpack_header
+from tests.support.pcd_bytes import Field, column, pcd
+
+ENCODINGS = ("ascii", "binary", "binary_compressed")
+BOX = (0.0, 0.0, 20.0, 20.0)
+
+
+@pytest.fixture
+def segment() -> Iterator[int]:
+    fd = os.memfd_create("segment")
+    yield fd
+    os.close(fd)
+
+
+def content(fd: int) -> bytes:
+    return os.pread(fd, os.fstat(fd).st_size, 0)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("bad", [(), (3,), (0, 299), tuple(range(300))])
+def test_a_segment_holds_the_kept_points(
+    tmp_path: Path, segment: int, encoding: str, bad: tuple[int, ...]
+) -> None:
+    rows = 300
+    x = [math.nan if row in bad else row / 8 for row in range(rows)]
+    fields = [
+        column("intensity", "U1", [row % 256 for row in range(rows)]),
+        column("x", "F4", x),
+        column("y", "F4", [row / 4 for row in range(rows)]),
+        column("z", "F4", [-row / 2 for row in range(rows)]),
+        Field("h", "I", 8, tuple((row, -row) for row in range(rows)), 2),
+    ]
+    path = tmp_path / "cell.pcd"
+    path.write_bytes(pcd(fields, encoding))
+    asked: list[int] = []
+    returned = build_points(str(path), segment, cell_id=str(path), box=BOX, reserve=asked.append)
+    data = content(segment)
+    header = unpack_header(memoryview(data), len(data))
+    assert repr(header) == repr(returned)  # NaN bounds are not equal to themselves
+    assert asked[-1] == header.total_bytes == len(data)
+    kept = [row for row in range(rows) if row not in bad]
+    assert (header.rows, header.source_points, header.dropped_points) == (len(kept), rows, len(bad))
+    assert (header.cell_id, header.layer, header.box) == (str(path), "points", BOX)
+    assert header.builder_version == BUILDER_VERSION
+    assert header.source_digest == xxhash.xxh3_128(path.read_bytes()).digest()
+    status = path.stat()
+    assert header.source == (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    expected = {
+        "xyz": np.array([[x[row], row / 4, -row / 2] for row in kept], "<f4").reshape(-1, 3),
+        "intensity": np.array([row % 256 for row in kept], "u1"),
+        "h": np.array([[row, -row] for row in kept], "<i8").reshape(-1, 2),
+    }
+    assert [entry.name for entry in header.columns] == list(expected)
+    for entry in header.columns:
+        raw = data[entry.offset : entry.offset + entry.nbytes]
+        assert raw == expected[entry.name].tobytes()
+        assert entry.shape == expected[entry.name].shape
+        assert entry.offset % 64 == 0
+        assert entry.checksum == xxhash.xxh3_64(raw).intdigest()
+    if kept:
+        assert (header.z_min, header.z_max) == (-kept[-1] / 2, -kept[0] / 2)
+    else:
+        assert math.isnan(header.z_min)
+        assert math.isnan(header.z_max)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_dropping_points_gives_the_bytes_of_a_file_without_them(
+    tmp_path: Path, segment: int, encoding: str
+) -> None:
+    """Also across blocks: nothing of the first pass remains."""
+    rows = 140_000 if encoding == "binary" else 2_000
+    good = [column(name, "F4", [float(row) for row in range(rows)]) for name in "xyz"]
+    odd = [column(name, "F4", [math.inf, *(float(row) for row in range(rows)), math.nan]) for name in "xyz"]
+    path = tmp_path / "cell.pcd"
+    columns = []
+    for fields in (good, odd):
+        path.write_bytes(pcd(fields, encoding))
+        os.ftruncate(segment, 0)
+        header = build_points(str(path), segment, cell_id="cell", box=BOX)
+        data = content(segment)
+        assert len(data) == header.total_bytes
+        columns.append(data[header.header_bytes :])
+    assert columns[0] == columns[1]
+
+
+def test_a_refused_reservation_writes_nothing(tmp_path: Path, segment: int) -> None:
+    path = tmp_path / "cell.pcd"
+    path.write_bytes(pcd([column(name, "F4", [1.0] * 1000) for name in "xyz"], "binary"))
+
+    def refuse(nbytes: int) -> None:
+        raise MemoryError(nbytes)
+
+    with pytest.raises(MemoryError):
+        build_points(str(path), segment, cell_id="cell", box=BOX, reserve=refuse)
+    assert os.fstat(segment).st_size == 0
+
+
+def test_a_bad_file_reserves_nothing(tmp_path: Path, segment: int) -> None:
+    path = tmp_path / "cell.pcd"
+    path.write_bytes(pcd([column(name, "F4", [1.0] * 10) for name in "xyz"], "binary")[:-1])
+    asked: list[int] = []
+    with pytest.raises(MapDataError):
+        build_points(str(path), segment, cell_id="cell", box=BOX, reserve=asked.append)
+    assert asked == []
+
+
+def test_a_file_that_changes_meanwhile_is_refused(tmp_path: Path, segment: int) -> None:
+    path = tmp_path / "cell.pcd"
+    path.write_bytes(pcd([column(name, "F4", [1.0] * 10) for name in "xyz"], "binary"))
+
+    def rewrite(nbytes: int) -> None:
+        with open(path, "ab") as file:
+            file.write(b"more")
+
+    with pytest.raises(MapDataError) as caught:
+        build_points(str(path), segment, cell_id="cell", box=BOX, reserve=rewrite)
+    assert caught.value.cause == "changed"
+
+
+def test_keeping_all_points(tmp_path: Path, segment: int) -> None:
+    path = tmp_path / "cell.pcd"
+    path.write_bytes(pcd([column(name, "F4", [1.0, math.nan]) for name in "xyz"], "binary"))
+    header = build_points(str(path), segment, cell_id="cell", box=BOX, keep_non_finite=True)
+    assert (header.rows, header.dropped_points, header.z_max) == (2, 0, 1.0)
