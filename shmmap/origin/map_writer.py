@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import math
@@ -157,9 +158,9 @@ class MapWriter:
         """
         rows = self._rows(columns)
         ix, iy = self._cell_indices(rows)
-        order, starts = _group(ix, iy)
+        order, bounds = _group(ix, iy)
         rows = rows[order]
-        for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
+        for start, stop in itertools.pairwise(bounds):
             where = (int(ix[order[start]]), int(iy[order[start]]))
             if where in self._written or (complete and where in self._pending):
                 raise BadRequest(f"the cell at {self._corner_text(where)} has points already")
@@ -297,7 +298,7 @@ def _number_text(value: float) -> str:
 
 
 def _group(ix: NDArray[np.int64], iy: NDArray[np.int64]) -> tuple[NDArray[np.intp], list[int]]:
-    """Order that brings points of a cell together, stably, and where each cell starts in it."""
+    """Order that brings points of a cell together, stably, and where each cell starts and the last ends."""
     if not len(ix):
         return np.empty(0, dtype=np.intp), []
     width, height = int(np.ptp(ix)) + 1, int(np.ptp(iy)) + 1
@@ -309,7 +310,7 @@ def _group(ix: NDArray[np.int64], iy: NDArray[np.int64]) -> tuple[NDArray[np.int
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     starts = np.flatnonzero(np.concatenate(([True], ordered[1:] != ordered[:-1])))
-    return order, starts.tolist()
+    return order, [*starts.tolist(), len(order)]
 
 
 def _flush_directory(path: str) -> None:
