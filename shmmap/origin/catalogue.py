@@ -134,7 +134,9 @@ class Catalogue:
         return self._names.ids(indices)
 
     def find(self, cell: str) -> int | None:
-        """Index of the cell with this id, or with this base name where only one has it; None if none.
+        """Index of the cell with this id, in full or without `id_prefix`, or else with this base name.
+
+        None where there is no such cell.
 
         Raises
         ------

@@ -55,7 +55,9 @@ class CellNames:
         return [prefix + os.fsdecode(name) for name in self.names[indices].tolist()]
 
     def find(self, wanted: str) -> int | None:
-        """Index of the cell with this id, or this base name where only one cell has it.
+        """Index of the cell with this id, in full or without the prefix, or with this base name.
+
+        A base name must be unique, unless a cell right below the prefix has it: that is its id then.
 
         Raises
         ------
@@ -64,7 +66,9 @@ class CellNames:
         """
         index = self._known.get(wanted)
         if index is None:
-            index = self._find_id(wanted) if "/" in wanted else self._find_base(wanted)
+            index = self._find_id(wanted)
+            if index is None and "/" not in wanted:
+                index = self._find_base(wanted)
             if index is not None:
                 if len(self._known) >= _REMEMBERED:
                     self._known.clear()
@@ -72,9 +76,9 @@ class CellNames:
         return index
 
     def _find_id(self, wanted: str) -> int | None:
-        if not wanted.startswith(self.prefix):
+        if wanted.startswith("/") and not wanted.startswith(self.prefix):
             return None
-        found = _positions(self.names, wanted[len(self.prefix) :])
+        found = _positions(self.names, wanted.removeprefix(self.prefix))
         return found.start if found else None
 
     def _find_base(self, wanted: str) -> int | None:

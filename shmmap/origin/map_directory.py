@@ -111,13 +111,20 @@ class MapDirectory:
         if layout.metadata is None:
             return _without_metadata(files)
         # looked at before it is read: a change meanwhile then differs from what is written down
-        metadata_source = Source.of(layout.metadata, os.stat(layout.metadata))
+        metadata_source = Source.of(layout.metadata, _status(layout.metadata))
         entries = read_metadata(layout.metadata, strict=self.strict)
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
         if len(catalogue) >= self.cached_from_cells and all(os.path.isdir(root) for root in layout.roots):
             directories = [Source.of(path, status) for path, status in files.directories.items()]
             save_sidecar(sidecar, key, [metadata_source, *directories], catalogue, scanned_ns)
         return catalogue
+
+
+def _status(path: str) -> os.stat_result:
+    try:
+        return os.stat(path)
+    except OSError as error:
+        raise MapMissing(f"cannot read {path}: {error.strerror}") from error
 
 
 def _without_metadata(files: ScannedFiles) -> Catalogue:

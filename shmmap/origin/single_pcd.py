@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 
-from shmmap.errors import MapDataError
+from shmmap.errors import MapDataError, MapMissing
 from shmmap.formats.pcd_reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.stamp import Stamp
@@ -17,25 +17,29 @@ __all__ = ["MAX_SINGLE_PCD_BYTES", "load_single_pcd"]
 MAX_SINGLE_PCD_BYTES = 256 << 20
 """A larger file is refused: loading all of a map to use a part of it is what dividing avoids."""
 
+# What a compressed file of that size may hold; point clouds shrink to a half or a third.
+_MAX_POINT_BYTES = 4 * MAX_SINGLE_PCD_BYTES
+
 
 def load_single_pcd(path: str) -> Catalogue:
     """Catalogue of one cell whose box is the bounds of the points in ``path`` (read whole).
 
     Raises
     ------
+    MapMissing
+        The file vanished or may not be read.
     MapDataError
-        The file is larger than 256 MiB, is no sound PCD, or has no finite point.
+        The file is larger than 256 MiB (or its points than 1 GiB), is no sound PCD, or has no finite
+        point.
     """
-    status = os.stat(path)
-    if status.st_size > MAX_SINGLE_PCD_BYTES:
-        raise MapDataError(
-            f"{status.st_size / 2**20:.0f} MiB in one file; a map served without metadata"
-            f" may have {MAX_SINGLE_PCD_BYTES >> 20} MiB",
-            path=path,
-            cause="needs_dividing",
-            hint="divide it into cells of about 20 m with metadata, as Autoware's pointcloud divider does",
-        )
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise MapMissing(f"cannot read {path}: {error.strerror}") from error
+    _refuse_large(path, "file", status.st_size, MAX_SINGLE_PCD_BYTES)
     with PcdReader(path) as reader:
+        points_bytes = reader.header.points * reader.header.point_bytes
+        _refuse_large(path, "points", points_bytes, _MAX_POINT_BYTES)
         for _ in reader.blocks():
             pass
         lower, upper = reader.bounds
@@ -43,3 +47,13 @@ def load_single_pcd(path: str) -> Catalogue:
         raise MapDataError("no finite point, so the map has no extent", path=path, cause="no_points")
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
     return Catalogue.from_cells([(path, box, Stamp.of(status))])
+
+
+def _refuse_large(path: str, what: str, size: int, limit: int) -> None:
+    if size > limit:
+        raise MapDataError(
+            f"{size / 2**20:.0f} MiB of {what}; a map of one file without metadata may have {limit >> 20}",
+            path=path,
+            cause="needs_dividing",
+            hint="divide it into cells of about 20 m with metadata, as Autoware's pointcloud divider does",
+        )

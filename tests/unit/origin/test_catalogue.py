@@ -57,8 +57,17 @@ def test_find_by_id_and_base_name() -> None:
     assert cells.find("ü.pcd") == 4
     for _ in range(2):  # the second time from memory
         assert cells.find("/m/2/b.pcd") == 2
+    assert cells.find("1/a.pcd") == 0
+    assert cells.find("2/a.pcd") == 1
+    assert cells.find("3/a.pcd") is None
     with pytest.raises(BadRequest, match=r"2 cells are called a\.pcd: /m/1/a\.pcd, /m/2/a\.pcd"):
         cells.find("a.pcd")
+
+
+def test_an_id_without_its_prefix_is_no_ambiguous_base_name() -> None:
+    cells = catalogue(dict.fromkeys(["/m/a.pcd", "/m/1/a.pcd"], STAMP))
+    assert cells.find("a.pcd") == cells.find("/m/a.pcd") == 1
+    assert cells.find("1/a.pcd") == 0
 
 
 @pytest.mark.parametrize(

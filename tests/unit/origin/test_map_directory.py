@@ -273,6 +273,19 @@ def test_one_pcd_too_large_wants_dividing(tmp_path: Path) -> None:
     assert caught.value.exit_code == 65
 
 
+def test_one_pcd_whose_points_are_too_many_is_not_decompressed(tmp_path: Path) -> None:
+    file = tmp_path / "city.pcd"
+    points = 100_000_000
+    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+    head += f"WIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA binary_compressed\n"
+    with open(file, "wb") as out:
+        out.write(head.encode() + (100 << 20).to_bytes(4, "little") + (points * 12).to_bytes(4, "little"))
+        out.truncate(101 << 20)
+    with pytest.raises(MapDataError, match="1144 MiB of points") as caught:
+        open_map(file).load()
+    assert caught.value.cause == "needs_dividing"
+
+
 def test_one_pcd_without_points_or_sense(tmp_path: Path) -> None:
     file = tmp_path / "city.pcd"
     write_pcd(file, dict.fromkeys("xyz", np.full(2, np.nan, dtype=np.float32)))
