@@ -172,9 +172,10 @@ class _Life:
             started_unix_ns=time.time_ns(),
             frame_id=catalogue.frame_id,
         )
+        budget = choose_budget(config.budget_bytes, directory)  # may refuse: before anything has a name
         self._statistics = StatisticsWriter(directory, config.instance, self._identity, mode=mode, gid=gid)
         self._sessions = Sessions()
-        books = Residency(choose_budget(config.budget_bytes, directory))
+        books = Residency(budget)
         books.overhead_bytes = self._statistics.size_bytes
         reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction])
         retire_leftovers(directory, config.instance, reclaimer, time.monotonic())

@@ -35,7 +35,7 @@ def daemon(request: pytest.FixtureRequest) -> Iterator[DaemonFactory]:
 
     yield factory
     problems: list[str] = []
-    for one in started:
+    for one in reversed(started):  # a later one may live in an earlier one's directory
         try:
             if one.process is not None:
                 code = one.stop()

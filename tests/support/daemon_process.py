@@ -229,7 +229,9 @@ class DaemonProcess:
             return found  # SIGKILL leaves names behind for the next life to adopt
         found += [f"segment {name}" for name in os.listdir(self.shm_dir) if name.startswith(prefix)]
         if self._own_shm_dir:
-            found += [f"file {n} in the shm directory" for n in os.listdir(self.shm_dir) if prefix not in n]
+            found += [
+                f"file {n} in the shm directory" for n in os.listdir(self.shm_dir) if not n.startswith(prefix)
+            ]
         found += [f"socket {name}" for name in os.listdir(self.runtime_dir) if name.endswith(".sock")]
         found += [f"temporary file {name}" for name in os.listdir(f"{self._private}/tmp")]
         return found
