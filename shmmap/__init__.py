@@ -1,4 +1,152 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One copy of a vehicle's point-cloud map per machine, in shared memory."""
+"""One copy of a vehicle's point-cloud map per machine, in shared memory.
+
+::
+
+    import shmmap
+
+    cells = shmmap.connect().around(x, y, radius=50)
+    print(sum(len(cell.xyz) for cell in cells))
+
+Every public name is loaded when it is first used, so that ``import shmmap`` itself costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from shmmap.client import (
+        Cell,
+        CellInfo,
+        CellSet,
+        Client,
+        Departed,
+        MapListing,
+        MapWindow,
+        PendingLayer,
+        PointsAround,
+        Retention,
+        RetentionPolicy,
+        WindowUpdate,
+        connect,
+    )
+    from shmmap.errors import (
+        BadRequest,
+        CellError,
+        ConfigError,
+        DaemonUnreachable,
+        InstanceBusy,
+        InternalError,
+        LoadFailed,
+        LoadTimeout,
+        MapDataError,
+        MapMissing,
+        NoAnswer,
+        NoSession,
+        NoSocket,
+        NoSpace,
+        NotPermitted,
+        OverBudget,
+        ProtocolMismatch,
+        SegmentCorrupt,
+        SegmentError,
+        ShmmapError,
+        SocketPermission,
+        StaleHandle,
+        StaleSocket,
+        UnknownCell,
+    )
+    from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
+    from shmmap.protocol.messages import HeldCell, Intent
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Area",
+    "AutowareSquare",
+    "BadRequest",
+    "Box",
+    "Cell",
+    "CellError",
+    "CellInfo",
+    "CellSet",
+    "Circle",
+    "Client",
+    "ConfigError",
+    "DaemonUnreachable",
+    "Departed",
+    "HeldCell",
+    "InstanceBusy",
+    "Intent",
+    "InternalError",
+    "LoadFailed",
+    "LoadTimeout",
+    "MapDataError",
+    "MapListing",
+    "MapMissing",
+    "MapWindow",
+    "NoAnswer",
+    "NoSession",
+    "NoSocket",
+    "NoSpace",
+    "NotPermitted",
+    "OverBudget",
+    "PendingLayer",
+    "PointsAround",
+    "ProtocolMismatch",
+    "Retention",
+    "RetentionPolicy",
+    "SegmentCorrupt",
+    "SegmentError",
+    "ShmmapError",
+    "SocketPermission",
+    "StaleHandle",
+    "StaleSocket",
+    "UnknownCell",
+    "WindowUpdate",
+    "ZRange",
+    "__version__",
+    "connect",
+]
+
+_GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
+_MESSAGES: Final = frozenset({"HeldCell", "Intent"})
+_CLIENT: Final = frozenset(
+    {
+        "Cell",
+        "CellInfo",
+        "CellSet",
+        "Client",
+        "Departed",
+        "MapListing",
+        "MapWindow",
+        "PendingLayer",
+        "PointsAround",
+        "Retention",
+        "RetentionPolicy",
+        "WindowUpdate",
+        "connect",
+    }
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _CLIENT:
+        module = "shmmap.client"
+    elif name in _GEOMETRY:
+        module = "shmmap.geometry"
+    elif name in _MESSAGES:
+        module = "shmmap.protocol.messages"
+    elif name in __all__:
+        module = "shmmap.errors"
+    else:
+        raise AttributeError(f"module 'shmmap' has no attribute {name!r}")
+    value = getattr(importlib.import_module(module), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

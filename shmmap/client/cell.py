@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cell of the map in this process: read-only arrays over shared memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from shmmap.protocol.messages import Handle
+from shmmap.segment.attach import AttachedSegment
+from shmmap.segment.layout import SegmentHeader, SourceStamp
+
+if TYPE_CHECKING:
+    import open3d
+    import torch
+
+__all__ = ["Cell"]
+
+
+class Cell:
+    """One layer of one cell at one version, attached.
+
+    Every array is a read-only view of shared memory, zero-copy, and valid as long as it or any
+    view of it lives: after the cell object is gone, after the client is closed, after the daemon
+    ended.  Its bytes never change; a changed map comes as a new cell.
+
+    Attributes
+    ----------
+    id : str
+        Absolute path of the source file, as in Autoware.
+    version : int
+        64-bit hash of the id and the source's stamp; another one after any rewrite of the file.
+    layer : str
+        ``"points"`` is the source itself.
+    box : tuple of float
+        (min_x, min_y, max_x, max_y), metres, map frame.
+    points : int
+        Rows of each column.
+    stale : bool
+        At the last reply that named this version: its source has changed, but the successor could
+        not be loaded yet.
+    segment : str
+        Name of the shared-memory object.
+    offset, nbytes : int
+        Where in it the cell lies, header included.
+    """
+
+    __slots__ = (
+        "__weakref__",
+        "_attached",
+        "_views",
+        "box",
+        "id",
+        "layer",
+        "nbytes",
+        "offset",
+        "points",
+        "segment",
+        "stale",
+        "version",
+    )
+
+    def __init__(self, cell_id: str, segment: str, handle: Handle, attached: AttachedSegment) -> None:
+        self.id = cell_id
+        self.version = handle.version
+        self.layer = handle.layer
+        self.box = (handle.min_x, handle.min_y, handle.max_x, handle.max_y)
+        self.points = handle.points
+        self.stale = handle.stale
+        self.segment = segment
+        self.offset = handle.offset
+        self.nbytes = handle.bytes
+        self._attached = attached
+        self._views: dict[str, NDArray[Any]] = {}
+
+    def __repr__(self) -> str:
+        return f"<Cell {self.id} {self.layer} version {self.version_hex}, {self.points} points>"
+
+    @property
+    def version_hex(self) -> str:
+        """The version as 16 hex digits, as people and JSON read it."""
+        return f"{self.version:016x}"
+
+    # --- columns --------------------------------------------------------------------------------
+
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        """Return a column by name: (N,) or (N, k), in the source's own dtype.
+
+        Raises
+        ------
+        KeyError
+            The cell has no such column; the message lists those it has.
+        """
+        view = self._views.get(column)
+        if view is None:
+            for index, row in enumerate(self._attached.columns):
+                if row[0] == column:
+                    view = self._views[column] = self._attached.column(index)
+                    break
+            else:
+                raise KeyError(f"{self.id} has no column {column!r}; it has {', '.join(self.column_names)}")
+        return view
+
+    @property
+    def xyz(self) -> NDArray[Any]:
+        """Coordinates, (N, 3) in the source's dtype (float32 as a rule), metres, relative to `origin`."""
+        return self["xyz"]
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns, in the source's order."""
+        return tuple(row[0] for row in self._attached.columns)
+
+    @property
+    def columns(self) -> Mapping[str, NDArray[Any]]:
+        """All columns by name."""
+        return MappingProxyType({name: self[name] for name in self.column_names})
+
+    def unit(self, column: str) -> str:
+        """SI unit of a column, empty where the source does not tell."""
+        return next(row[5] for row in self._attached.columns if row[0] == column)
+
+    # --- what the header says -------------------------------------------------------------------
+
+    @property
+    def header(self) -> SegmentHeader:
+        """All that the segment says about itself."""
+        return self._attached.header
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """What coordinates are relative to, metres, map frame; (0, 0, 0) for `points`."""
+        return self.header.origin
+
+    @property
+    def z_bounds(self) -> tuple[float, float]:
+        """Lowest and highest z, metres, map frame; NaN for an empty cell."""
+        return self.header.z_min, self.header.z_max
+
+    @property
+    def source_points(self) -> int:
+        """Points in the source, those that were dropped included."""
+        return self.header.source_points
+
+    @property
+    def dropped_points(self) -> int:
+        """Points left out because a coordinate is not finite."""
+        return self.header.dropped_points
+
+    @property
+    def source(self) -> SourceStamp:
+        """Size (bytes), mtime and ctime (ns) of the source when it was read."""
+        return self.header.source
+
+    @property
+    def source_digest(self) -> bytes:
+        """XXH3-128 of the source, 16 bytes."""
+        return self.header.source_digest
+
+    @property
+    def frame_id(self) -> str:
+        """Name of the map frame."""
+        return self.header.frame_id
+
+    def verify(self) -> None:
+        """Compare every column with its checksum; needs the ``xxhash`` package.
+
+        The header's own checksum was verified when the cell was attached.
+
+        Raises
+        ------
+        SegmentCorrupt
+            Naming the first column whose bytes changed.
+        """
+        self._attached.verify()
+
+    # --- other libraries, over the same memory ----------------------------------------------------
+
+    def to_open3d(self) -> open3d.t.geometry.PointCloud:
+        """Return an Open3D tensor point cloud over the same memory.
+
+        ``xyz`` is its ``positions``; every other column is an attribute of its own name, (N, 1) or
+        (N, k).  Open3D does not know read-only memory: **writing through the result ends the
+        process** (SIGSEGV).  ``.clone()`` makes a private copy.
+        """
+        from shmmap.client.wrapping import open3d_cloud
+
+        return open3d_cloud(self)
+
+    def to_torch(self) -> dict[str, torch.Tensor]:
+        """Return torch tensors by column name over the same memory.
+
+        Torch does not know read-only memory: **writing through a tensor ends the process**
+        (SIGSEGV).  ``.clone()`` makes a private copy.
+        """
+        from shmmap.client.wrapping import torch_tensors
+
+        return torch_tensors(self)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a request for cells brings back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, overload
+
+from shmmap.client.cell import Cell
+from shmmap.errors import CellError
+from shmmap.protocol.messages import FailedCell, Holder
+
+__all__ = ["CellSet", "PendingLayer", "cell_error"]
+
+
+class PendingLayer(NamedTuple):
+    """One layer of one cell that is still being loaded."""
+
+    id: str
+    layer: str
+
+
+@dataclass(frozen=True, slots=True)
+class CellSet(Sequence[Cell]):
+    """The cells that answer a request, in reply order, and what is missing among them.
+
+    It is a sequence of its cells.
+
+    Attributes
+    ----------
+    cells : tuple of Cell
+        Attached cells; of a differential request only the new and changed ones.
+    failed : tuple of CellError
+        Cells that cannot be had; the others are good all the same.
+    pending : tuple of PendingLayer
+        Cells still being loaded when the wait was over: ask again.
+    removed : tuple of str
+        Held ids that left the area or the map, in the order they were given.
+    epoch : int
+        Which life of the daemon answered.
+    map_version : int
+        Which state of the map.
+    """
+
+    cells: tuple[Cell, ...] = ()
+    failed: tuple[CellError, ...] = ()
+    pending: tuple[PendingLayer, ...] = ()
+    removed: tuple[str, ...] = ()
+    epoch: int = 0
+    map_version: int = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing that was asked for is missing."""
+        return not self.failed and not self.pending
+
+    def raise_for_failures(self) -> CellSet:
+        """Return the set itself, or raise the first of `failed`."""
+        if self.failed:
+            raise self.failed[0]
+        return self
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def __iter__(self) -> Iterator[Cell]:
+        return iter(self.cells)
+
+    @overload
+    def __getitem__(self, index: int) -> Cell: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Cell, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> Cell | tuple[Cell, ...]:
+        return self.cells[index]
+
+
+def _kinds(root: type[CellError]) -> dict[str, type[CellError]]:
+    return {root.code: root, **{kind.code: kind for kind in root.__subclasses__()}}
+
+
+_KINDS = _kinds(CellError)
+
+
+def _line(holder: Holder) -> str:
+    what = f"{holder.bytes} bytes" + (f" in {holder.cells} cells" if holder.cells else "")
+    if holder.session == 0:
+        return f"unknown (not through the client library) holds {what}"
+    name = f" ({holder.client})" if holder.client else ""
+    return f"session {holder.session:016x}, pid {holder.pid}{name} holds {what}"
+
+
+def cell_error(failure: FailedCell, cell_id: str) -> CellError:
+    """Return the error that a reply describes for one cell."""
+    kind = _KINDS.get(failure.code, CellError)
+    return kind(
+        f"{cell_id} ({failure.layer}): {failure.message}",
+        cell_id=cell_id,
+        layer=failure.layer,
+        holders=[_line(holder) for holder in failure.holders],
+    )

@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`Client`: one process's session with the daemon."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from threading import TIMEOUT_MAX
+from types import TracebackType
+from typing import Final
+
+from shmmap import geometry
+from shmmap.client.attaching import Unmapper
+from shmmap.client.cell_set import CellSet
+from shmmap.client.discovery import candidates
+from shmmap.client.held import Held, HeldCells
+from shmmap.client.map_listing import MapListing
+from shmmap.client.session import Session
+from shmmap.errors import BadRequest, NoAnswer
+from shmmap.protocol import messages
+from shmmap.protocol.messages import Intent, Welcome
+
+__all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
+
+DEFAULT_WAIT_S: Final = 5.0
+_LISTING_ROUNDS: Final = 5  # how often a listing is begun again because the map changed meanwhile
+_PAGE_ROWS: Final = 10_000
+
+
+class Client:
+    """A session with the daemon; get one from `connect`.
+
+    May be used from several threads: one request is on its way at a time, others wait for it.
+
+    After a fork the child gets a session of its own with its first request.  Cells attached before
+    stay readable in it, and until the child drops them or ends the daemon takes them for pinned by the
+    parent.  The parent notices nothing.
+
+    Every request has a deadline, ``timeout`` beyond what it lets the daemon wait, and is repeated on
+    silence; a restarted daemon gets a new session without any error.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str],
+        *,
+        timeout: float,
+        connect_timeout: float,
+        name: str,
+        shm_dir: str,
+    ) -> None:
+        self._session = Session(
+            paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir
+        )
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the session; attached cells stay readable."""
+        self._session.close()
+
+    # --- what the daemon said -------------------------------------------------------------------
+
+    @property
+    def timeout(self) -> float:
+        """Seconds a reply may take, beyond what a request lets the daemon wait."""
+        return self._session.timeout_s
+
+    @property
+    def welcome(self) -> Welcome:
+        """What the daemon said of itself and its map when the session began."""
+        return self._session.welcome
+
+    @property
+    def endpoint(self) -> str:
+        """Path of the daemon's socket."""
+        return self._session.path
+
+    @property
+    def epoch(self) -> int:
+        """Which life of the daemon the session is with."""
+        return self._session.welcome.epoch
+
+    @property
+    def map_version(self) -> int:
+        """Which state of the map the last answer was about."""
+        return self._session.map_version
+
+    @property
+    def unmapper(self) -> Unmapper:
+        """Where this client's mappings go when their last view is gone."""
+        return self._session.attacher.unmapper
+
+    # --- cells ------------------------------------------------------------------------------------
+
+    def around(
+        self,
+        x: float,
+        y: float,
+        radius: float = 50.0,
+        *,
+        layers: str | Sequence[str] = ("points",),
+        z: tuple[float, float] | None = None,
+        wait: float | None = DEFAULT_WAIT_S,
+    ) -> CellSet:
+        """Cells within ``radius`` metres of a place: `area` with a circle."""
+        heights = geometry.ZRange(*z) if z is not None else None
+        return self.area(geometry.Circle(x, y, radius, heights), layers, wait=wait)
+
+    def area(
+        self,
+        area: geometry.Area,
+        layers: str | Sequence[str] = ("points",),
+        *,
+        wait: float | None = DEFAULT_WAIT_S,
+        intent: Intent | None = None,
+    ) -> CellSet:
+        """Cells that touch an area, in id order.
+
+        Parameters
+        ----------
+        area
+            `Circle`, `Box` or `AutowareSquare`; metres, map frame.
+        layers
+            What to have of each cell.
+        wait
+            Seconds the daemon may take to load what is not in memory; None: take what is there, the
+            rest is `CellSet.pending`.
+        intent
+            Where this process is and goes; the daemon keeps what is near.
+
+        Raises
+        ------
+        NoAnswer
+            No reply before the deadline.
+        BadRequest
+            The area or a layer makes no sense.
+        SegmentError
+            This user may not read the segments, or the process has no room for more mappings.
+        """
+        specs = _layers(layers)
+        message = messages.area_to_message(area)
+        return self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, intent), wait)
+
+    def differential(
+        self,
+        area: geometry.Area,
+        held: Iterable[Held],
+        layers: str | Sequence[str] = ("points",),
+        *,
+        wait: float | None = DEFAULT_WAIT_S,
+        intent: Intent | None = None,
+        by_name: bool = False,
+        populate: bool = False,
+    ) -> CellSet:
+        """Cells that touch an area, minus those that are held at their current version.
+
+        Drop what `CellSet.removed` lists before adding the cells; a cell whose version changed comes
+        again without being removed.
+
+        Parameters
+        ----------
+        held
+            Cells of earlier answers; or ids, alone (meaning the current version) or with a version.
+        by_name
+            Send held cells by name and version, not by version alone: for the first request to a
+            restarted daemon, which cannot know what the versions of an earlier life belonged to.
+        populate
+            Let the kernel map every page while attaching instead of at first touch.
+
+        Other parameters and errors are those of `area`.
+        """
+        specs = _layers(layers)
+        message = messages.area_to_message(area)
+        mine = HeldCells(held, specs, by_name=by_name)
+        return self._session.ask_cells(
+            lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, intent),
+            wait,
+            removed=mine.removed,
+            populate=populate,
+        )
+
+    def selected(
+        self,
+        ids: Iterable[str],
+        layers: str | Sequence[str] = ("points",),
+        *,
+        wait: float | None = DEFAULT_WAIT_S,
+        intent: Intent | None = None,
+    ) -> CellSet:
+        """Cells by id, in the order asked for, duplicates preserved.
+
+        An id is the absolute path of the cell's file, or its base name where that is unique.  Other
+        parameters and errors are those of `area`.
+        """
+        specs = _layers(layers)
+        wanted = tuple(ids)
+        return self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, intent), wait)
+
+    def release(self) -> int:
+        """Tell the daemon now what this process let go since the last request; returns how many versions.
+
+        Every request tells it anyway; this is for programs that drop cells and then stay quiet.
+        """
+        return self._session.tell_unmapped()
+
+    # --- the map and the daemon -------------------------------------------------------------------
+
+    def metadata(self, area: geometry.Area | None = None, *, since: int | None = None) -> MapListing:
+        """List the map's cells, loaded or not.
+
+        Parameters
+        ----------
+        area
+            Only cells that touch it.
+        since
+            Only what changed after this map version, if the daemon still knows it
+            (`MapListing.since_known`).
+        """
+        message = messages.area_to_message(area) if area is not None else None
+        for _ in range(_LISTING_ROUNDS):
+            rows: list[messages.MetadataRow] = []
+            first: messages.MetadataPage | None = None
+            start: int | None = 0
+            while start is not None:
+                page = self._session.ask(
+                    lambda n, at=start: messages.Metadata(n, message, since, at, _PAGE_ROWS),  # type: ignore[misc]
+                    messages.MetadataPage,
+                )
+                first = first or page
+                if page.map_version != first.map_version:
+                    break  # a reload came in between: pages of two states do not fit together
+                rows += page.rows
+                start = page.next
+            else:
+                assert first is not None  # noqa: S101  the loop ran at least once
+                return MapListing(
+                    rows,
+                    self._session.welcome.id_prefix,
+                    map_version=first.map_version,
+                    since_known=first.since_known,
+                    removed=tuple(self._session.whole_id(cell) for cell in first.removed),
+                )
+        raise NoAnswer("the map changed again and again while it was being listed")
+
+    def stats(self) -> messages.StatsReply:
+        """Return the daemon's counters, its sessions, and memory that nobody known holds."""
+        return self._session.ask(messages.Stats, messages.StatsReply)
+
+    def show(self, cell: str) -> messages.ShownCell:
+        """Return everything about one cell: versions, segments and their holders, last failure.
+
+        Raises
+        ------
+        UnknownCell
+            The map has no such cell.
+        """
+        return self._session.ask(lambda n: messages.Show(n, cell), messages.ShownCell)
+
+    def reload(self) -> messages.Reloaded:
+        """Have the daemon read the map's directory again.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only its own user and root do this.
+        """
+        return self._session.ask(messages.Reload, messages.Reloaded)
+
+    def evict(self, ids: Iterable[str] | None = None) -> messages.Evicted:
+        """Have the daemon drop cells, all by default; mapped ones are freed when they are let go.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only its own user and root do this.
+        """
+        wanted = tuple(ids) if ids is not None else None
+        return self._session.ask(lambda n: messages.Evict(n, wanted), messages.Evicted)
+
+
+def _layers(layers: str | Sequence[str]) -> tuple[str, ...]:
+    return (layers,) if isinstance(layers, str) else tuple(layers)
+
+
+def connect(
+    endpoint: str | os.PathLike[str] | None = None,
+    *,
+    timeout: float = 5.0,
+    connect_timeout: float = 0.9,
+    name: str = "",
+    shm_dir: str | None = None,
+) -> Client:
+    """Find the daemon and begin a session.
+
+    Parameters
+    ----------
+    endpoint
+        The daemon's socket, a path or an ``ipc://`` URL.  Without one: ``SHMMAP_ENDPOINT``, else
+        ``default.sock`` in ``$XDG_RUNTIME_DIR/shmmap`` and in ``/run/shmmap``, whichever answers first.
+    timeout
+        Seconds a reply may take; what a request lets the daemon wait comes on top.
+    connect_timeout
+        Seconds until the daemon must have said welcome.  Short, since a daemon always answers at once:
+        whoever does not is stopped, hung or overloaded.
+    name
+        How this program appears in ``shmmap clients``; at most 64 characters.
+    shm_dir
+        Directory of the segments as this process sees it (default: ``SHMMAP_SHM_DIR``, else as the daemon
+        says); for containers that have it mounted elsewhere.
+
+    Raises
+    ------
+    NoSocket, SocketPermission, StaleSocket, NoAnswer
+        Why no daemon can be reached; all of them are `DaemonUnreachable`.
+    ProtocolMismatch
+        Who listens is no shmmap daemon, or one of another major version.
+    BadRequest
+        The endpoint cannot be a socket path.
+    """
+    for what, seconds in (("timeout", timeout), ("connect_timeout", connect_timeout)):
+        if not 0 < seconds <= TIMEOUT_MAX:
+            raise BadRequest(f"{what} must be a positive number of seconds, not {seconds!r}")
+    return Client(
+        candidates(os.fspath(endpoint) if endpoint is not None else None),
+        timeout=timeout,
+        connect_timeout=connect_timeout,
+        name=name,
+        shm_dir=shm_dir or os.environ.get("SHMMAP_SHM_DIR", ""),
+    )

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One session with the daemon: requests, deadlines, resending, and coming back after a restart.
+
+A request travels on a DEALER socket, which reconnects by itself.  What was in flight when a daemon
+was killed is lost; so a request is sent again, with the same id, as soon as the connection is back,
+and now and then while nothing is heard.  Every request may be repeated; replies to requests that
+nobody waits for any more are dropped.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import secrets
+import time
+import weakref
+from collections.abc import Sequence
+from typing import Final, TypeVar
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from shmmap.client.discovery import find_socket
+from shmmap.errors import NoAnswer, ProtocolMismatch, error_from_wire
+from shmmap.protocol.codec import decode_reply, encode
+from shmmap.protocol.messages import PROTOCOL_VERSION, ErrorReply, Hello, Reply, Request, Welcome
+
+__all__ = ["Connection"]
+
+R = TypeVar("R")
+
+_SLICE_MS: Final = 100  # how often silence is looked at: did the connection break?
+_RESEND_S: Final = 1.0  # first repetition on silence; the interval then doubles
+_RECONNECT_MS: Final = 20
+_RECONNECT_MAX_MS: Final = 500
+_LAST_WORDS_MS: Final = 100  # closing may take this long to deliver a last message
+_QUEUE: Final = 64  # messages that may wait for a slow daemon
+_SILENT_HINT: Final = "the daemon is stopped, hung, overloaded or gone: see `shmmap health`"
+_UPDATE_HINT: Final = "update the older of client and daemon"
+
+
+class Connection:
+    """A DEALER socket with a session on it; not thread-safe.
+
+    Parameters
+    ----------
+    paths
+        Socket paths to try, in order.
+    name
+        How this client appears in the daemon's lists.
+    timeout_s
+        Until `Welcome` must be here.
+
+    Attributes
+    ----------
+    welcome : Welcome
+        What the daemon said of itself when the session began.
+    path : str
+        Where it listens.
+
+    Raises
+    ------
+    DaemonUnreachable, ProtocolMismatch
+        As `shmmap.client.discovery.find_socket`, and when no `Welcome` comes in time.
+    """
+
+    def __init__(self, paths: Sequence[str], *, name: str = "", timeout_s: float = 0.9) -> None:
+        deadline_s = time.monotonic() + timeout_s
+        self.path = find_socket(paths, deadline_s)
+        self._name = name
+        self._next_request = secrets.randbits(48)
+        self._handshakes = 0
+        # a context of our own: no other library's sockets can hold up its end
+        context = zmq.Context()
+        self._socket = context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # nothing queues up for a daemon that is away
+        self._socket.setsockopt(zmq.SNDHWM, _QUEUE)
+        self._socket.setsockopt(zmq.RCVTIMEO, _SLICE_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
+        self._monitor = self._socket.get_monitor_socket(
+            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+        )
+        # also when nobody calls close(), and at the end of the program
+        sockets = (self._monitor, self._socket)
+        self._finalizer = weakref.finalize(self, _shut, sockets, context, os.getpid())
+        self._socket.connect(f"ipc://{self.path}")
+        self.welcome = self._greet(deadline_s)
+
+    def close(self) -> None:
+        """End the connection; messages just sent get a short moment to leave."""
+        self._finalizer()
+
+    def new_request(self) -> int:
+        """Return a request id not used before."""
+        self._next_request += 1
+        return self._next_request
+
+    def tell(self, message: Request) -> None:
+        """Send a message whose reply nobody waits for; lost if the daemon is away."""
+        self._send(encode(message))
+
+    def ask(self, message: Request, kind: type[R], *, timeout_s: float, quiet_s: float = 0.0) -> R:
+        """Send a request and return its reply; begins a new session where the daemon lost it.
+
+        Parameters
+        ----------
+        kind
+            The reply's type.
+        timeout_s
+            How long the reply may take.
+        quiet_s
+            How long the daemon was asked to wait, during which silence means nothing.
+
+        Raises
+        ------
+        NoAnswer
+            No reply before the deadline.
+        ShmmapError
+            The error with which the daemon refused the request.
+        """
+        data = encode(message)
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            reply = self._exchange(message.request, data, deadline_s, quiet_s)
+            if isinstance(reply, kind):
+                return reply
+            if reply is None:
+                raise NoAnswer(f"{self.path}: no answer within {timeout_s:.3g} s", hint=_SILENT_HINT)
+            if not isinstance(reply, ErrorReply):
+                raise ProtocolMismatch(
+                    f"the daemon answered {type(message).__name__} with {type(reply).__name__}",
+                    hint=_UPDATE_HINT,
+                )
+            if reply.code != "no_session":
+                raise error_from_wire(reply.code, reply.message, reply.hint)
+            self.welcome = self._greet(deadline_s)
+
+    def _greet(self, deadline_s: float) -> Welcome:
+        started_s = time.monotonic()
+        hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name)
+        reply = self._exchange(hello.request, encode(hello), deadline_s, 0.0)
+        self._watch_connection()
+        if reply is None:
+            raise NoAnswer(
+                f"{self.path}: connected, but no welcome within {time.monotonic() - started_s:.2g} s",
+                hint=_SILENT_HINT,
+            )
+        if isinstance(reply, ErrorReply):
+            raise error_from_wire(reply.code, reply.message, reply.hint)
+        if not isinstance(reply, Welcome):
+            raise ProtocolMismatch(f"{self.path}: the answer to Hello was {type(reply).__name__}")
+        if reply.major != PROTOCOL_VERSION[0]:
+            raise ProtocolMismatch(
+                f"{self.path}: the daemon speaks protocol {reply.major}.{reply.minor}, "
+                f"this client {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
+                hint=_UPDATE_HINT,
+            )
+        return reply
+
+    def _exchange(self, request: int, data: bytes, deadline_s: float, quiet_s: float) -> Reply | None:
+        """Send until something comes back under this request id; None at the deadline."""
+        sent = False
+        handshakes = self._handshakes
+        interval_s = _RESEND_S
+        resend_s = 0.0
+        while True:
+            now_s = time.monotonic()
+            if not sent or handshakes != self._handshakes or now_s >= resend_s:
+                handshakes = self._handshakes
+                sent = self._send(data)
+                resend_s = now_s + quiet_s + interval_s
+                interval_s = interval_s * 2 if sent else interval_s
+            if sent:
+                reply = self._receive(request, deadline_s)
+                if reply is not None:
+                    return reply
+            else:
+                self._socket.poll(_slice_ms(deadline_s), zmq.POLLOUT)
+            self._watch_connection()
+            if time.monotonic() >= deadline_s:
+                return None
+
+    def _send(self, data: bytes) -> bool:
+        try:
+            self._socket.send(data, zmq.DONTWAIT)
+        except zmq.Again:
+            return False
+        return True
+
+    def _receive(self, request: int, deadline_s: float) -> Reply | None:
+        """Return the reply to ``request``; None after a slice of silence or at the deadline."""
+        while True:
+            slice_ms = _slice_ms(deadline_s)
+            if slice_ms < _SLICE_MS and not self._socket.poll(slice_ms):
+                return None
+            try:
+                data = self._socket.recv()
+            except zmq.Again:
+                return None
+            reply = decode_reply(data)
+            if reply.request == request:
+                return reply
+
+    def _watch_connection(self) -> None:
+        while self._monitor.poll(0):
+            if recv_monitor_message(self._monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._handshakes += 1
+            else:
+                raise ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")
+
+
+def _slice_ms(deadline_s: float) -> int:
+    return max(0, min(_SLICE_MS, math.ceil((deadline_s - time.monotonic()) * 1000)))
+
+
+def _shut(
+    sockets: tuple[zmq.Socket[bytes], zmq.Socket[bytes]],
+    context: zmq.Context[zmq.Socket[bytes]],
+    pid: int,
+) -> None:
+    if os.getpid() != pid:
+        return  # in a forked child the sockets are the parent's
+    monitor, socket = sockets
+    socket.disable_monitor()
+    monitor.close(linger=0)
+    socket.close(linger=_LAST_WORDS_MS)
+    context.term()

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding the daemon, and saying exactly why it cannot be reached."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import stat
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from shmmap.errors import (
+    DaemonUnreachable,
+    NoAnswer,
+    NoSocket,
+    ProtocolMismatch,
+    SocketPermission,
+    StaleSocket,
+)
+from shmmap.protocol.endpoint import SYSTEM_RUNTIME_DIR, endpoint_path, runtime_dirs, socket_path
+
+__all__ = ["candidates", "check_socket", "find_socket"]
+
+_SIGNATURE_BYTES: Final = 10
+_START_HINT: Final = "start one with `shmmap serve MAP`, or name its socket with SHMMAP_ENDPOINT"
+
+
+def candidates(endpoint: str | None = None, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """Socket paths to try, in order: the one named, else those of the default instance.
+
+    Parameters
+    ----------
+    endpoint
+        A socket path or an ``ipc://`` URL; ``SHMMAP_ENDPOINT`` stands in for None.
+
+    Raises
+    ------
+    BadRequest
+        If the name cannot be a socket path.
+    """
+    named = endpoint or environ.get("SHMMAP_ENDPOINT", "")
+    if named:
+        return [endpoint_path(named)]
+    return [socket_path(directory) for directory in runtime_dirs(environ)]
+
+
+def find_socket(paths: Sequence[str], deadline_s: float) -> str:
+    """Return the first path at which a ZeroMQ peer answers.
+
+    A path that nobody listens at is passed over.  A daemon that is there but silent ends the
+    search: the next one might serve another map.
+
+    Parameters
+    ----------
+    deadline_s
+        On the clock of `time.monotonic`.
+
+    Raises
+    ------
+    NoSocket, SocketPermission, StaleSocket
+        None of the paths can be connected to; the message tells about each of them, and the kind
+        is that of the first one that at least exists.
+    NoAnswer, ProtocolMismatch
+        See `check_socket`.
+    """
+    refusals: list[DaemonUnreachable] = []
+    for path in paths:
+        try:
+            check_socket(path, deadline_s)
+        except (NoSocket, SocketPermission, StaleSocket) as refusal:  # noqa: PERF203  two paths at most
+            refusals.append(refusal)
+        else:
+            return path
+    telling = next((refusal for refusal in refusals if not isinstance(refusal, NoSocket)), refusals[0])
+    if len(refusals) == 1:
+        raise telling
+    raise type(telling)("; ".join(refusal.message for refusal in refusals), hint=telling.hint) from telling
+
+
+def check_socket(path: str, deadline_s: float) -> None:
+    """Connect to a socket once, to tell the ways apart in which that can fail.
+
+    ZeroMQ itself connects in the background and never says why it does not succeed.
+
+    Raises
+    ------
+    NoSocket
+        There is no socket at ``path``.
+    SocketPermission
+        This user may not connect.
+    StaleSocket
+        Nobody listens any more.
+    NoAnswer
+        Somebody listens, but did not say a word before the deadline.
+    ProtocolMismatch
+        Who listens does not speak ZeroMQ.
+    """
+    with socket.socket(
+        socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
+    ) as probe:
+        try:
+            probe.connect(path)
+        except BlockingIOError as error:  # its queue of connections is full: it accepts none
+            raise _no_answer(path) from error
+        except OSError as error:
+            raise _refusal(path, error) from error
+        # Every ZMTP peer speaks first: 0xff, eight bytes, 0x7f (https://rfc.zeromq.org/spec/23/)
+        heard = b""
+        while len(heard) < _SIGNATURE_BYTES:
+            probe.settimeout(max(deadline_s - time.monotonic(), 1e-3))
+            try:
+                part = probe.recv(_SIGNATURE_BYTES - len(heard))
+            except TimeoutError as error:
+                raise _no_answer(path) from error
+            except ConnectionError:
+                part = b""
+            heard += part
+            if not part or heard[0] != 0xFF or (len(heard) == _SIGNATURE_BYTES and heard[9] != 0x7F):
+                raise ProtocolMismatch(
+                    f"{path}: who listens there does not speak ZeroMQ",
+                    hint="is this the socket of another program?",
+                )
+
+
+def _no_answer(path: str) -> NoAnswer:
+    return NoAnswer(
+        f"{path}: the daemon accepts connections but does not answer",
+        hint="it is stopped, hung or overloaded: see `shmmap health`",
+    )
+
+
+def _refusal(path: str, error: OSError) -> DaemonUnreachable | ProtocolMismatch:
+    if error.errno in (errno.ENOENT, errno.ENOTDIR):
+        return NoSocket(f"{path}: there is no socket", hint=_other_instances(path) or _START_HINT)
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return SocketPermission(
+            f"{path}: this user may not connect",
+            hint="join the daemon's group (`shmmap doctor` names it), then log in again",
+        )
+    if error.errno == errno.EPROTOTYPE:
+        return ProtocolMismatch(f"{path} is a socket of another kind: no shmmap daemon made it")
+    if error.errno == errno.ECONNREFUSED:
+        try:
+            is_socket = stat.S_ISSOCK(Path(path).stat().st_mode)
+        except OSError:
+            is_socket = False
+        if is_socket:
+            return StaleSocket(
+                f"{path}: the daemon that made this socket is gone",
+                hint="start it again; it replaces the socket by itself",
+            )
+        return NoSocket(f"{path} is not a socket", hint=_START_HINT)
+    return NoSocket(f"{path}: {error.strerror}", hint=_START_HINT)
+
+
+def _other_instances(path: str) -> str:
+    try:
+        others = sorted(str(other) for other in Path(path).parent.glob("*.sock") if other.is_socket())
+    except OSError:
+        return ""
+    directory = str(Path(path).parent)
+    if not others or not (directory.endswith("/shmmap") or directory == SYSTEM_RUNTIME_DIR):
+        return ""
+    return f"other instances are there: {', '.join(others)}; name one with SHMMAP_ENDPOINT"

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells a window keeps attached after they have left it: pure decisions, no clock of their own.
+
+A cell that is kept costs memory that the daemon could use otherwise, and saves attaching it again
+(tens of microseconds) or loading it again (milliseconds) when the vehicle turns back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from shmmap.errors import BadRequest
+
+__all__ = ["Departed", "Retention", "RetentionPolicy"]
+
+
+class Departed(NamedTuple):
+    """A cell outside the window that is still attached.
+
+    ``distance`` is from the present pose to the nearest point of its box, metres; ``nbytes`` its
+    size; ``age`` how many seconds ago it left.
+    """
+
+    distance: float
+    nbytes: int
+    age: float
+
+
+class RetentionPolicy(Protocol):
+    """What a window asks after each answer of the daemon."""
+
+    def keep(self, departed: Sequence[Departed]) -> Sequence[bool]:
+        """Whether to keep each of the departed cells."""
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """Keeps cells up to a distance, a sum of bytes, and an age; nearest first.
+
+    Parameters
+    ----------
+    distance
+        Metres from the pose to the nearest point of the cell; the default 0 keeps nothing.
+    max_bytes
+        Sum of the sizes of what is kept.  What is kept is the nearest cells that fit one after the other:
+        a nearer cell is never dropped for the sake of a farther one.
+    max_age
+        Seconds since the cell left the window.
+
+    Raises
+    ------
+    BadRequest
+        A limit is negative or not a number.
+    """
+
+    distance: float = 0.0
+    max_bytes: float = math.inf
+    max_age: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "max_bytes", "max_age"):
+            value: float = getattr(self, name)
+            if not value >= 0:
+                raise BadRequest(f"retention: {name} must not be negative, it is {value!r}")
+
+    def keep(self, departed: Sequence[Departed]) -> list[bool]:
+        """Whether to keep each of the departed cells."""
+        kept = [False] * len(departed)
+        if not self.distance:
+            return kept
+        left = self.max_bytes
+        for index in sorted(range(len(departed)), key=lambda i: (departed[i].distance, departed[i].age)):
+            cell = departed[index]
+            if cell.distance > self.distance:
+                break
+            if cell.age > self.max_age:
+                continue
+            left -= cell.nbytes
+            if left < 0:
+                break
+            kept[index] = True
+        return kept

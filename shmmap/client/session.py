@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all requests of one client share: the connection, the attached cells, a lock, and fork."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final, TypeVar
+
+import numpy as np
+
+from shmmap.client.answer import Answer
+from shmmap.client.attaching import Attacher
+from shmmap.client.cell import Cell
+from shmmap.client.cell_set import CellSet
+from shmmap.client.connection import Connection
+from shmmap.errors import BadRequest, NoAnswer
+from shmmap.protocol import messages
+from shmmap.protocol.messages import Handle
+
+__all__ = ["Session"]
+
+R = TypeVar("R")
+
+_STALE_ROUNDS: Final = 5  # how often a handle that went stale before it was attached is asked for again
+
+
+class Session:
+    """One client's session; one request is on its way at a time, other threads wait for it.
+
+    After a fork the child begins a session of its own with its first request; the parent's
+    connection is not touched.
+
+    Parameters
+    ----------
+    paths
+        Socket paths to try, in order.
+    timeout_s
+        How long a reply may take, beyond what a request lets the daemon wait.
+    connect_timeout_s
+        How long `Welcome` may take.
+    shm_dir
+        Directory of the segments; empty: as the daemon says.
+
+    Attributes
+    ----------
+    welcome : Welcome
+        What the daemon said when the session began.
+    map_version : int
+        Of the last reply about cells.
+    attacher : Attacher
+        Knows what is mapped.
+    """
+
+    def __init__(
+        self, paths: Sequence[str], *, timeout_s: float, connect_timeout_s: float, name: str, shm_dir: str
+    ) -> None:
+        self.timeout_s = timeout_s
+        self.attacher = Attacher()
+        self._paths = tuple(paths)
+        self._connect_timeout_s = connect_timeout_s
+        self._name = name
+        self._shm_dir = shm_dir
+        self._lock = threading.Lock()
+        self._closed = False
+        self._inherited: list[Connection] = []
+        self._connection: Connection | None = None
+        self.path = ""
+        connection = self._connect()
+        self.welcome = connection.welcome
+        self.map_version = self.welcome.map_version
+        _sessions.add(self)
+
+    def _connect(self) -> Connection:
+        connection = Connection(self._paths, name=self._name, timeout_s=self._connect_timeout_s)
+        self._connection = connection
+        self.path = connection.path
+        return connection
+
+    def close(self) -> None:
+        """End the session; attached cells stay readable."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            connection = self._connection
+            if connection is None:
+                return
+            self._tell_unmapped(connection)
+            if not self.attacher.any_mapped:  # else the daemon should still know who holds them
+                connection.tell(messages.Bye(connection.new_request()))
+            connection.close()
+
+    @contextlib.contextmanager
+    def _turn(self, timeout_s: float) -> Iterator[Connection]:
+        """Take the connection for one request."""
+        if not self._lock.acquire(timeout=timeout_s):
+            raise NoAnswer(
+                f"another thread's request was under way for {timeout_s:.3g} s",
+                hint="give each thread that waits long a client of its own",
+            )
+        try:
+            if self._closed:
+                raise BadRequest("this client is closed")
+            connection = self._connection or self._connect()
+            self._tell_unmapped(connection)
+            yield connection
+        finally:
+            self._lock.release()
+
+    def ask(self, make: Callable[[int], messages.Request], kind: type[R]) -> R:
+        """Send the request that ``make`` builds for a request id; returns its reply."""
+        with self._turn(self.timeout_s) as connection:
+            reply = connection.ask(make(connection.new_request()), kind, timeout_s=self.timeout_s)
+            self.welcome = connection.welcome
+            return reply
+
+    def ask_cells(
+        self,
+        make: Callable[[int], messages.Request],
+        wait_s: float | None,
+        *,
+        removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None = None,
+        populate: bool = False,
+    ) -> CellSet:
+        """Send a request for cells and attach what it brings.
+
+        Parameters
+        ----------
+        wait_s
+            What the request lets the daemon wait.
+        removed
+            Makes ids of the reply's two lists of removals.
+        populate
+            Let the kernel map every page now.
+        """
+        quiet_s = wait_s or 0.0
+        timeout_s = self.timeout_s + quiet_s
+        deadline_s = time.monotonic() + timeout_s
+        with self._turn(timeout_s) as connection:
+            message = make(connection.new_request())
+            reply = connection.ask(message, messages.Cells, timeout_s=timeout_s, quiet_s=quiet_s)
+            self.map_version = reply.map_version
+            self.welcome = connection.welcome
+            answer = Answer(lambda handle: self._attach(handle, connection, populate), self.whole_id)
+            answer.take(reply, range(len(reply.cells)))
+            for _ in range(_STALE_ROUNDS):
+                if not answer.gone or time.monotonic() >= deadline_s:
+                    break
+                answer.ask_again(connection, deadline_s)
+            self.welcome = connection.welcome
+            return answer.result(reply, removed)
+
+    def tell_unmapped(self) -> int:
+        """Tell the daemon what was unmapped since the last request; returns how many versions."""
+        with self._turn(self.timeout_s) as connection:
+            told = self._told
+            # the reply to this one means that the telling before it has arrived
+            connection.ask(
+                messages.Release(connection.new_request(), b""), messages.Released, timeout_s=self.timeout_s
+            )
+            return told
+
+    def _tell_unmapped(self, connection: Connection) -> None:
+        versions = self.attacher.take_unmapped()
+        self._told = len(versions)
+        if versions:
+            connection.tell(messages.Release(connection.new_request(), _pack(versions)))
+
+    def whole_id(self, cell_id: str) -> str:
+        """Return the cell id of what a reply carries."""
+        return cell_id if cell_id.startswith("/") else self.welcome.id_prefix + cell_id
+
+    def _attach(self, handle: Handle, connection: Connection, populate: bool) -> Cell:
+        welcome = connection.welcome
+        return self.attacher.attach(
+            handle,
+            handle.id if handle.id.startswith("/") else welcome.id_prefix + handle.id,
+            welcome.segment_prefix + handle.segment,
+            shm_dir=self._shm_dir or welcome.shm_dir,
+            slot=welcome.session,
+            populate=populate,
+        )
+
+    def _restart_in_child(self) -> None:
+        if self._connection is not None:
+            # left alone, and kept, so that nothing here tries to end the parent's sockets
+            self._inherited.append(self._connection)
+            self._connection = None
+        self._lock = threading.Lock()
+        self.attacher.unmapper.restart_in_child()
+
+
+_sessions: weakref.WeakSet[Session] = weakref.WeakSet()
+
+
+def _after_fork_in_child() -> None:
+    for session in list(_sessions):
+        session._restart_in_child()
+
+
+os.register_at_fork(after_in_child=_after_fork_in_child)
+
+
+def _pack(versions: Iterable[int]) -> bytes:
+    return np.fromiter(versions, "<u8").tobytes()

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thread behind a window: it asks, attaches and unmaps, so that the control loop never does."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from queue import Empty, SimpleQueue
+from typing import Final
+
+from shmmap.client.attaching import Mapping, Unmapper
+from shmmap.client.window_refresh import WindowRefresher
+from shmmap.client.window_state import EMPTY, WindowState
+from shmmap.errors import InternalError, ShmmapError
+from shmmap.protocol.messages import Intent
+
+__all__ = ["PENDING_WAIT_S", "WindowFollower", "moved"]
+
+PENDING_WAIT_S: Final = 0.25
+"""How long one request waits for loads: what is ready then is shown, and a new pose is heard."""
+
+_RETRY_S: Final = 0.05  # first pause after an answer that brought nothing although something is missing
+_RETRY_MAX_S: Final = 1.0  # pauses double up to this
+
+
+def moved(state: WindowState, pose: Intent, update_distance: float) -> bool:
+    """Whether ``pose`` is far enough from where was last asked to ask again."""
+    if state.asked is None:
+        return True
+    distance = math.hypot(pose.x - state.asked.x, pose.y - state.asked.y)
+    return distance > 0 and distance >= update_distance
+
+
+class WindowFollower:
+    """Keeps a window current in a thread of its own.
+
+    Everything reaches the thread through one queue: new poses, mappings to give back, the end.
+    Everything leaves it by replacing one attribute.
+
+    Attributes
+    ----------
+    state : WindowState
+        The latest; read it from any thread.
+    error : ShmmapError or None
+        Why the last request failed, None after one that did not.
+    stale_since : float or None
+        `time.monotonic` of the first failure after the last success.
+    """
+
+    def __init__(
+        self,
+        refresher: WindowRefresher,
+        unmapper: Unmapper,
+        *,
+        update_distance: float,
+        refresh_interval_s: float,
+    ) -> None:
+        self._refresher = refresher
+        self._unmapper = unmapper
+        self._update_distance = update_distance
+        self._refresh_interval_s = refresh_interval_s
+        self._mailbox: SimpleQueue[Mapping | None] = SimpleQueue()
+        self._pose: Intent | None = None
+        self._stopping = False
+        self._pause_s = 0.0
+        self._changed = threading.Condition()
+        self._pid = os.getpid()
+        self.state = EMPTY
+        self.error: ShmmapError | None = None
+        self.stale_since: float | None = None
+        unmapper.defer_to(self._mailbox)
+        self._thread = threading.Thread(target=self._run, name="shmmap-window", daemon=True)
+        self._thread.start()
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether this is a forked child, where the thread does not exist."""
+        return os.getpid() != self._pid
+
+    def follow(self, pose: Intent) -> None:
+        """Take a new pose; returns at once."""
+        self._pose = pose
+        if moved(self.state, pose, self._update_distance):
+            self._mailbox.put(None)
+
+    def wait_until_current(self, timeout_s: float) -> bool:
+        """Wait until the state answers the latest pose and nothing is missing; False at the deadline."""
+        with self._changed:
+            return self._changed.wait_for(self._is_current, timeout_s)
+
+    def _is_current(self) -> bool:
+        pose = self._pose
+        return (
+            pose is not None
+            and self.error is None
+            and self.state.settled
+            and not moved(self.state, pose, self._update_distance)
+        )
+
+    def stop(self) -> None:
+        """End the thread; what is attached stays so."""
+        if self.elsewhere or self._stopping:
+            return
+        self._stopping = True
+        self._mailbox.put(None)
+        self._thread.join()
+        self._unmapper.stop_deferring(self._mailbox)
+
+    # --- the thread -----------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            due_s = math.inf  # nothing to ask before there is a pose
+            while self._wait(due_s):
+                pose = self._pose
+                if pose is None:
+                    continue
+                if self.error is None and moved(self.state, pose, self._update_distance):
+                    due_s = 0.0
+                if time.monotonic() >= due_s:
+                    due_s = time.monotonic() + self._refresh(pose)
+        except BaseException as error:
+            self._publish(self.state, InternalError(f"the window's thread ended: {error!r}"))
+            raise
+
+    def _wait(self, until_s: float) -> bool:
+        """Unmap what arrives, until it is time to ask or there is a new pose; False at the end."""
+        while True:
+            remaining_s = until_s - time.monotonic()
+            try:
+                if remaining_s <= 0:
+                    mapping = self._mailbox.get_nowait()
+                else:
+                    mapping = self._mailbox.get(timeout=min(remaining_s, threading.TIMEOUT_MAX))
+            except Empty:
+                return not self._stopping
+            if mapping is not None:
+                self._unmapper.finish(mapping)
+            elif remaining_s > 0 or self._stopping:
+                return not self._stopping
+
+    def _refresh(self, pose: Intent) -> float:
+        """Ask once and publish what came; returns after how many seconds to ask again."""
+        before = self.state
+        wait_s = PENDING_WAIT_S if before.pending and self.error is None else None
+        try:
+            state, progress = self._refresher.refresh(before, pose, wait_s)
+        except ShmmapError as error:
+            self._publish(before, error)
+            return self._pause()
+        del before  # the last reference to what was replaced may be this one
+        self._publish(state, None)
+        if state.settled:
+            self._pause_s = 0.0
+            return self._refresh_interval_s
+        if progress or (state.pending and wait_s is None):
+            self._pause_s = 0.0
+            return 0.0
+        return 0.0 if state.pending else self._pause()
+
+    def _pause(self) -> float:
+        self._pause_s = min(max(self._pause_s * 2, _RETRY_S), _RETRY_MAX_S)
+        return self._pause_s
+
+    def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
+        with self._changed:
+            self.state = state
+            self.error = error
+            if error is None:
+                self.stale_since = None
+            elif self.stale_since is None:
+                self.stale_since = time.monotonic()
+            self._changed.notify_all()

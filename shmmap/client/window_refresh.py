@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A window's bookkeeping: one differential request, and the state that follows from its answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from shmmap import geometry
+from shmmap.client.cell import Cell
+from shmmap.client.cell_set import CellSet
+from shmmap.client.client import Client
+from shmmap.client.retention import Departed, RetentionPolicy
+from shmmap.client.window_state import EMPTY, LayerKey, WindowState
+from shmmap.errors import BadRequest, OverBudget
+from shmmap.geometry import distance_to_boxes
+from shmmap.protocol.messages import Intent
+
+__all__ = ["WindowRefresher"]
+
+_Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
+
+_SHAPES: Final[dict[str, _Shape]] = {"circle": geometry.Circle, "square": geometry.AutowareSquare}
+
+
+class WindowRefresher:
+    """Turns answers of the daemon into states; used by one thread at a time.
+
+    Parameters
+    ----------
+    client
+        Who asks.
+    radius
+        Of the window, metres.
+    layers
+        What to have of each cell.
+    shape
+        ``"circle"`` or ``"square"`` (Autoware's).
+    z
+        Heights of interest, or None.
+    retention
+        What to keep of what leaves the window.
+    populate
+        Let the kernel map every page while attaching.
+    clock
+        Seconds.
+
+    Attributes
+    ----------
+    retained : dict
+        Cells outside the window that are kept attached, and since when.
+
+    Raises
+    ------
+    BadRequest
+        The shape is unknown, or the radius makes no sense.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        radius: float,
+        *,
+        layers: Sequence[str],
+        shape: str,
+        z: geometry.ZRange | None,
+        retention: RetentionPolicy,
+        populate: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        if shape not in _SHAPES:
+            raise BadRequest(f"window shape {shape!r} is unknown", hint="use 'circle' or 'square'")
+        self._make_area = _SHAPES[shape]
+        self._make_area(0.0, 0.0, radius, z)
+        self._client = client
+        self._radius = radius
+        self._layers = tuple(layers)
+        self._z = z
+        self._retention = retention
+        self._populate = populate
+        self._clock = clock
+        self.retained: dict[LayerKey, tuple[Cell, float]] = {}
+
+    def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
+        """Ask the daemon once.
+
+        Returns
+        -------
+        state : WindowState
+            The new state; the old one's mappings are returned unchanged where nothing changed.
+        progress : bool
+            Whether cells came or went.
+
+        Raises
+        ------
+        ShmmapError
+            As `Client.differential`; the old state stays true.
+        """
+        answer = self._ask(state, pose, wait_s, by_name=False)
+        if answer.epoch != state.epoch and state.cells:
+            # Another life of the daemon cannot know what versions of an earlier one belonged to, and takes
+            # those that are not current for strangers.  What was attached stays so while asking again.
+            first = answer
+            answer = self._ask(state, pose, wait_s, by_name=True)
+            del first
+        now_s = self._clock()
+        if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
+            # what is kept beyond the window may be outdated, or in the way of what is in it
+            self.retained.clear()
+        progress = bool(answer.cells or answer.removed)
+        if not progress:
+            after = replace(
+                state,
+                pending=answer.pending,
+                failed=answer.failed,
+                asked=pose,
+                epoch=answer.epoch,
+                map_version=answer.map_version,
+            )
+        else:
+            after = self._apply(state, answer, pose, now_s)
+        self._retain(pose, now_s)
+        return after, progress
+
+    def _ask(self, state: WindowState, pose: Intent, wait_s: float | None, *, by_name: bool) -> CellSet:
+        return self._client.differential(
+            self._make_area(pose.x, pose.y, self._radius, self._z),
+            state.cells.values(),
+            self._layers,
+            wait=wait_s,
+            intent=pose,
+            by_name=by_name,
+            populate=self._populate,
+        )
+
+    def _apply(self, state: WindowState, answer: CellSet, pose: Intent, now_s: float) -> WindowState:
+        removed = set(answer.removed)
+        cells = {key: cell for key, cell in state.cells.items() if key[0] not in removed}
+        if removed:
+            left = {key: (cell, now_s) for key, cell in state.cells.items() if key[0] in removed}
+            self.retained.update(left)
+        for cell in answer.cells:
+            key = (cell.id, cell.layer)
+            cells[key] = cell
+            self.retained.pop(key, None)
+        return WindowState.build(
+            cells,
+            pending=answer.pending,
+            failed=answer.failed,
+            asked=pose,
+            epoch=answer.epoch,
+            map_version=answer.map_version,
+        )
+
+    def _retain(self, pose: Intent, now_s: float) -> None:
+        if not self.retained:
+            return
+        boxes = np.array([cell.box for cell, _ in self.retained.values()])
+        distances = distance_to_boxes(pose.x, pose.y, boxes).tolist()
+        departed = [
+            Departed(distance, cell.nbytes, now_s - since_s)
+            for distance, (cell, since_s) in zip(distances, self.retained.values(), strict=True)
+        ]
+        keep = self._retention.keep(departed)
+        self.retained = {
+            key: value for (key, value), kept in zip(self.retained.items(), keep, strict=True) if kept
+        }
+
+    def forget(self) -> WindowState:
+        """Drop what is retained; returns the state of a window that holds nothing."""
+        self.retained.clear()
+        return EMPTY
