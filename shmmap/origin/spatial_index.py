@@ -105,12 +105,18 @@ class SpatialIndex:
     def query(self, area: Area) -> Indices:
         """Rows of ``boxes`` that touch ``area`` (closed borders, its z range ignored), ascending."""
         if not self._grids:
-            return np.flatnonzero(area.overlaps(self.boxes))
+            return np.flatnonzero(_touched(area, self.boxes))
         min_x, min_y, max_x, max_y = area.bounds
         slack = _ROUNDING * max(abs(min_x), abs(min_y), abs(max_x), abs(max_y))
         bounds = (min_x - slack, min_y - slack, max_x + slack, max_y + slack)
         found = [grid.candidates(bounds) for grid in self._grids]
         candidates = found[0] if len(found) == 1 else np.concatenate(found)
-        hit = candidates[area.overlaps(self.boxes.T.take(candidates, axis=1).T)]
+        hit = candidates[_touched(area, self.boxes.T.take(candidates, axis=1).T)]
         hit.sort()
         return hit
+
+
+def _touched(area: Area, boxes: Floats) -> NDArray[np.bool_]:
+    # squares of distances beyond 1e154 m overflow to infinity, which compares as it should
+    with np.errstate(over="ignore"):
+        return area.overlaps(boxes)

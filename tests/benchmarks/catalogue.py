@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time and memory of the catalogue at 10^4, 10^5 and 10^6 cells, beside Autoware's linear search.
 
-    python tests/benchmarks/catalogue.py [--cells 10000 100000 1000000] [--dir /dev/shm] [--queries 2000]
+    python -m tests.benchmarks.catalogue [--cells 10000 100000 1000000] [--dir /dev/shm] [--queries 2000]
 
-For each size it makes that many empty PCD files with their metadata under DIR (a million take 10 s in
+For each size it makes that many tiny PCD files with their metadata under DIR (a million take 10 s in
 /dev/shm, minutes on a disk), and measures, in a process of its own:
 
 first       open_map().load() without a cache: list and stat all files, read the YAML, join, index
@@ -29,30 +29,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.benchmarks.make_many_cells import make_many_cells
+
 RADIUS = 200.0
-CELL = 20
 
 
 def resident_bytes() -> int:
     """Resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def make_map(root: Path, side: int) -> None:
-    """Make ``side`` x ``side`` empty cells with metadata, in an order that is not sorted."""
-    cells = root / "pointcloud_map.pcd"
-    cells.mkdir(parents=True)
-    fd = os.open(cells, os.O_RDONLY)
-    lines = [f"x_resolution: {CELL}\n", f"y_resolution: {CELL}\n"]
-    try:
-        for x in range(0, side * CELL, CELL):
-            for y in range(0, side * CELL, CELL):
-                name = f"city_{x}_{y}.pcd"
-                os.close(os.open(name, os.O_CREAT | os.O_WRONLY, 0o644, dir_fd=fd))
-                lines.append(f"{name}: [{x}, {y}]\n")
-    finally:
-        os.close(fd)
-    (root / "pointcloud_map_metadata.yaml").write_text("".join(lines))
 
 
 def measure(root: Path, cache: Path, queries: int) -> None:
@@ -95,7 +79,8 @@ def measure(root: Path, cache: Path, queries: int) -> None:
 
 def run_measure(root: Path, cache: Path, queries: int) -> dict[str, float]:
     """`measure` in a fresh interpreter."""
-    command = [sys.executable, __file__, "--measure", str(root), str(cache), "--queries", str(queries)]
+    command = [sys.executable, "-m", "tests.benchmarks.catalogue"]
+    command += ["--measure", str(root), str(cache), "--queries", str(queries)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
     result: dict[str, float] = json.loads(done.stdout)
     return result
@@ -139,7 +124,7 @@ def main() -> None:
         side = round(cells**0.5)
         with tempfile.TemporaryDirectory(prefix="shmmap-catalogue-", dir=arguments.dir) as scratch:
             work = Path(scratch)
-            make_map(work / "map", side)
+            make_many_cells(work / "map", side)
             first = run_measure(work / "map", work / "cache", arguments.queries)
             # a map that changed within the last milliseconds is not cached; this one has settled now
             if not list((work / "cache").glob("*.catalogue")):

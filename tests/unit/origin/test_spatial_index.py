@@ -166,6 +166,17 @@ def test_areas_far_larger_than_the_map(reach: float) -> None:
     assert len(index.query(Box(reach, reach, reach, reach))) == 0
 
 
+@pytest.mark.parametrize("linear", [0, 1 << 30])
+def test_areas_beyond_all_sense_warn_of_nothing(linear: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmmap.origin.spatial_index._LINEAR_CELLS", linear)
+    index = SpatialIndex(lattice(0.0, 10, 20.0))
+    assert len(index.query(Circle(1e300, 0.0, 5.0))) == 0
+    assert len(index.query(Circle(0.0, 0.0, 1e200))) == 100
+    assert len(index.query(Circle(0.0, 1.7e308, 1.7e308))) == 100
+    assert len(index.query(AutowareSquare(3e38, 0.0, 3e38))) == 100
+    assert len(index.query(Box(-1e308, -1e308, 1e308, 1e308))) == 100
+
+
 def test_cells_scattered_further_than_keys_can_count() -> None:
     boxes = np.array([[x, y, x + 1e-3, y + 1e-3] for x in (-1e12, 0.0, 1e12) for y in (-1e12, 0.0, 1e12)])
     index = SpatialIndex(boxes)

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes a divided map of very many tiny cells, to try what only their number makes slow.
+
+    python -m tests.benchmarks.make_many_cells OUT [--cells 1000000]
+
+A square grid of 20 m cells from (0, 0).  The files are hard links to a few sound PCD files of one point
+each, so a million of them need little space; the point lies in the first cell, whatever the file's name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+from pathlib import Path
+
+CELL_METRES = 20
+
+# ext4 allows 65 000 names for one file
+_LINKS = 60_000
+
+_PCD = b"""VERSION 0.7
+FIELDS x y z intensity
+SIZE 4 4 4 4
+TYPE F F F F
+COUNT 1 1 1 1
+WIDTH 1
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 1
+DATA binary
+"""
+
+
+def make_many_cells(out: Path, side: int) -> None:
+    """Write ``side`` x ``side`` cells and their metadata into the new directory ``out``."""
+    cells = out / "pointcloud_map.pcd"
+    cells.mkdir(parents=True)
+    lines = [f"x_resolution: {CELL_METRES}\n", f"y_resolution: {CELL_METRES}\n"]
+    fd = os.open(cells, os.O_RDONLY)
+    try:
+        first = ""
+        span = range(0, side * CELL_METRES, CELL_METRES)
+        for number, (x, y) in enumerate(itertools.product(span, span)):
+            name = f"city_{x}_{y}.pcd"
+            if number % _LINKS == 0:
+                (cells / name).write_bytes(_PCD + bytes(16))
+                first = name
+            else:
+                os.link(first, name, src_dir_fd=fd, dst_dir_fd=fd)
+            lines.append(f"{name}: [{x}, {y}]\n")
+    finally:
+        os.close(fd)
+    (out / "pointcloud_map_metadata.yaml").write_text("".join(lines))
+
+
+def main() -> None:
+    """Make as many cells as asked, rounded to a square number."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--cells", type=int, default=1_000_000)
+    arguments = parser.parse_args()
+    make_many_cells(arguments.out, round(arguments.cells**0.5))
+
+
+if __name__ == "__main__":
+    main()
