@@ -8,22 +8,22 @@ answer leaves when the last one settled or the client's patience ends, whichever
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
-import msgspec
 import numpy as np
 
+from shmmap.daemon.difference import difference, warm_difference
+from shmmap.daemon.reclaim import HAND_OUT_GRACE_S
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.sessions import Session
-from shmmap.daemon.store import HAND_OUT_GRACE_S, SPACE_CODES, Store
+from shmmap.daemon.store import SPACE_CODES, Store
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, ZRange, distance_to_boxes
-from shmmap.layers.spec import canonical_layer
+from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
-from shmmap.protocol.codec import encode, pack_versions, unpack_versions
+from shmmap.protocol.codec import encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -47,7 +47,7 @@ class Wanted:
     removed_packed: bytes = b""
     unknown: list[tuple[str, str]] = field(default_factory=list)
     refused: dict[Key, tuple[str, str]] = field(default_factory=dict)
-    held_old: frozenset[str] = frozenset()
+    held_old: set[str] = field(default_factory=set)
     area: Area | None = None
     keys: tuple[Key, ...] = ()
     outstanding: set[Key] = field(default_factory=set)
@@ -55,13 +55,14 @@ class Wanted:
 
 
 @dataclass(eq=False, slots=True)
-class _Named:
-    """Held cells named one by one: per cell which layers are current, what to remove, what is old."""
+class _Answer:
+    """A reply in the making; ``blockers``, who fills the budget, is looked up once if needed."""
 
-    layers: dict[int, frozenset[str]] = field(default_factory=dict)
-    removed: dict[str, None] = field(default_factory=dict)
-    old: set[str] = field(default_factory=set)
-    versions: set[int] = field(default_factory=set)
+    handles: list[bytes] = field(default_factory=list)
+    residents: list[Resident] = field(default_factory=list)
+    pending: list[PendingCell] = field(default_factory=list)
+    failed: list[FailedCell] = field(default_factory=list)
+    blockers: tuple[Holder, ...] | None = None
 
 
 class CellRequests:
@@ -104,14 +105,14 @@ class CellRequests:
     def area(self, session: Session, message: messages.Area, now_s: float) -> None:
         """All cells that touch an area."""
         area = messages.area_from_message(message.area)
-        layers = _layers(message.layers)
-        indices = self._in_area(area)
+        layers = canonical_layers(message.layers)
+        indices = self._at_height(self._store.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
         self._begin(Wanted(session, message.request, cells, area=area), message.wait, area, now_s)
 
     def selected(self, session: Session, message: messages.Selected, now_s: float) -> None:
         """Cells by id, in the order asked for."""
-        layers = _layers(message.layers)
+        layers = canonical_layers(message.layers)
         cells: list[tuple[int, str]] = []
         unknown: list[tuple[str, str]] = []
         for cell_id in message.ids:
@@ -126,93 +127,51 @@ class CellRequests:
     def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
         """Cells that touch an area, minus those the client holds."""
         area = messages.area_from_message(message.area)
-        layers = _layers(message.layers)
-        indices = self._in_area(area)
-        order = unpack_versions(message.packed)
-        packed = set(order)
-        named = self._named(message.held, indices, layers)
-        version = self._store.catalogue.version
-        cells: list[tuple[int, str]] = []
-        current: set[int] = set()
-        for layer in layers:
-            warm = self._store.warm.get(layer, {})
-            for index in indices:
-                resident = warm.get(index)
-                now = resident.version if resident is not None else version(index)
-                current.add(now)
-                if now not in packed and layer not in named.layers.get(index, ()):
-                    cells.append((index, layer))
-        if len(layers) > 1:
-            cells.sort(key=lambda cell: (cell[0], layers.index(cell[1])))
-        gone = packed - current
-        held_old = set(named.old)
-        if gone:
-            asked = {self._store.catalogue.id(index) for index, _ in cells}
-            superseded = {v: c for v in gone if (c := self._store.cell_of_version(v)) in asked}
-            held_old.update(cell for cell in superseded.values() if cell is not None)
-            gone -= superseded.keys()
+        layers = canonical_layers(message.layers)
+        found = self._store.catalogue.query(area)
+        if len(layers) == 1 and area.z is None and self._cannot_exceed_quota(session):
+            warm = warm_difference(self._store, message, found, layers[0])
+            if warm is not None:
+                answer = _Answer([resident.handle for resident in warm.residents], warm.residents)
+                self._reply(session, message.request, answer, warm.removed, warm.removed_packed)
+                # the books can wait until the answer is out
+                self._statistics.add("hits", len(answer.handles))
+                self._account(session, warm.held)
+                self._hand_out(session, answer, now_s)
+                return
+        lacks = difference(self._store, message, self._at_height(found.tolist(), area.z), layers)
         wanted = Wanted(
             session,
             message.request,
-            cells,
-            removed=tuple(named.removed),
-            removed_packed=pack_versions(v for v in dict.fromkeys(order) if v in gone),
-            held_old=frozenset(held_old),
+            lacks.cells,
+            removed=lacks.removed,
+            removed_packed=lacks.removed_packed,
+            held_old=lacks.old,
             area=area,
         )
-        self._account(session, packed | named.versions)
+        self._account(session, lacks.held)
         self._begin(wanted, message.wait, area, now_s)
 
-    def _named(
-        self, held: Sequence[messages.HeldCell], indices: list[int], layers: tuple[str, ...]
-    ) -> _Named:
-        """Sort the held cells that the client names one by one."""
-        named = _Named()
-        if not held:
-            return named
-        index_of, version = self._store.index_of, self._store.catalogue.version
-        inside = set(indices)
-        everything = frozenset(layers)
-        for cell in held:
-            index = index_of(cell.id)
-            if cell.version is not None:
-                named.versions.add(cell.version)
-            if index is None or index not in inside:
-                named.removed[cell.id] = None
-                continue
-            now = version(index)
-            if cell.version is None:
-                named.versions.add(now)
-            elif cell.version != now:
-                named.old.add(self._store.catalogue.id(index))
-                continue
-            had = everything if cell.layers is None else frozenset(_layers(cell.layers))
-            before = named.layers.get(index)
-            named.layers[index] = had if before is None else before | had
-        return named
+    def _cannot_exceed_quota(self, session: Session) -> bool:
+        return session.held_bytes + self._store.books.resident_bytes <= self._quota_bytes
 
     def _account(self, session: Session, held: set[int]) -> None:
         """The client says what it holds: note what it dropped since, and free it where possible."""
-        dropped = [version for version in session.held if version not in held]
+        dropped = session.held.keys() - held
         if dropped:
-            residents = [resident for version in dropped for resident in session.drop(version)]
-            self.let_go(residents)
+            self.let_go(session.drop(dropped))
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these: what was refused for want of memory may fit now."""
         self._store.reclaimer.let_go(residents, self._now_s())
         self._store.books.clear_failures(SPACE_CODES)
 
-    def _in_area(self, area: Area) -> list[int]:
-        indices: list[int] = self._store.catalogue.query(area).tolist()
-        if area.z is None:
-            return indices
-        return [index for index, _ in self._at_height([(index, "") for index in indices], area.z)]
-
-    def _at_height(self, cells: list[tuple[int, str]], z: ZRange) -> list[tuple[int, str]]:
+    def _at_height(self, indices: list[int], z: ZRange | None) -> list[int]:
         """Leave out cells whose heights, known once they were loaded, lie outside the range."""
+        if z is None:
+            return indices
         heights = self._store.heights
-        return [cell for cell in cells if (h := heights.get(cell[0])) is None or z.overlaps(*h)]
+        return [i for i in indices if (known := heights.get(i)) is None or z.overlaps(*known)]
 
     # --- waiting and answering ------------------------------------------------------------------
 
@@ -255,6 +214,8 @@ class CellRequests:
     def _check_quota(self, wanted: Wanted, cold: Sequence[tuple[int, str]]) -> None:
         """Refuse what would make this session keep more than its quota for itself alone."""
         session, store = wanted.session, self._store
+        if self._cannot_exceed_quota(session) and not cold:
+            return
         chilled = set(cold)
         sizes = [
             store.estimate(index) if (index, layer) in chilled else store.warm[layer][index].nbytes
@@ -289,10 +250,11 @@ class CellRequests:
 
     def _refresh(self, session: Session) -> None:
         """Ask the kernel which segments the session really still uses."""
-        for resident in list(session.residents()):
+        before_s = self._now_s() - HAND_OUT_GRACE_S
+        for resident in session.residents():
             slots = self._store.reclaimer.slots_of(resident)
-            if slots is not None and session.slot not in slots and resident.handed_until_s <= self._now_s():
-                session.drop_resident(resident)
+            if slots is not None and session.slot not in slots and resident.last_use_s < before_s:
+                session.drop_segment(resident)
 
     def _wait(self, wanted: Wanted) -> None:
         catalogue = self._store.catalogue
@@ -359,50 +321,51 @@ class CellRequests:
             self._answer(wanted, now_s)
 
     def _answer(self, wanted: Wanted, now_s: float) -> None:
-        session, warm = wanted.session, self._store.warm
-        handles: list[msgspec.Raw] = []
-        pending: list[PendingCell] = []
-        failed = [FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell")
-                  for cell_id, layer in wanted.unknown]  # fmt: skip
-        grace_s = now_s + HAND_OUT_GRACE_S
-        blockers: tuple[Holder, ...] | None = None
+        warm = self._store.warm
+        answer = _Answer()
         if wanted.area is not None and wanted.area.z is not None:
-            wanted.cells = self._at_height(wanted.cells, wanted.area.z)
+            inside = set(self._at_height([index for index, _ in wanted.cells], wanted.area.z))
+            wanted.cells = [cell for cell in wanted.cells if cell[0] in inside]
+        for cell_id, layer in wanted.unknown:
+            answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
         for index, layer in wanted.cells:
             resident = warm[layer].get(index) if layer in warm else None
             if resident is not None and not wanted.refused:
-                handles.append(msgspec.Raw(resident.handle))
-                resident.last_use_s = now_s
-                resident.hits += 1
-                resident.handed_until_s = grace_s
-                session.hold(resident)
-                continue
-            blockers = self._answer_cold(wanted, index, layer, handles, pending, failed, blockers, now_s)
-        reply: tuple[Any, ...] = (
-            "cells",
-            wanted.request,
+                answer.handles.append(resident.handle)
+                answer.residents.append(resident)
+            else:
+                self._answer_cold(wanted, index, layer, answer)
+        self._reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
+        self._hand_out(wanted.session, answer, now_s)
+
+    def _reply(
+        self,
+        session: Session,
+        request: int,
+        answer: _Answer,
+        removed: tuple[str, ...],
+        removed_packed: bytes,
+    ) -> None:
+        reply = encode_cells(
+            request,
             self._epoch,
             self._store.catalogue.map_version,
-            handles,
-            wanted.removed,
-            wanted.removed_packed,
-            pending,
-            failed,
+            answer.handles,
+            removed,
+            removed_packed,
+            answer.pending,
+            answer.failed,
         )
-        self._statistics.add("handles_sent", len(handles))
-        self._send(session, encode(reply))
+        self._send(session, reply)
 
-    def _answer_cold(
-        self,
-        wanted: Wanted,
-        index: int,
-        layer: str,
-        handles: list[msgspec.Raw],
-        pending: list[PendingCell],
-        failed: list[FailedCell],
-        blockers: tuple[Holder, ...] | None,
-        now_s: float,
-    ) -> tuple[Holder, ...] | None:
+    def _hand_out(self, session: Session, answer: _Answer, now_s: float) -> None:
+        for resident in answer.residents:
+            resident.last_use_s = now_s
+            resident.hits += 1
+        session.hold(answer.residents)
+        self._statistics.add("handles_sent", len(answer.handles))
+
+    def _answer_cold(self, wanted: Wanted, index: int, layer: str, answer: _Answer) -> None:
         """Answer for one cell that is not simply warm."""
         store = self._store
         key = Key(store.catalogue.id(index), layer)
@@ -412,30 +375,18 @@ class CellRequests:
         resident = slot.resident
         current = resident is not None and resident.version == store.catalogue.version(index)
         if resident is not None and refusal is None and (current or key.cell_id not in wanted.held_old):
-            handles.append(msgspec.Raw(resident.handle if current else resident.stale_handle))
-            resident.last_use_s = now_s
-            resident.handed_until_s = now_s + HAND_OUT_GRACE_S
-            wanted.session.hold(resident)
-        if current and refusal is None:
-            return blockers
+            answer.handles.append(resident.handle if current else resident.stale_handle)
+            answer.residents.append(resident)
         if refusal is not None:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            failed.append(FailedCell(wire_id, layer, *refusal, (mine,)))
-        elif slot.failure is not None and slot.load is None:
+            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,)))
+        elif not current and slot.failure is not None and slot.load is None:
             holders: tuple[Holder, ...] = ()
             if slot.failure.code in SPACE_CODES:
-                if blockers is None:
-                    blockers = store.reclaimer.holders_of(store.reclaimer.everything())
-                holders = blockers
-            failed.append(FailedCell(wire_id, layer, slot.failure.code, slot.failure.message, holders))
-        else:
-            pending.append(PendingCell(wire_id, layer))
+                if answer.blockers is None:
+                    answer.blockers = store.reclaimer.holders_of(store.reclaimer.everything())
+                holders = answer.blockers
+            answer.failed.append(FailedCell(wire_id, layer, slot.failure.code, slot.failure.message, holders))
+        elif not current:
+            answer.pending.append(PendingCell(wire_id, layer))
         store.books.forget_if_empty(key)
-        return blockers
-
-
-def _layers(specs: Sequence[str]) -> tuple[str, ...]:
-    """Canonical layers, duplicates left out."""
-    if not specs:
-        raise BadRequest("a request must name at least one layer")
-    return tuple(dict.fromkeys(itertools.starmap(canonical_layer, ((spec,) for spec in specs))))

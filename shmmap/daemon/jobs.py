@@ -19,6 +19,7 @@ __all__ = [
     "Grant",
     "Job",
     "Need",
+    "Ready",
     "Refuse",
     "ToWorker",
     "decode_from_worker",
@@ -53,6 +54,10 @@ class Refuse(msgspec.Struct, array_like=True, tag="refuse"):
     number: int
 
 
+class Ready(msgspec.Struct, array_like=True, tag="ready"):
+    """The worker has started: from now on its death is its job's fault."""
+
+
 class Need(msgspec.Struct, array_like=True, tag="need"):
     """The segment needs more than was granted; the worker waits for `Grant` or `Refuse`."""
 
@@ -84,7 +89,7 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
 
 
 ToWorker: TypeAlias = Job | Grant | Refuse
-FromWorker: TypeAlias = Need | Done | Failed
+FromWorker: TypeAlias = Ready | Need | Done | Failed
 
 encode: Final = msgspec.msgpack.Encoder().encode
 _to_worker: Final[msgspec.msgpack.Decoder[ToWorker]] = msgspec.msgpack.Decoder(ToWorker)

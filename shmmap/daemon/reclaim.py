@@ -28,6 +28,8 @@ TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
 ZOMBIE_INTERVAL_S: Final = 0.1
 """How often a segment that is still mapped is looked at, when nothing else gives a reason to."""
+HAND_OUT_GRACE_S: Final = 1.0
+"""A segment just handed out is not evicted for this long, so that its reader can open it."""
 PROBES_AT_ONCE: Final = 64
 """Looks per turn of the serving loop (about 15 us each)."""
 PIN_MEMO_S: Final = 0.2
@@ -138,7 +140,7 @@ class Reclaimer:
         for slot in list(resident.sessions):
             session = self._sessions.by_slot(slot)
             if session is not None:
-                session.drop_resident(resident)
+                session.drop_segment(resident)
         self.freed_count += 1
         self.on_freed(resident)
         return self._books.freed(resident.name)
@@ -188,7 +190,7 @@ class Reclaimer:
         missing = shortage - self._books.condemned_bytes()
         if missing <= 0:
             return Outcome.PENDING
-        candidates, grace_s = self._books.candidates(now_s)
+        candidates, graced_until_s = self._books.candidates(now_s, HAND_OUT_GRACE_S)
         self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
         unknown = [r for r in candidates if r.name not in self._pinned_until_s]
         ordered = self._policy(unknown, self._sessions.poses())
@@ -206,8 +208,8 @@ class Reclaimer:
         if len(ordered) > PROBES_AT_ONCE:
             self.wake_s = now_s
             return Outcome.PENDING
-        if grace_s < float("inf"):
-            self.wake_s = grace_s
+        if graced_until_s < float("inf"):
+            self.wake_s = graced_until_s
             return Outcome.PENDING
         return Outcome.PENDING if self._books.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
 

@@ -42,7 +42,6 @@ class Resident:
     last_use_s: float = 0.0
     load_ns: int = 0
     hits: int = 0
-    handed_until_s: float = 0.0
     sessions: set[int] = field(default_factory=set)
 
 
@@ -326,19 +325,19 @@ class Residency:
         """Bytes of zombies that nobody had open at the last look: they are about to be freed."""
         return sum(z.resident.nbytes for z in self.zombies.values() if z.condemned)
 
-    def candidates(self, now_s: float) -> tuple[list[Resident], float]:
+    def candidates(self, now_s: float, grace_s: float) -> tuple[list[Resident], float]:
         """Residents that may be retired now, and when the next one's hand-out grace ends.
 
-        Left out are those a waiting request needs, and those handed out so recently that their
-        reader may not have opened them yet.
+        Left out are those a waiting request needs, and those handed out less than ``grace_s`` ago:
+        their reader may not have opened them yet.
         """
         free: list[Resident] = []
-        grace_s = float("inf")
+        next_s = float("inf")
         for resident in self._by_name.values():
             if self.slots[resident.key].waiting:
                 continue
-            if resident.handed_until_s > now_s:
-                grace_s = min(grace_s, resident.handed_until_s)
+            if resident.last_use_s + grace_s > now_s:
+                next_s = min(next_s, resident.last_use_s + grace_s)
                 continue
             free.append(resident)
-        return free, grace_s
+        return free, next_s

@@ -249,12 +249,12 @@ class Server:
 
     def _released(self, session: Session, message: messages.Release) -> list[Resident]:
         if message.packed is None:
-            return session.drop_all()
-        return [r for version in unpack_versions(message.packed) for r in session.drop(version)]
+            return session.drop(list(session.held))
+        return session.drop(unpack_versions(message.packed))
 
     def end_session(self, session: Session) -> None:
         """A client's process ended, or it said goodbye: what it held may be free now."""
-        held = list(session.residents())
+        held = session.residents()
         self.cells.forget(session)
         if session.pidfd >= 0:
             self.unwatch(session.pidfd)

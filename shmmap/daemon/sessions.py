@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,7 +44,7 @@ class Peer:
 class Session:
     """One client.
 
-    ``held`` is what it was handed or says it has, by version and layer: bookkeeping for quotas and for
+    ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
     naming holders.  Safety never depends on it, pins are the kernel's word.
     """
 
@@ -54,55 +54,51 @@ class Session:
     client: str
     command: str
     pidfd: int
-    held: dict[int, dict[str, Resident]] = field(default_factory=dict)
+    held: dict[int, list[Resident]] = field(default_factory=dict)
     held_bytes: int = 0
     intent: Intent | None = None
     requests: int = 0
     last_request_s: float = 0.0
 
-    def hold(self, resident: Resident) -> None:
-        """The session was handed this segment."""
-        layers = self.held.setdefault(resident.version, {})
-        old = layers.get(resident.key.layer)
-        if old is resident:
-            return
-        if old is not None:
-            self._let_go(old)
-        layers[resident.key.layer] = resident
-        self.held_bytes += resident.nbytes
-        resident.sessions.add(self.slot)
+    def hold(self, residents: Iterable[Resident]) -> None:
+        """The session was handed these segments."""
+        held = self.held
+        for resident in residents:
+            known = held.get(resident.version)
+            if known is None:
+                held[resident.version] = [resident]
+            elif resident in known:
+                continue
+            else:
+                known.append(resident)
+            self.held_bytes += resident.nbytes
+            resident.sessions.add(self.slot)
 
-    def _let_go(self, resident: Resident) -> None:
-        self.held_bytes -= resident.nbytes
-        resident.sessions.discard(self.slot)
-
-    def drop(self, version: int) -> list[Resident]:
-        """The session does not have this version any more; returns what it had of it."""
-        dropped = list(self.held.pop(version, {}).values())
+    def drop(self, versions: Iterable[int]) -> list[Resident]:
+        """The session does not have these versions any more; returns what it had of them."""
+        dropped = [resident for version in versions for resident in self.held.pop(version, ())]
         for resident in dropped:
-            self._let_go(resident)
+            self.held_bytes -= resident.nbytes
+            resident.sessions.discard(self.slot)
         return dropped
 
-    def drop_resident(self, resident: Resident) -> None:
-        """The session cannot have this segment any more: its memory is gone."""
-        layers = self.held.get(resident.version, {})
-        if layers.get(resident.key.layer) is resident:
-            del layers[resident.key.layer]
-            self._let_go(resident)
-            if not layers:
+    def drop_segment(self, resident: Resident) -> None:
+        """The session cannot have this one segment any more."""
+        known = self.held.get(resident.version, [])
+        if resident in known:
+            known.remove(resident)
+            self.held_bytes -= resident.nbytes
+            resident.sessions.discard(self.slot)
+            if not known:
                 del self.held[resident.version]
 
-    def drop_all(self) -> list[Resident]:
-        """The session has nothing any more; returns what it had."""
-        return [resident for version in list(self.held) for resident in self.drop(version)]
-
-    def residents(self) -> Iterator[Resident]:
+    def residents(self) -> list[Resident]:
         """Everything the session holds."""
-        return (resident for layers in self.held.values() for resident in layers.values())
+        return [resident for known in self.held.values() for resident in known]
 
     def exclusive_bytes(self) -> int:
         """Bytes that nobody but this session holds."""
-        return sum(r.nbytes for r in self.residents() if len(r.sessions) == 1)
+        return sum(resident.nbytes for resident in self.residents() if len(resident.sessions) == 1)
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
         """This session as a line in a reply."""
@@ -172,7 +168,7 @@ class Sessions:
 
     def close(self, session: Session) -> None:
         """End a session and its bookkeeping."""
-        session.drop_all()
+        session.drop(list(session.held))
         if self._by_identity.get(session.identity) is session:
             del self._by_identity[session.identity]
         self._by_slot.pop(session.slot, None)

@@ -15,6 +15,8 @@ from collections.abc import Callable
 from typing import Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.daemon import jobs
 from shmmap.daemon.reclaim import Outcome, Reclaimer
@@ -34,11 +36,11 @@ __all__ = ["Store"]
 
 _log = logging.getLogger(__name__)
 
-HAND_OUT_GRACE_S: Final = 1.0
-"""A segment just handed out is not evicted for this long, so that its reader can open it."""
 FIRST_RETRY_S: Final = 1.0
 LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
+START_ATTEMPTS: Final = 3
+"""After this many loaders in a row that could not start, loads fail instead of waiting."""
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
@@ -61,8 +63,11 @@ class Store:
     history : deque
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
     warm : dict
-        Per layer, catalogue index to resident segment of the cell's *current* version: what a
-        warm request looks into.
+        Per layer, catalogue index to resident segment of the cell's *current* version.
+    versions : dict
+        Per layer, (cells,) uint64: that version, 0 where the cell is not in memory.
+    index_of_version : dict
+        Versions handed out (current and earlier ones) to catalogue indices.
     """
 
     def __init__(
@@ -86,6 +91,7 @@ class Store:
         self.reclaimer = reclaimer
         self.pool = pool
         self.warm: dict[str, dict[int, Resident]] = {}
+        self.versions: dict[str, NDArray[np.uint64]] = {}
         self.id_prefix = id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
@@ -100,7 +106,7 @@ class Store:
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
         self._hungry: dict[int, tuple[Worker, int]] = {}
-        self._cell_of_version: dict[int, str] = {}
+        self.index_of_version: dict[int, int] = {}
         self.history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=64)
         reclaimer.on_retired = self._leave
         reclaimer.on_freed = lambda resident: statistics.cell_removed(resident.name)
@@ -121,10 +127,6 @@ class Store:
     def wire_id(self, cell_id: str) -> str:
         """An id as replies carry it: without the prefix, whole where it does not start with it."""
         return cell_id[len(self.id_prefix) :] if cell_id.startswith(self.id_prefix) else cell_id
-
-    def cell_of_version(self, version: int) -> str | None:
-        """Id of the cell that a version handed out in this epoch belongs to."""
-        return self._cell_of_version.get(version)
 
     # --- wanting ------------------------------------------------------------------------------
 
@@ -233,6 +235,11 @@ class Store:
         if received is None:
             return False
         message, fd = received
+        if isinstance(message, jobs.Ready):
+            worker.ready = True
+            worker.head_since_s = now_s
+            self.pool.failed_starts = 0
+            return True
         if isinstance(message, jobs.Need):
             self._hungry[message.number] = (worker, message.bytes)
             self._feed_hungry(now_s)
@@ -270,12 +277,16 @@ class Store:
     def _on_worker_end(self, worker: Worker, now_s: float) -> None:
         unfinished, how = self.pool.remove(worker)
         self._statistics.add("worker_crashes")
+        if not worker.ready:
+            self.pool.failed_starts += 1
+            _log.error("a loader could not start: %s", how)
+        at_fault = worker.ready or self.pool.failed_starts >= START_ATTEMPTS
         for position, job in enumerate(unfinished):
             self._hungry.pop(job.number, None)
             load = self._jobs.pop(job.number, None)
             if load is None:
                 continue
-            if position == 0:
+            if position == 0 and at_fault:
                 _log.error("loader died while it read %s: %s", job.path, how)
                 self._fail(load, "load_failed", f"{job.path}: the loader died of it ({how})", None, now_s)
             else:
@@ -327,8 +338,7 @@ class Store:
                 return
             self._remember({load.key.cell_id}, ())
             self.catalogue.set_stamp(index, stamp)
-            for warm in self.warm.values():
-                warm.pop(index, None)
+            self._chill(index)
         version = self.catalogue.version(index)
         name = new_segment_name(self._instance)
         try:
@@ -373,8 +383,12 @@ class Store:
         self._encode(resident)
         if resident.version == self.catalogue.version(index):
             self.warm.setdefault(resident.key.layer, {})[index] = resident
+            versions = self.versions.get(resident.key.layer)
+            if versions is None:
+                versions = self.versions[resident.key.layer] = np.zeros(len(self.catalogue), np.uint64)
+            versions[index] = resident.version
         self.heights[index] = (resident.z_min, resident.z_max)
-        self._cell_of_version[resident.version] = resident.key.cell_id
+        self.index_of_version[resident.version] = index
         self._indices[self.wire_id(resident.key.cell_id)] = index
         self._show(resident, "resident" if resident.version == self.catalogue.version(index) else "stale")
 
@@ -384,6 +398,7 @@ class Store:
         warm = self.warm.get(resident.key.layer, {})
         if index is not None and warm.get(index) is resident:
             del warm[index]
+            self.versions[resident.key.layer][index] = 0
         self._show(resident, "zombie")
 
     def _encode(self, resident: Resident) -> None:
@@ -425,6 +440,12 @@ class Store:
 
     # --- leaving --------------------------------------------------------------------------------
 
+    def _chill(self, index: int) -> None:
+        """What is resident of this cell is not its current version any more."""
+        for layer, warm in self.warm.items():
+            if warm.pop(index, None) is not None:
+                self.versions[layer][index] = 0
+
     def evict(self, resident: Resident, now_s: float) -> bool:
         """Retire on request; True if nobody has it mapped."""
         return self.reclaimer.retire(resident, now_s)
@@ -439,7 +460,13 @@ class Store:
         if renumbered:
             self._indices.clear()
             self.warm.clear()
+            self.versions.clear()
             self.heights.clear()
+            self.index_of_version.clear()
+            for zombie in self.books.zombies.values():
+                index = self.index_of(zombie.resident.key.cell_id)
+                if index is not None:
+                    self.index_of_version[zombie.resident.version] = index
         gone = set(change.removed)
         for resident in list(self.books.residents()):
             if resident.key.cell_id in gone:
@@ -449,14 +476,12 @@ class Store:
             if index is None:
                 self.evict(resident, now_s)
                 continue
-            self.warm.get(resident.key.layer, {}).pop(index, None)
+            self._chill(index)
             resident.box = new.box(index)
             self._enter(resident, index)
         for key in [key for key in self.books.slots if key.cell_id in gone]:
             self.books.cancel(key)
             self._on_settled(key)
-        kept = {r.version for r in self.reclaimer.everything()}
-        self._cell_of_version = {v: c for v, c in self._cell_of_version.items() if v in kept}
         return change
 
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:

@@ -43,6 +43,7 @@ class _Worker:
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
+        self._send(jobs.Ready())
         while True:
             job = self._waiting.pop(0) if self._waiting else self._receive()
             if job is None:

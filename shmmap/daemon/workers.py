@@ -32,6 +32,7 @@ class Worker:
     channel: socket.socket
     queue: OrderedDict[int, jobs.Job] = field(default_factory=OrderedDict)
     head_since_s: float = 0.0
+    ready: bool = False
 
     @property
     def fd(self) -> int:
@@ -52,6 +53,11 @@ class WorkerPool:
         How long one load may take; then its worker is killed.
     watch, unwatch
         Called with a worker's descriptor when it comes and goes, for the caller's poller.
+
+    Attributes
+    ----------
+    failed_starts
+        Workers in a row that ended before they were ready: not their job's fault.
     """
 
     def __init__(
@@ -69,6 +75,7 @@ class WorkerPool:
         self._watch = watch
         self._unwatch = unwatch
         self._workers: dict[int, Worker] = {}
+        self.failed_starts = 0
 
     def __len__(self) -> int:
         return len(self._workers)
@@ -99,6 +106,8 @@ class WorkerPool:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+                cwd="/",  # nothing is imported from where the daemon happens to run
                 start_new_session=True,
             )  # fmt: skip
         except BaseException:

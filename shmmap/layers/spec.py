@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from shmmap.errors import BadRequest
 
-__all__ = ["LAYERS", "canonical_layer"]
+__all__ = ["LAYERS", "canonical_layer", "canonical_layers"]
 
 LAYERS: Final = ("points",)
 
@@ -18,3 +19,10 @@ def canonical_layer(spec: str) -> str:
     if name not in LAYERS:
         raise BadRequest(f"unknown layer {spec!r}", hint=f"layers are: {', '.join(LAYERS)}")
     return name
+
+
+def canonical_layers(specs: Sequence[str]) -> tuple[str, ...]:
+    """Return the canonical forms of several layer specs, duplicates left out; there must be one."""
+    if not specs:
+        raise BadRequest("a request must name at least one layer")
+    return tuple(dict.fromkeys(map(canonical_layer, specs)))

@@ -4,19 +4,20 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import msgspec
 
 from shmmap.errors import BadRequest, ProtocolMismatch
-from shmmap.protocol.messages import Handle, Reply, Request
+from shmmap.protocol.messages import FailedCell, Handle, PendingCell, Reply, Request
 
 __all__ = [
     "MAX_REQUEST_BYTES",
     "decode_reply",
     "decode_request",
     "encode",
+    "encode_cells",
     "encode_handle",
     "pack_versions",
     "request_number",
@@ -36,6 +37,30 @@ encode: Final = _encoder.encode
 def encode_handle(handle: Handle) -> bytes:
     """Return a handle's bytes, to be reused in every reply that carries it."""
     return _encoder.encode(handle)
+
+
+def encode_cells(
+    request: int,
+    epoch: int,
+    map_version: int,
+    handles: Sequence[bytes],
+    removed: tuple[str, ...],
+    removed_packed: bytes,
+    pending: Sequence[PendingCell],
+    failed: Sequence[FailedCell],
+) -> bytes:
+    """Return a `Cells` reply put together from handles that are encoded already."""
+    count = len(handles)
+    if count < 16:
+        head = bytes((0x90 | count,))
+    elif count < 1 << 16:
+        head = b"\xdc" + count.to_bytes(2, "big")
+    else:
+        head = b"\xdd" + count.to_bytes(4, "big")
+    start = encode(("cells", request, epoch, map_version))
+    end = encode((removed, removed_packed, pending, failed))
+    # one array of nine elements instead of two of four: replace their one-byte heads
+    return b"".join((b"\x99", start[1:], head, *handles, end[1:]))
 
 
 def decode_request(data: bytes | memoryview) -> Request:
@@ -59,7 +84,8 @@ def request_number(data: bytes | memoryview) -> int:
 
 def pack_versions(versions: Iterable[int]) -> bytes:
     """Return cell versions as 8 bytes little-endian each."""
-    return b"".join(version.to_bytes(8, "little") for version in versions)
+    whole = tuple(versions)
+    return struct.pack(f"<{len(whole)}Q", *whole)
 
 
 def unpack_versions(packed: bytes) -> tuple[int, ...]:

@@ -326,7 +326,7 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     """Answer to `Area`, `Differential` and `Selected`.
 
     ``removed`` repeats held ids that the client should drop, in the order it gave them;
-    ``removed_packed`` the same for packed versions.
+    ``removed_packed`` the same for packed versions, in any order.
     """
 
     request: int
