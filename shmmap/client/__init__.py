@@ -1,14 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The client library: connect, ask for cells, follow a pose."""
+"""The client library: connect, ask for cells, follow a pose.
+
+What windows need is loaded when it is first used; a program that only asks does without.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, PendingLayer
 from shmmap.client.client import Client, connect
 from shmmap.client.map_listing import CellInfo, MapListing
-from shmmap.client.points_around import PointsAround
-from shmmap.client.retention import Departed, Retention, RetentionPolicy
-from shmmap.client.window import MapWindow
-from shmmap.client.window_state import WindowUpdate
+
+if TYPE_CHECKING:
+    from shmmap.client.points_around import PointsAround
+    from shmmap.client.retention import Departed, Retention, RetentionPolicy
+    from shmmap.client.window import MapWindow
+    from shmmap.client.window_state import WindowUpdate
 
 __all__ = [
     "Cell",
@@ -25,3 +35,20 @@ __all__ = [
     "WindowUpdate",
     "connect",
 ]
+
+_LATER: Final = {
+    "Departed": "retention",
+    "MapWindow": "window",
+    "PointsAround": "points_around",
+    "Retention": "retention",
+    "RetentionPolicy": "retention",
+    "WindowUpdate": "window_state",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module 'shmmap.client' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"shmmap.client.{_LATER[name]}"), name)
+    globals()[name] = value
+    return value

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, overload
 
 from shmmap.client.cell import Cell
@@ -21,7 +20,6 @@ class PendingLayer(NamedTuple):
     layer: str
 
 
-@dataclass(frozen=True, slots=True)
 class CellSet(Sequence[Cell]):
     """The cells that answer a request, in reply order, and what is missing among them.
 
@@ -43,12 +41,29 @@ class CellSet(Sequence[Cell]):
         Which state of the map.
     """
 
-    cells: tuple[Cell, ...] = ()
-    failed: tuple[CellError, ...] = ()
-    pending: tuple[PendingLayer, ...] = ()
-    removed: tuple[str, ...] = ()
-    epoch: int = 0
-    map_version: int = 0
+    __slots__ = ("cells", "epoch", "failed", "map_version", "pending", "removed")
+
+    def __init__(
+        self,
+        cells: tuple[Cell, ...] = (),
+        failed: tuple[CellError, ...] = (),
+        pending: tuple[PendingLayer, ...] = (),
+        removed: tuple[str, ...] = (),
+        epoch: int = 0,
+        map_version: int = 0,
+    ) -> None:
+        self.cells = cells
+        self.failed = failed
+        self.pending = pending
+        self.removed = removed
+        self.epoch = epoch
+        self.map_version = map_version
+
+    def __repr__(self) -> str:
+        return (
+            f"<CellSet of {len(self.cells)} cells, {len(self.removed)} removed,"
+            f" {len(self.pending)} pending, {len(self.failed)} failed>"
+        )
 
     @property
     def complete(self) -> bool:

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import math
 import os
-import secrets
+import struct
 import time
 import weakref
 from collections.abc import Sequence
 from typing import Final, TypeVar
 
 import zmq
-from zmq.utils.monitor import recv_monitor_message
 
 from shmmap.client.discovery import find_socket
 from shmmap.errors import NoAnswer, ProtocolMismatch, error_from_wire
@@ -29,6 +28,7 @@ __all__ = ["Connection"]
 
 R = TypeVar("R")
 
+_EVENT: Final = struct.Struct("=HI")  # first frame of a message of zmq_socket_monitor(3): event, value
 _SLICE_MS: Final = 100  # how often silence is looked at: did the connection break?
 _RESEND_S: Final = 1.0  # first repetition on silence; the interval then doubles
 _RECONNECT_MS: Final = 20
@@ -68,7 +68,7 @@ class Connection:
         deadline_s = time.monotonic() + timeout_s
         self.path = find_socket(paths, deadline_s)
         self._name = name
-        self._next_request = secrets.randbits(48)
+        self._next_request = int.from_bytes(os.urandom(6), "little")
         self._handshakes = 0
         # a context of our own: no other library's sockets can hold up its end
         context = zmq.Context()
@@ -205,7 +205,9 @@ class Connection:
 
     def _watch_connection(self) -> None:
         while self._monitor.poll(0):
-            if recv_monitor_message(self._monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            # zmq.utils.monitor would do this, but loads asyncio (20 ms)
+            event, _value = _EVENT.unpack(self._monitor.recv_multipart()[0])
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._handshakes += 1
             else:
                 raise ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")

@@ -9,7 +9,6 @@ import socket
 import stat
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Final
 
 from shmmap.errors import (
@@ -144,7 +143,7 @@ def _refusal(path: str, error: OSError) -> DaemonUnreachable | ProtocolMismatch:
         return ProtocolMismatch(f"{path} is a socket of another kind: no shmmap daemon made it")
     if error.errno == errno.ECONNREFUSED:
         try:
-            is_socket = stat.S_ISSOCK(Path(path).stat().st_mode)
+            is_socket = stat.S_ISSOCK(os.stat(path).st_mode)
         except OSError:
             is_socket = False
         if is_socket:
@@ -157,11 +156,13 @@ def _refusal(path: str, error: OSError) -> DaemonUnreachable | ProtocolMismatch:
 
 
 def _other_instances(path: str) -> str:
+    directory = os.path.dirname(path)
+    if not (directory.endswith("/shmmap") or directory == SYSTEM_RUNTIME_DIR):
+        return ""
     try:
-        others = sorted(str(other) for other in Path(path).parent.glob("*.sock") if other.is_socket())
+        others = sorted(f"{directory}/{name}" for name in os.listdir(directory) if name.endswith(".sock"))
     except OSError:
         return ""
-    directory = str(Path(path).parent)
-    if not others or not (directory.endswith("/shmmap") or directory == SYSTEM_RUNTIME_DIR):
+    if not others:
         return ""
     return f"other instances are there: {', '.join(others)}; name one with SHMMAP_ENDPOINT"

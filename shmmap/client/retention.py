@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
+
+import msgspec
 
 from shmmap.errors import BadRequest
 
@@ -36,8 +37,7 @@ class RetentionPolicy(Protocol):
         """Whether to keep each of the departed cells."""
 
 
-@dataclass(frozen=True, slots=True)
-class Retention:
+class Retention(msgspec.Struct, frozen=True):
     """Keeps cells up to a distance, a sum of bytes, and an age; nearest first.
 
     Parameters

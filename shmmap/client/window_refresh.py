@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Final, TypeAlias
 
+import msgspec
 import numpy as np
 
 from shmmap import geometry
@@ -113,7 +113,7 @@ class WindowRefresher:
             self.retained.clear()
         progress = bool(answer.cells or answer.removed)
         if not progress:
-            after = replace(
+            after = msgspec.structs.replace(
                 state,
                 pending=answer.pending,
                 failed=answer.failed,

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +21,7 @@ LayerKey: TypeAlias = tuple[str, str]
 """Cell id and layer."""
 
 
-@dataclass(frozen=True, slots=True)
-class WindowUpdate:
+class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     """What happened to a window since the last `MapWindow.move_to`.
 
     Attributes
@@ -56,8 +55,7 @@ class WindowUpdate:
         return not self.pending and not self.failed
 
 
-@dataclass(frozen=True, slots=True)
-class WindowState:
+class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     """The cells of a window after one answer of the daemon; never changed, only replaced.
 
     Attributes
@@ -72,10 +70,10 @@ class WindowState:
         The pose that was asked about; None before the first answer.
     """
 
-    cells: Mapping[LayerKey, Cell] = field(default_factory=dict)
-    versions: Mapping[LayerKey, int] = field(default_factory=dict)
-    by_layer: Mapping[str, tuple[Cell, ...]] = field(default_factory=dict)
-    boxes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    cells: Mapping[LayerKey, Cell] = {}
+    versions: Mapping[LayerKey, int] = {}
+    by_layer: Mapping[str, tuple[Cell, ...]] = {}
+    boxes: Mapping[str, NDArray[np.float64]] = {}
     pending: tuple[PendingLayer, ...] = ()
     failed: tuple[CellError, ...] = ()
     asked: Intent | None = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Final
 
 from shmmap.errors import BadRequest
@@ -39,7 +38,7 @@ def endpoint_path(endpoint: str) -> str:
     path = endpoint.removeprefix("ipc://")
     if "://" in path or not path or path.startswith("@"):
         raise BadRequest(f"endpoint {endpoint!r} is not usable", hint="give a socket path or an ipc:// URL")
-    absolute = str(Path(path).absolute())
+    absolute = os.path.abspath(path)
     if len(os.fsencode(absolute)) > _SUN_PATH_BYTES:
         raise BadRequest(
             f"socket path {absolute} is longer than the {_SUN_PATH_BYTES} bytes a socket address holds",

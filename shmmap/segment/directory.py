@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
 
 from shmmap.errors import ConfigError
 from shmmap.segment.layout import PublishBlock, pack_publish_block
@@ -35,7 +34,7 @@ class ShmDirectory:
     """
 
     def __init__(self, path: str = DEFAULT_SHM_DIR) -> None:
-        self.path = str(Path(path).absolute())
+        self.path = os.path.abspath(path)
         try:
             self._fd = os.open(self.path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
