@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files and loaders that crash, hang or lie cost their own cell and nothing else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.divided_map import DividedMap
+from tests.support.raw_client import RawClient, circle
+
+Connect = Callable[..., RawClient]
+
+
+def stop_loaders(one: DaemonProcess) -> list[int]:
+    """SIGSTOP every loader there is, wait until they stand still."""
+    loaders = one.children()
+    for pid in loaders:
+        os.kill(pid, signal.SIGSTOP)
+        while Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T":
+            os.sched_yield()
+    return loaders
+
+
+def test_one_load_for_many_who_ask(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    clients = [connect(one) for _ in range(8)]
+    requests = [client.send("area", circle(0, 0, 60), ["points"], 30.0) for client in clients]
+    wanted = divided_map.in_circle(0, 0, 60)
+    replies = [c.cells_reply(c.wait_for(r)) for c, r in zip(clients, requests, strict=True)]
+    segments = [handle.segment for handle in replies[0].cells]
+    assert [handle.id for handle in replies[0].cells] == [divided_map.id(name) for name in wanted]
+    assert all([h.segment for h in reply.cells] == segments for reply in replies)
+    counters = clients[0].ask("stats")[4]
+    assert counters["loads_started"] == counters["loads_finished"] == len(wanted)
+
+
+def test_a_cold_request_delays_nobody_s_warm_one(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """The loaders stand still, so the cold request cannot be answered: warm ones are."""
+    one = daemon(divided_map.root, "--workers", "1")
+    warm, cold = connect(one), connect(one)
+    warm.area(circle(0, 0, 5))
+    (loader,) = stop_loaders(one)
+    request = cold.send("area", circle(40, 40, 5), ["points"], 60.0)
+    partly = cold.area(circle(20, 20, 5), wait=None)  # the same session is not held up either
+    assert len(partly.cells) + len(partly.pending) == 4
+    assert partly.pending
+    for _ in range(50):
+        assert len(warm.area(circle(0, 0, 5)).cells) == 4
+    os.kill(loader, signal.SIGCONT)
+    assert len(cold.cells_reply(cold.wait_for(request)).cells) == 4
+
+
+def test_patience_ends(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    """Who waits for a while gets what there is by then."""
+    one = daemon(divided_map.root, "--workers", "1")
+    client = connect(one)
+    client.area(circle(0, 0, 5))
+    (loader,) = stop_loaders(one)
+    reply = client.area(circle(10, 0, 15), wait=0.2)
+    assert len(reply.cells) == 4
+    assert len(reply.pending) == len(divided_map.in_circle(10, 0, 15)) - 4
+    os.kill(loader, signal.SIGCONT)
+    assert len(client.area(circle(10, 0, 15)).cells) == len(divided_map.in_circle(10, 0, 15))
+
+
+def test_a_loader_that_hangs_ends_at_its_deadline(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, "--workers", "1", "--load-timeout", "1")
+    client = connect(one)
+    client.area(circle(0, 0, 5))
+    (loader,) = stop_loaders(one)
+    reply = client.area(circle(40, 40, 5))
+    assert wait_ended(loader)
+    assert [failure.code for failure in reply.failed] == ["load_timeout"]  # the one it stood still at
+    assert len(reply.cells) == 3  # the others were given to the next loader
+    assert client.ask("stats")[4]["loads_timed_out"] == 1
+
+
+def test_a_loader_that_is_killed_costs_one_cell(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, "--workers", "1")
+    client = connect(one)
+    client.area(circle(0, 0, 5))
+    (loader,) = stop_loaders(one)
+    request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
+    client.ask("stats")
+    os.kill(loader, signal.SIGKILL)
+    reply = client.cells_reply(client.wait_for(request))
+    assert len(reply.cells) == 3
+    (failure,) = reply.failed
+    assert (failure.code, "SIGKILL" in failure.message) == ("load_failed", True)
+    assert client.ask("stats")[4]["worker_crashes"] == 1
+    reply = client.area(circle(40, 40, 5))  # not tried again at once
+    while reply.failed:
+        reply = client.area(circle(40, 40, 5))
+    assert len(reply.cells) == 4
+
+
+def test_idle_loaders_that_are_killed_are_replaced(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    client.area(circle(0, 0, 25))
+    for pid in one.children():
+        os.kill(pid, signal.SIGKILL)
+        assert wait_ended(pid)
+    reply = client.area(circle(0, 0, 200))
+    assert (len(reply.cells), reply.failed) == (36, [])
+
+
+def test_a_pipe_instead_of_a_file(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    """Opening it would wait for ever."""
+    one = daemon(divided_map.root, "--load-timeout", "2")
+    path = divided_map.pcd_dir / "0_0.pcd"
+    path.unlink()
+    os.mkfifo(path)
+    client = connect(one)
+    reply = client.area(circle(0, 0, 5))
+    assert [(f.id.rsplit("/", 1)[-1], f.code) for f in reply.failed] in (
+        [("0_0.pcd", "load_failed")],
+        [("0_0.pcd", "load_timeout")],
+    )
+    assert len(reply.cells) == 3
+
+
+@pytest.mark.parametrize("kind", ["missing", "directory", "empty", "truncated", "loop", "unreadable length"])
+def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, kind: str
+) -> None:
+    one = daemon(divided_map.root)
+    path = divided_map.pcd_dir / "0_0.pcd"
+    whole = path.read_bytes()
+    path.unlink()
+    if kind == "directory":
+        path.mkdir()
+    elif kind == "loop":
+        path.symlink_to(path)
+    elif kind != "missing":
+        content = {
+            "empty": b"",
+            "truncated": whole[:-1],
+            "unreadable length": whole.replace(b"POINTS 500", b"POINTS 4000000000"),
+        }
+        path.write_bytes(content[kind])
+    client = connect(one)
+    reply = client.area(circle(0, 0, 5))
+    (failure,) = reply.failed
+    assert (failure.id.rsplit("/", 1)[-1], failure.code) == ("0_0.pcd", "load_failed")
+    assert str(path) in failure.message
+    assert len(reply.cells) == 3
+    if kind == "directory":
+        path.rmdir()
+    else:
+        path.unlink(missing_ok=True)
+    interim = path.with_suffix(".new")
+    interim.write_bytes(whole)
+    interim.rename(path)
+    reply = client.area(circle(0, 0, 5))
+    while reply.failed:  # a file that could not even be looked at is tried again after a while
+        reply = client.area(circle(0, 0, 5))
+    assert len(reply.cells) == 4
+
+
+def test_a_header_that_promises_the_moon_costs_no_memory(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, "--workers", "1")
+    client = connect(one)
+    client.area(circle(0, 0, 5))
+    (loader,) = one.children()
+    idle = peak_memory(loader)
+    header = (
+        b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 300000000\nHEIGHT 1\n"
+        b"POINTS 300000000\nDATA "
+    )
+    for name, tail in (
+        ("20_20.pcd", b"binary\n" + bytes(100)),
+        ("20_0.pcd", b"ascii\n1 2 3\n"),
+        ("40_20.pcd", b"binary_compressed\n" + struct.pack("<II", 40, 3_600_000_000) + bytes(40)),
+    ):
+        (divided_map.pcd_dir / name).write_bytes(header + tail)
+        reply = client.selected([name])
+        assert [f.code for f in reply.failed] == ["load_failed"]
+    assert one.children() == [loader]
+    assert peak_memory(loader) - idle < 100 << 20
+
+
+def peak_memory(pid: int) -> int:
+    """Most memory a process ever had, bytes."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    raise AssertionError("no VmHWM")

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whoever maps a segment keeps it, whatever it is and whatever happens; nobody else does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap
+from tests.support.mapping_process import MappingProcess
+from tests.support.raw_client import RawClient, circle
+
+Connect = Callable[..., RawClient]
+
+
+def until_freed(one: DaemonProcess, client: RawClient) -> None:
+    """Ask until no segment is left (the daemon looks at retired ones by itself)."""
+    while one.segments():
+        client.ask("stats")
+
+
+def test_evicting_everything_frees_what_nobody_maps(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    handles = client.area(circle(0, 0, 25)).cells
+    paths = [client.path(handle) for handle in handles[:2]]
+    expected = [zlib.crc32(Path(path).read_bytes()) for path in paths]
+    with MappingProcess(paths) as reader:
+        evicted = client.ask("evict")
+        assert (evicted[2], evicted[3]) == (len(handles) - 2, 2)
+        while len(one.segments()) > 2:
+            client.ask("stats")
+        assert all(name.endswith(".zombie") for name in one.segments())
+        while client.ask("stats")[4]["zombies"] != 2:  # gauges are written a few times a second
+            pass
+        os.kill(reader.pid, signal.SIGSTOP)
+        client.ask("evict")
+        os.kill(reader.pid, signal.SIGCONT)
+        assert reader.checksums() == expected
+        # a retired segment that is wanted again is put back, not loaded a second time
+        loads = client.ask("stats")[4]["loads_finished"]
+        again = client.selected([handles[0].id]).cells[0]
+        assert again.segment == handles[0].segment
+        assert client.ask("stats")[4]["loads_finished"] == loads
+        client.ask("evict")
+    until_freed(one, client)
+
+
+def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unknown(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Plain open and mmap, SIGSTOP, a daemon that is killed and comes back: nothing gets lost."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    expected = zlib.crc32(Path(client.path(handle)).read_bytes())
+    with MappingProcess([client.path(handle)]) as stranger:
+        os.kill(stranger.pid, signal.SIGSTOP)
+        one.kill()
+        one.start()
+        client.hello()
+        stats = client.ask("stats")
+        assert (stats[6], stats[7] >= handle.bytes) == (1, True)
+        client.ask("evict")
+        assert len(one.segments()) == 1
+        stats = client.ask("stats")
+        assert (stats[6], stats[7] >= handle.bytes) == (1, True)
+        os.kill(stranger.pid, signal.SIGCONT)
+        assert stranger.checksums() == [expected]
+    until_freed(one, client)
+    stats = client.ask("stats")
+    assert (stats[6], stats[7]) == (0, 0)
+
+
+def test_clients_that_die_let_go(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    paths = [client.path(handle) for handle in client.area(circle(0, 0, 60)).cells]
+    readers = [MappingProcess(paths[i::4]) for i in range(4)]
+    try:
+        os.kill(readers[0].pid, signal.SIGSTOP)
+        client.ask("evict")
+        assert len(one.segments()) == len(paths)
+    finally:
+        for reader in readers:
+            reader.end()
+    until_freed(one, client)
+
+
+def test_a_name_removed_behind_the_daemon_s_back(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """The handle is stale; once evicted the cell is loaded anew, and the books stay right."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    os.unlink(client.path(handle))
+    client.ask("evict", ["0_0.pcd"])
+    again = client.selected(["0_0.pcd"]).cells[0]
+    assert again.segment != handle.segment
+    assert Path(client.path(again)).exists()
+    while client.ask("stats")[4]["bytes_resident"] != one.segment_bytes():
+        pass
