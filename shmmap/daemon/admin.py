@@ -14,6 +14,7 @@ from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
 from shmmap.errors import BadRequest, UnknownCell
 from shmmap.layers.spec import LAYERS
+from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -40,15 +41,12 @@ class Admin:
         self._sessions = sessions
         self._statistics = statistics
         self._epoch = epoch
+        self._bounds_of: Catalogue | None = None
+        self._known_bounds: tuple[float, float, float, float] | None = None
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
         """Tell a new client where everything is."""
         catalogue = self._store.catalogue
-        bounds = None
-        if len(catalogue):
-            low = catalogue.boxes[:, :2].min(axis=0).tolist()
-            high = catalogue.boxes[:, 2:].max(axis=0).tolist()
-            bounds = (low[0], low[1], high[0], high[1])
         return messages.Welcome(
             request=message.request,
             major=messages.PROTOCOL_VERSION[0],
@@ -64,11 +62,22 @@ class Admin:
             id_prefix=self._store.id_prefix,
             segment_prefix=self._store.segment_prefix,
             cells=len(catalogue),
-            bounds=bounds,
+            bounds=self._bounds(),
             layers=LAYERS,
             budget_bytes=self._store.books.budget_bytes,
             pid=os.getpid(),
         )
+
+    def _bounds(self) -> tuple[float, float, float, float] | None:
+        """Box around all cells; looked for once per catalogue, there may be a million of them."""
+        catalogue = self._store.catalogue
+        if self._bounds_of is not catalogue:
+            self._bounds_of, self._known_bounds = catalogue, None
+            if len(catalogue):
+                low = catalogue.boxes[:, :2].min(axis=0).tolist()
+                high = catalogue.boxes[:, 2:].max(axis=0).tolist()
+                self._known_bounds = (low[0], low[1], high[0], high[1])
+        return self._known_bounds
 
     def answer(self, message: messages.Request, now_s: float) -> messages.Reply:
         """Answer one request."""

@@ -133,6 +133,10 @@ class Reclaimer:
         del self._by_key[key]
         return self._books.revive(zombie)
 
+    def never_revive(self, key: Key) -> None:
+        """What is retired of this key must not be handed out again."""
+        self._by_key.pop(key, None)
+
     def _forget(self, zombie: Zombie) -> int:
         resident = zombie.resident
         if self._by_key.get(resident.key) is zombie:

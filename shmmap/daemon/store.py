@@ -468,16 +468,17 @@ class Store:
                 if index is not None:
                     self.index_of_version[zombie.resident.version] = index
         gone = set(change.removed)
+        moved = set(change.moved)
         for resident in list(self.books.residents()):
             if resident.key.cell_id in gone:
                 self.evict(resident, now_s)
                 continue
             index = self.index_of(resident.key.cell_id)
-            if index is None:
+            if index is None or resident.key.cell_id in moved:
                 self.evict(resident, now_s)
+                self.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
             self._chill(index)
-            resident.box = new.box(index)
             self._enter(resident, index)
         for key in [key for key in self.books.slots if key.cell_id in gone]:
             self.books.cancel(key)
