@@ -50,7 +50,7 @@ def warm_difference(
     current, held = set(versions), set(packed)
     if named:
         given = [cell.version for cell in named]
-        if None in given or any(cell.layers is not None for cell in named):
+        if None in given or [cell for cell in named if cell.layers is not None]:
             return None
         held.update(cast("list[int]", given))
     if 0 in current:
@@ -77,12 +77,11 @@ def _removed_names(
 ) -> tuple[str, ...]:
     """Held ids to drop, in the order given; one whose cell is in the area at another version stays."""
     removed: dict[str, None] = {}
-    for cell in named:
-        if cell.version in gone:
-            index = store.index_of(cell.id)
-            resident = store.warm[layer].get(index) if index is not None else None
-            if resident is None or resident.version not in current:
-                removed[cell.id] = None
+    for cell_id in [cell.id for cell in named if cell.version in gone]:
+        index = store.index_of(cell_id)
+        resident = store.warm[layer].get(index) if index is not None else None
+        if resident is None or resident.version not in current:
+            removed[cell_id] = None
     return tuple(removed)
 
 

@@ -9,7 +9,9 @@ every name is taken away before the lock is.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
+import gc
 import grp
 import logging
 import os
@@ -240,6 +242,7 @@ class _Life:
                     len(self._catalogue), budget, time.monotonic() - started_s,
                 )  # fmt: skip
                 notify("READY=1", f"STATUS=serving {len(self._catalogue)} cells", f"MAINPID={os.getpid()}")
+                _settle_memory()
                 server.run()
         finally:
             notify("STOPPING=1", "STATUS=freeing memory")
@@ -313,6 +316,13 @@ class _Life:
         self._statistics.close()
         if self._server is not None:
             self._server.close()
+
+
+def _settle_memory() -> None:
+    """Give back what reading the map took, and keep what stays out of the garbage collector's way."""
+    gc.collect()
+    gc.freeze()
+    ctypes.CDLL(None).malloc_trim(0)
 
 
 def _with_map_version(identity: DaemonIdentity, version: int) -> DaemonIdentity:

@@ -125,7 +125,7 @@ class Intent(msgspec.Struct, array_like=True, frozen=True):
     route: tuple[tuple[float, float], ...] = ()
 
 
-class HeldCell(msgspec.Struct, array_like=True, frozen=True):
+class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """A cell the client says it has: version nil means "the current one", layers nil "all asked for"."""
 
     id: str
@@ -273,7 +273,7 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
     pid: int = 0
 
 
-class Handle(msgspec.Struct, array_like=True, frozen=True):
+class Handle(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """Where one layer of one cell lies in shared memory.
 
     ``id`` and ``segment`` lack the prefixes that `Welcome` gives.  ``stale`` marks a version whose
@@ -339,7 +339,7 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     failed: tuple[FailedCell, ...] = ()
 
 
-class MetadataRow(msgspec.Struct, array_like=True, frozen=True):
+class MetadataRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """One cell of the catalogue; ``id`` lacks the prefix, z bounds are nil until first loaded."""
 
     id: str
