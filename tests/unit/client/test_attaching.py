@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One mapping for each version and layer, and where mappings go."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shmmap.client.attaching import Mapping
+from shmmap.client.cell import Cell
+
+if TYPE_CHECKING:
+    from tests.unit.client.conftest import Segments
+
+XYZ = {"xyz": np.ones((5, 3), np.float32)}
+
+
+def mapped(path: str) -> int:
+    return sum(path in line for line in Path("/proc/self/maps").read_text().splitlines())
+
+
+def test_the_same_version_and_layer_is_mapped_once(segments: Segments) -> None:
+    name, handle = segments.publish("/a", XYZ, version=5)
+    first = segments.attach(name, handle)
+    assert segments.attach(name, handle) is first
+    other, handle_of_other = segments.publish("/a", XYZ, version=5, layer="voxel")
+    assert segments.attach(other, handle_of_other) is not first
+    assert mapped(segments.path) == 1
+
+
+def test_staleness_follows_the_last_reply(segments: Segments) -> None:
+    name, handle = segments.publish("/a", XYZ, version=5)
+    cell = segments.attach(name, handle)
+    values = [getattr(handle, field) for field in handle.__struct_fields__]
+    values[handle.__struct_fields__.index("stale")] = True
+    segments.attach(name, type(handle)(*values))
+    assert cell.stale
+    segments.attach(name, handle)
+    assert not cell.stale
+
+
+def test_a_version_is_told_when_its_last_layer_is_unmapped(segments: Segments) -> None:
+    points = segments.cell("/a", XYZ, version=5)
+    voxel = segments.cell("/a", XYZ, version=5, layer="voxel")
+    other = segments.cell("/b", XYZ, version=6)
+    attacher = segments.attacher
+    del points
+    assert attacher.take_unmapped() == []
+    del voxel
+    assert attacher.take_unmapped() == [5]
+    assert attacher.take_unmapped() == []
+    assert attacher.any_mapped
+    del other
+    assert attacher.take_unmapped() == [6]
+    assert not attacher.any_mapped
+
+
+def test_deferred_mappings_stay_until_their_thread_unmaps_them(segments: Segments) -> None:
+    queue: SimpleQueue[Mapping | None] = SimpleQueue()
+    unmapper = segments.attacher.unmapper
+    unmapper.defer_to(queue)
+    cell = segments.cell("/a", XYZ, version=5)
+    address = cell.xyz.ctypes.data
+    del cell
+    assert mapped(segments.path) == 1
+    assert segments.attacher.take_unmapped() == []
+    mapping = queue.get_nowait()
+    assert mapping is not None
+    assert mapping[0] == 5
+    assert mapping[1] <= address < mapping[1] + mapping[2]
+    unmapper.finish(mapping)
+    assert mapped(segments.path) == 0
+    assert segments.attacher.take_unmapped() == [5]
+    unmapper.stop_deferring(queue)
+
+
+def test_what_is_queued_when_the_thread_ends_is_unmapped_too(segments: Segments) -> None:
+    first: SimpleQueue[Mapping | None] = SimpleQueue()
+    second: SimpleQueue[Mapping | None] = SimpleQueue()
+    unmapper = segments.attacher.unmapper
+    unmapper.defer_to(first)
+    unmapper.defer_to(second)
+    cells = [segments.cell(f"/{i}", XYZ, version=i) for i in range(1, 4)]
+    cells.pop()
+    unmapper.stop_deferring(first)
+    assert mapped(segments.path) == 2
+    cells.pop()
+    assert second.qsize() == 1, "the other thread takes over"
+    unmapper.stop_deferring(second)
+    assert mapped(segments.path) == 1
+    cells.pop()
+    assert mapped(segments.path) == 0
+
+
+def drop_when_all_are_there(cells: list[Cell], barrier: threading.Barrier) -> None:
+    barrier.wait()
+    cells.clear()
+
+
+def test_dropping_cells_in_many_threads_while_the_thread_ends_loses_none(segments: Segments) -> None:
+    queue: SimpleQueue[Mapping | None] = SimpleQueue()
+    unmapper = segments.attacher.unmapper
+    for round_ in range(20):
+        unmapper.defer_to(queue)
+        cells = [segments.cell(f"/{round_}/{i}", XYZ, version=round_ * 100 + i + 1) for i in range(8)]
+        barrier = threading.Barrier(9)
+        threads = [threading.Thread(target=drop_when_all_are_there, args=([c], barrier)) for c in cells]
+        for thread in threads:
+            thread.start()
+        cells.clear()
+        barrier.wait()
+        unmapper.stop_deferring(queue)
+        for thread in threads:
+            thread.join()
+        threads.clear()
+        del thread
+        assert mapped(segments.path) == 0

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers: a sequence of cells, and errors by wire code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from shmmap import errors
+from shmmap.client.cell import Cell
+from shmmap.client.cell_set import CellSet, PendingLayer, cell_error
+from shmmap.protocol.messages import FailedCell, Holder
+
+BOX = (0.0, 0.0, 20.0, 20.0)
+
+
+def test_it_is_the_sequence_of_its_cells(make_cell: Callable[..., Cell]) -> None:
+    cells = tuple(make_cell(f"/{i}", BOX) for i in range(3))
+    answer = CellSet(cells)
+    assert tuple(answer) == cells
+    assert (len(answer), answer[1], answer[-1], answer[:2]) == (3, cells[1], cells[2], cells[:2])
+    assert answer.complete
+    assert answer.raise_for_failures() is answer
+
+
+def test_pending_and_failed_make_it_incomplete() -> None:
+    assert not CellSet(pending=(PendingLayer("/a", "points"),)).complete
+    failed = CellSet(failed=(errors.LoadFailed("broken", cell_id="/a", layer="points"),))
+    assert not failed.complete
+    with pytest.raises(errors.LoadFailed, match="broken"):
+        failed.raise_for_failures()
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        ("unknown_cell", errors.UnknownCell),
+        ("load_failed", errors.LoadFailed),
+        ("load_timeout", errors.LoadTimeout),
+        ("over_budget", errors.OverBudget),
+        ("no_space", errors.NoSpace),
+        ("of_a_later_version", errors.CellError),
+    ],
+)
+def test_errors_have_the_kind_of_their_code(code: str, kind: type[errors.CellError]) -> None:
+    error = cell_error(FailedCell("a", "points", code, "why"), "/map/a")
+    assert type(error) is kind
+    assert (error.cell_id, error.layer) == ("/map/a", "points")
+    assert str(error) == "/map/a (points): why"
+
+
+def test_holders_are_lines_that_name_who() -> None:
+    holders = (Holder(0xAB, 42, 1000, "ndt", 4096, 3), Holder(0, 0, -1, "", 8192))
+    error = cell_error(FailedCell("a", "points", "over_budget", "full", holders), "/a")
+    assert error.holders == (
+        "session 00000000000000ab, pid 42 (ndt) holds 4096 bytes in 3 cells",
+        "unknown (not through the client library) holds 8192 bytes",
+    )
