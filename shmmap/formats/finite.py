@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bounds", "row_extremes"]
+__all__ = ["Bounds", "axis_extremes", "row_extremes"]
 
 _GROUP: Final = 512  # rows folded into one long row, so that numpy reduces with vector instructions
 
@@ -23,6 +23,12 @@ def row_extremes(rows: NDArray[Any]) -> tuple[list[float], list[float]]:
     """Return minimum and maximum of each column of a C-contiguous (N, k) array, N > 0; NaN wins."""
     with np.errstate(invalid="ignore"):  # signalling NaNs
         return _reduce(np.minimum, rows), _reduce(np.maximum, rows)
+
+
+def axis_extremes(axes: tuple[NDArray[Any], ...]) -> tuple[list[float], list[float]]:
+    """Return minimum and maximum of each contiguous (N,) array, N > 0; NaN wins."""
+    with np.errstate(invalid="ignore"):
+        return [float(axis.min()) for axis in axes], [float(axis.max()) for axis in axes]
 
 
 def _reduce(extreme: np.ufunc, rows: NDArray[Any]) -> list[float]:
@@ -46,8 +52,8 @@ class Bounds:
         self._low = [math.inf] * 3
         self._high = [-math.inf] * 3
 
-    def add(self, xyz: NDArray[Any]) -> NDArray[np.bool_] | None:
-        """Take a block of (N, 3) points in.
+    def add(self, xyz: NDArray[Any], axes: tuple[NDArray[Any], ...] = ()) -> NDArray[np.bool_] | None:
+        """Take a block of (N, 3) points in; ``axes`` are the same as contiguous x, y and z, if at hand.
 
         Returns
         -------
@@ -55,7 +61,7 @@ class Bounds:
         """
         if not len(xyz):
             return None
-        low, high = row_extremes(xyz)
+        low, high = axis_extremes(axes) if axes else row_extremes(xyz)
         if all(map(math.isfinite, low + high)):
             self._take(low, high)
             return None

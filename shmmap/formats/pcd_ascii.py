@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from shmmap.errors import MapDataError
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd_header import PcdHeader
-from shmmap.formats.pcd_table import FieldTable
+from shmmap.formats.pcd_table import FieldTable, RawBlock
 from shmmap.formats.source_file import SourceFile
 
 __all__ = ["ascii_blocks"]
@@ -32,7 +32,7 @@ _NUMBER: Final = re.compile(
 
 def ascii_blocks(
     source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int, warnings: list[str]
-) -> Iterator[tuple[NDArray[Any], ...]]:
+) -> Iterator[RawBlock]:
     """Yield blocks of an ``ascii`` body: one line per point, values separated by white space.
 
     Raises
@@ -53,7 +53,7 @@ def ascii_blocks(
             left -= len(block[0])
             at = stop
             if len(block[0]):
-                yield block
+                yield block, ()
         parser.count_surplus(text[at:])
     if left:
         points = header.points

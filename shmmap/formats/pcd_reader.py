@@ -145,8 +145,8 @@ class PcdReader:
             raw = ascii_blocks(source, header, self._table, self._block_points, self._warnings)
         else:
             raw = compressed_blocks(source, header, self._table, self._block_points)
-        for block in raw:
-            mask = self._bounds.add(block[0])
+        for block, axes in raw:
+            mask = self._bounds.add(block[0], axes)
             if mask is None or self._keep:
                 kept = block
             else:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +13,10 @@ from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd_fields import AXES, PcdField
 
-__all__ = ["FieldTable", "coordinate_dtype", "field_table"]
+__all__ = ["FieldTable", "RawBlock", "coordinate_dtype", "field_table"]
+
+# a block of columns, and x, y and z once more where they are at hand as contiguous arrays
+RawBlock = tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]
 
 _EXACT: Final = 1 << 53  # the largest integers that float64 holds exactly
 
@@ -36,6 +38,8 @@ class FieldTable:
         ``xyz`` first, then every field that is neither padding nor a coordinate, in file order.
     axes, others
         The fields behind ``xyz`` and behind the other columns.
+    axes_are_xyz
+        Whether the coordinates have the type of ``xyz`` already.
     record
         Packed type of one point in a ``binary`` file; fields by their unique names, padding skipped.
     values
@@ -54,6 +58,7 @@ class FieldTable:
             ColumnSpec("xyz", self.xyz_dtype, 3, "m"),
             *(ColumnSpec(field.name, field.dtype, field.count) for field in self.others),
         )
+        self.axes_are_xyz = all(field.dtype == self.xyz_dtype for field in self.axes)
         self.values = sum(field.count for field in fields)
         self.record = _record_dtype(fields)
 
@@ -100,7 +105,19 @@ def _record_dtype(fields: tuple[PcdField, ...]) -> np.dtype[Any]:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": at})
 
 
-@lru_cache(maxsize=64)  # the cells of a map share their fields
+_TABLES_LIMIT: Final = 64
+_tables: Final[dict[int, FieldTable]] = {}
+
+
 def field_table(fields: tuple[PcdField, ...]) -> FieldTable:
-    """Return the table for ``fields``."""
-    return FieldTable(fields)
+    """Return the table for ``fields``; the cells of a map share one.
+
+    The headers of one map share the very tuple, and its id is found faster than its hash.
+    """
+    table = _tables.get(id(fields))
+    if table is None or table.fields is not fields:
+        table = FieldTable(fields)
+        if len(_tables) >= _TABLES_LIMIT:
+            _tables.clear()
+        _tables[id(fields)] = table
+    return table

@@ -7,9 +7,7 @@ itself.  A reader borrows, and gives back when it is done.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +26,13 @@ class Scratch:
     def __init__(self) -> None:
         self._memory: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._start = 0
+
+    def __enter__(self) -> Scratch:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not _idle and self.nbytes <= _KEPT_BYTES:
+            _idle.append(self)
 
     @property
     def nbytes(self) -> int:
@@ -50,15 +55,9 @@ class Scratch:
         return tuple(arrays)
 
 
-@contextlib.contextmanager
-def borrow_scratch() -> Iterator[Scratch]:
-    """Lend a `Scratch` that nobody else uses meanwhile; at most one idle one is kept per process."""
+def borrow_scratch() -> Scratch:
+    """Return a `Scratch` that nobody else uses inside its ``with``; at most one idle one is kept."""
     try:
-        scratch = _idle.pop()
+        return _idle.pop()
     except IndexError:
-        scratch = Scratch()
-    try:
-        yield scratch
-    finally:
-        if not _idle and scratch.nbytes <= _KEPT_BYTES:
-            _idle.append(scratch)
+        return Scratch()

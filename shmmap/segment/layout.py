@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -155,6 +156,12 @@ def plan_columns(specs: Sequence[ColumnSpec], rows: int, header_bytes: int) -> t
     return tuple(columns), offset
 
 
+@lru_cache(maxsize=64)  # numpy computes ``dtype.str`` in Python
+def _dtype_name(dtype: np.dtype[np.generic]) -> bytes:
+    name: str = dtype.newbyteorder("<").str
+    return name.encode()
+
+
 def pack_header(header: SegmentHeader) -> bytes:
     """Return the header's bytes, publish block empty.
 
@@ -168,7 +175,7 @@ def pack_header(header: SegmentHeader) -> bytes:
     at = COLUMNS_OFFSET
     for column in header.columns:
         name, unit = column.name.encode(), column.unit.encode()
-        dtype = column.dtype.newbyteorder("<").str.encode()
+        dtype = _dtype_name(column.dtype)
         if len(name) > 40 or len(unit) > 16 or len(dtype) > 8 or len(column.shape) > MAX_DIMENSIONS:
             raise ValueError(f"column {column.name!r} does not fit the layout's row")
         if column.dtype.kind not in "fiu":

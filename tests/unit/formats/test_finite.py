@@ -57,3 +57,15 @@ def test_bounds_of_float32_are_exact_in_float64() -> None:
     bounds.add(np.array([[0.1, -0.1, 89000.1]], "f4"))
     assert bounds.result()[0].dtype == np.float64
     assert bounds.result()[0].tolist() == np.array([0.1, -0.1, 89000.1], "f4").astype("f8").tolist()
+
+
+@pytest.mark.parametrize("bad", [None, np.nan, np.inf])
+def test_contiguous_axes_give_the_same(bad: float | None) -> None:
+    rows = np.random.default_rng(1).normal(size=(3000, 3)).astype("f4")
+    if bad is not None:
+        rows[77, 1] = bad
+    axes = tuple(np.ascontiguousarray(rows[:, axis]) for axis in range(3))
+    one, two = Bounds(), Bounds()
+    masks = one.add(rows), two.add(rows, axes)
+    assert (masks[0] is None) == (masks[1] is None) == (bad is None)
+    assert np.array_equal(one.result(), two.result())

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError
+from shmmap.formats import pcd_header
 from shmmap.formats.causes import CAUSES, refusal
 from shmmap.formats.pcd_header import PcdHeader, parse_header
 from tests.support.pcd_bytes import Field, column, header, pcd
@@ -263,3 +264,31 @@ def test_any_bytes_are_parsed_or_refused(data: bytes) -> None:
 def test_only_listed_causes_can_be_raised() -> None:
     with pytest.raises(KeyError):
         refusal("no such cause", "message", path="x")
+
+
+def test_headers_that_share_lines_keep_their_own_numbers() -> None:
+    """A header like one seen before is recognised; everything that differs must still count."""
+    pcd_header._seen.clear()
+    first = parse(pcd(WITH, "binary"))
+    again = parse(pcd(WITH, "binary"))
+    assert again == first
+    assert again.fields is first.fields
+    three = [column(field.name, f"{field.kind}{field.size}", [1, 2, 3]) for field in WITH]
+    wide = parse(pcd(three, "binary", change={"WIDTH": "1", "HEIGHT": "3"}))
+    assert (wide.width, wide.height, wide.points) == (1, 3, 3)
+    assert pcd(three, "binary")[wide.data_offset :] == pcd(three, "binary")[-39:]
+    assert parse(pcd(three, "binary", change={"WIDTH": "2"})).warnings
+    assert cause(pcd(WITH, "binary")[:-1]) == "truncated"
+    assert cause(pcd(WITH, "binary", change={"POINTS": "9" * 10, "WIDTH": "9" * 10})) == "too_many_points"
+    assert cause(pcd(WITH, "binary", change={"POINTS": "3", "WIDTH": "3"})) == "truncated"
+    assert parse(pcd(WITH, "ascii")).encoding == "ascii"
+    assert parse(pcd(WITH, "binary", change={"TYPE": "F F F I"})).fields[3].dtype.str == "|i1"
+    assert parse(pcd(WITH, "binary", change={"VIEWPOINT": "1 0 0 1 0 0 0"})).warnings
+    assert parse(pcd(WITH, "binary", change={"VIEWPOINT": "1 0 0 1 0 0 0"})).warnings
+    for _ in range(2):
+        assert cause(pcd(WITH, "binary", change={"FIELDS": "x y w i"})) == "no_xyz"
+    for number in range(200):
+        assert (
+            parse(pcd(WITH, "binary", change={"FIELDS": f"x y z f{number}"})).fields[3].name == f"f{number}"
+        )
+    assert len(pcd_header._seen) <= pcd_header._SEEN_LIMIT
