@@ -179,6 +179,13 @@ class _Life:
         self._sessions = Sessions()
         books = Residency(budget)
         books.overhead_bytes = self._statistics.size_bytes
+
+        def grow_statistics(nbytes: int) -> bool:
+            fits = books.shortage(nbytes) <= 0
+            books.overhead_bytes += nbytes if fits else 0
+            return fits
+
+        self._statistics.reserve = grow_statistics
         reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction])
         retire_leftovers(directory, config.instance, reclaimer, time.monotonic())
         pool = WorkerPool(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import struct
 import time
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from itertools import islice
 
 from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
@@ -33,6 +33,13 @@ from shmmap.statistics.layout import (
 __all__ = ["StatisticsWriter"]
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
+
+
+def _always(nbytes: int) -> bool:
+    del nbytes
+    return True
+
+
 _FREE_ROW = pack_row(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
 
 
@@ -53,6 +60,9 @@ class StatisticsWriter:
     ----------
     values : dict of int
         Counters by name (`shmmap.statistics.counters`); may be changed in place.
+    reserve : callable
+        Asked with a number of bytes before the segment grows (64 KiB at a time); where it answers
+        False, the rows that found no room are counted in ``rows_missing`` and tried again later.
 
     Raises
     ------
@@ -70,6 +80,7 @@ class StatisticsWriter:
         gid: int = -1,
     ) -> None:
         self.values: dict[str, int] = dict.fromkeys(COUNTER_NAMES, 0)
+        self.reserve: Callable[[int], bool] = _always
         self.name = statistics_name(instance)
         self._directory = directory
         self._layout = plan(COUNTERS)
@@ -86,7 +97,9 @@ class StatisticsWriter:
         self._removed: list[int] = []
         self._fd = directory.create()
         try:
-            os.posix_fallocate(self._fd, 0, self._layout.rows_offset)
+            # with the first rows, so that a small daemon never grows after it took its budget
+            os.posix_fallocate(self._fd, 0, self._layout.rows_offset + _GROWTH_ROWS * ROW_BYTES)
+            self._allocated = _GROWTH_ROWS
             os.pwrite(self._fd, pack_header(self._layout), 0)
             self.update_identity(identity)
             self.beat()
@@ -202,9 +215,12 @@ class StatisticsWriter:
         rows = min(self._allocated + _GROWTH_ROWS, self._layout.max_rows)
         if rows == self._allocated:
             return False
+        nbytes = (rows - self._allocated) * ROW_BYTES
+        if not self.reserve(nbytes):
+            return False
         start = self._layout.rows_offset + self._allocated * ROW_BYTES
         try:
-            os.posix_fallocate(self._fd, start, (rows - self._allocated) * ROW_BYTES)
+            os.posix_fallocate(self._fd, start, nbytes)
         except OSError as error:
             if is_full(error):
                 return False

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,30 @@ DaemonFactory = Callable[..., DaemonProcess]
 
 
 @pytest.fixture
-def daemon(request: pytest.FixtureRequest) -> Iterator[DaemonFactory]:
+def private_tmpfs(tmp_path: Path) -> Iterator[Callable[[str], str]]:
+    """Mount tmpfs file systems of their own, ``private_tmpfs("16m")``: nobody else fills them."""
+    mounted: list[str] = []
+
+    def mount(size: str) -> str:
+        path = tmp_path / f"tmpfs{len(mounted)}"
+        path.mkdir()
+        done = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={size},mode=755", "tmpfs", str(path)],
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode:
+            pytest.skip(f"cannot mount a tmpfs: {done.stderr.strip()}")
+        mounted.append(str(path))
+        return str(path)
+
+    yield mount
+    for path in mounted:
+        subprocess.run(["umount", path], check=True)
+
+
+@pytest.fixture
+def daemon(private_tmpfs: Callable[[str], str]) -> Iterator[DaemonFactory]:
     """Start daemons: ``daemon(map_path, *flags, environment=..., shm_dir=..., start=True)``.
 
     At the end of the test each one still running gets SIGTERM and must exit 0 and leave no name, no

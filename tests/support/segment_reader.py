@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 import struct
@@ -74,10 +75,16 @@ def parse(data: bytes | mmap.mmap) -> SegmentBytes:
     return SegmentBytes(fields, columns, units, checksums, epoch, version)
 
 
-def map_segment(path: str | Path) -> mmap.mmap:
-    """Map a segment the way any other program would: plain open and mmap."""
+def map_segment(path: str | Path, session: int | None = None) -> mmap.mmap:
+    """Map a segment the way any other program would: plain open and mmap.
+
+    With a session, take its lock as the document says; it lives as long as the mapping.
+    """
     fd = os.open(path, os.O_RDONLY)
     try:
+        if session is not None:
+            set_lock = 37  # F_OFD_SETLK; struct flock: type, whence, start, length, pid
+            fcntl.fcntl(fd, set_lock, struct.pack("@hhqqi4x", fcntl.F_RDLCK, 0, session, 1, 0))
         return mmap.mmap(fd, 0, prot=mmap.PROT_READ)
     finally:
         os.close(fd)

@@ -123,9 +123,11 @@ def test_a_new_identity(shm: ShmDirectory, writer: StatisticsWriter, identity: D
         assert seen.map_version == version
 
 
+@pytest.mark.parametrize("cause", ["file system", "budget"])
 def test_no_room_for_rows(
-    shm: ShmDirectory, writer: StatisticsWriter, monkeypatch: pytest.MonkeyPatch
+    shm: ShmDirectory, writer: StatisticsWriter, monkeypatch: pytest.MonkeyPatch, cause: str
 ) -> None:
+    """The first 256 rows are there from the start; the next five find no room at first."""
     fallocate = os.posix_fallocate
     full = True
 
@@ -134,22 +136,32 @@ def test_no_room_for_rows(
             raise OSError(28, "No space left on device")
         fallocate(fd, offset, length)
 
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    for number in range(5):
+    if cause == "budget":
+        writer.reserve = lambda _: not full
+    else:
+        monkeypatch.setattr(os, "posix_fallocate", refuse)
+    size = writer.size_bytes
+    for number in range(261):
         writer.cell_changed(number, row(number))
     writer.add("requests")
+    writer.beat(max_rows=1000)
+    seen = read_statistics("unit", shm.path)
+    assert (len(seen.cells), seen.rows_missing, seen.counters["requests"]) == (256, 5, 1)
+    assert writer.size_bytes == size
+    writer.cell_removed(256)
+    writer.cell_changed(257, row(257, nbytes=8192))
+    writer.cell_changed(3, row(3, nbytes=8192))
     writer.beat()
     seen = read_statistics("unit", shm.path)
-    assert (seen.cells, seen.rows_missing, seen.counters["requests"]) == ([], 5, 1)
+    assert (seen.rows_missing, seen.cells[3].bytes) == (4, 8192)
     writer.cell_removed(0)
-    writer.cell_changed(1, row(1, nbytes=8192))
     writer.beat()
-    assert read_statistics("unit", shm.path).rows_missing == 4
+    assert read_statistics("unit", shm.path).rows_missing == 3  # took the row that became free
     full = False
     writer.beat()
     seen = read_statistics("unit", shm.path)
-    assert (seen.rows_missing, [c.version for c in seen.cells]) == (0, [1, 2, 3, 4])
-    assert seen.cells[0].bytes == 8192
+    assert (seen.rows_missing, [c.version for c in seen.cells]) == (0, [*range(1, 256), 257, 258, 259, 260])
+    assert seen.cells[255].bytes == 8192
 
 
 def test_a_leftover_is_replaced_and_never_taken_away(shm: ShmDirectory, identity: DaemonIdentity) -> None:

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Other user accounts: the group may read, nobody but the daemon may change anything."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.divided_map import DividedMap
+from tests.support.raw_client import RawClient, circle
+
+pytestmark = pytest.mark.root
+Connect = Callable[..., RawClient]
+
+DAEMON_UID, GROUP, MEMBER, STRANGER = 61001, 61002, 61003, 61004
+
+ATTEMPTS = """
+import ctypes, fcntl, json, mmap, os, sys
+path = sys.argv[1]
+
+def attempt(action):
+    try:
+        action()
+    except OSError as error:
+        return error.errno
+    except ValueError as error:
+        return str(error)
+    return 0
+
+def read():
+    fd = os.open(path, os.O_RDONLY)
+    with mmap.mmap(fd, 0, prot=mmap.PROT_READ) as mapped:
+        assert mapped[:6] == b"SHMMAP"
+    os.close(fd)
+
+def from_reader(action):
+    def run():
+        fd = os.open(path, os.O_RDONLY)
+        try:
+            action(fd)
+        finally:
+            os.close(fd)
+    return run
+
+def protect(fd):
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.mmap.restype = ctypes.c_void_p
+    libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t] + [ctypes.c_int] * 3 + [ctypes.c_long]
+    address = libc.mmap(None, 4096, 1, 1, fd, 0)
+    if libc.mprotect(ctypes.c_void_p(address), 4096, 3):
+        raise OSError(ctypes.get_errno(), "mprotect")
+
+print(json.dumps({
+    "read": attempt(read),
+    "open for writing": attempt(lambda: os.open(path, os.O_RDWR)),
+    "truncate": attempt(lambda: os.truncate(path, 0)),
+    "unlink": attempt(lambda: os.unlink(path)),
+    "rename": attempt(lambda: os.rename(path, path + "x")),
+    "chmod": attempt(lambda: os.chmod(path, 0o666)),
+    "utime": attempt(lambda: os.utime(path, ns=(1, 1))),
+    "writable mapping": attempt(from_reader(lambda fd: mmap.mmap(fd, 0, prot=3))),
+    "mprotect": attempt(from_reader(protect)),
+    "ftruncate": attempt(from_reader(lambda fd: os.ftruncate(fd, 0))),
+    "reopen": attempt(from_reader(lambda fd: os.open(f"/proc/self/fd/{fd}", os.O_RDWR))),
+    "lease": attempt(from_reader(lambda fd: fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK))),
+}))
+"""
+
+
+def as_user(uid: int, gid: int, *command: str) -> subprocess.CompletedProcess[str]:
+    """Run a command as somebody else, without any other group."""
+    return subprocess.run(
+        ["setpriv", f"--reuid={uid}", f"--regid={gid}", "--clear-groups", "--inh-caps=-all", *command],
+        capture_output=True,
+        text=True,
+        cwd="/",
+        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT)},
+    )
+
+
+def attempts(path: str, uid: int, gid: int) -> dict[str, Any]:
+    """What an account can do to a segment: 0 worked, else the errno."""
+    python = os.path.realpath(sys.executable)  # the environment itself may not be open to others
+    done = as_user(uid, gid, python, "-I", "-c", ATTEMPTS, path)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.fixture
+def service(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
+    """Return a daemon with a group, as the service unit starts it; its directories are open to all."""
+    one: DaemonProcess = daemon(divided_map.root, "--group", str(GROUP), start=False)
+    os.chmod(one.runtime_dir, 0o755)
+    os.chmod(one.shm_dir, 0o1777)
+    return one.start()
+
+
+def test_members_of_the_group_read_and_change_nothing(service: DaemonProcess, connect: Connect) -> None:
+    client = connect(service)
+    path = client.path(client.selected(["0_0.pcd"]).cells[0])
+    before = os.stat(path)
+    found = attempts(path, MEMBER, GROUP)
+    assert found.pop("read") == 0
+    assert 0 not in found.values(), found
+    after = os.stat(path)
+    assert (before.st_size, before.st_mtime_ns, before.st_mode) == (
+        after.st_size,
+        after.st_mtime_ns,
+        after.st_mode,
+    )
+
+
+def test_others_are_refused_everything(service: DaemonProcess, connect: Connect) -> None:
+    client = connect(service)
+    path = client.path(client.selected(["0_0.pcd"]).cells[0])
+    found = attempts(path, STRANGER, STRANGER)
+    assert 0 not in found.values(), found
+
+
+CONNECT = "import socket, sys; socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
+
+
+@pytest.mark.parametrize(("uid", "gid", "works"), [(MEMBER, GROUP, True), (STRANGER, STRANGER, False)])
+def test_the_socket_and_the_statistics(service: DaemonProcess, uid: int, gid: int, works: bool) -> None:
+    python = os.path.realpath(sys.executable)
+    assert (as_user(uid, gid, python, "-I", "-c", CONNECT, service.endpoint).returncode == 0) == works
+    statistics = f"{service.shm_dir}/shmmap.{service.instance}.statistics"
+    assert (as_user(uid, gid, "cksum", statistics).returncode == 0) == works
+
+
+def test_without_a_group_nobody_else_reads(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    os.chmod(one.runtime_dir, 0o755)
+    os.chmod(one.shm_dir, 0o1777)
+    client = connect(one)
+    path = client.path(client.area(circle(10, 10, 1)).cells[0])
+    found = attempts(path, STRANGER, STRANGER)
+    assert 0 not in found.values(), found
+    python = os.path.realpath(sys.executable)
+    assert as_user(STRANGER, STRANGER, python, "-I", "-c", CONNECT, one.endpoint).returncode != 0
