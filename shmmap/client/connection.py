@@ -80,7 +80,7 @@ class Connection:
         self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
         self._monitor = self._socket.get_monitor_socket(
-            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_DISCONNECTED
         )
         # also when nobody calls close(), and at the end of the program
         sockets = (self._monitor, self._socket)
@@ -209,7 +209,8 @@ class Connection:
             event, _value = _EVENT.unpack(self._monitor.recv_multipart()[0])
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._handshakes += 1
-            else:
+            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL or not self._handshakes:
+                # a socket of a pattern that does not fit (SUB, say) hangs up without a word
                 raise ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")
 
 
