@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 __all__ = ["Scratch", "borrow_scratch"]
 
 _KEPT_BYTES: Final = 16 << 20  # larger sets of buffers are not kept
+_FIRST_BYTES: Final = 4 << 20  # from here on numpy asks for huge pages; only what is touched counts
 _ALIGNMENT_BYTES: Final = 64
 _idle: list[Scratch] = []
 
@@ -45,7 +46,7 @@ class Scratch:
         steps = [-(-size // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES for size in sizes]
         needed = sum(steps) + _ALIGNMENT_BYTES
         if len(self._memory) < needed:
-            self._memory = np.empty(needed, np.uint8)
+            self._memory = np.empty(max(needed, _FIRST_BYTES), np.uint8)
             self._start = -self._memory.ctypes.data % _ALIGNMENT_BYTES
         at = self._start
         arrays: list[NDArray[Any]] = []
