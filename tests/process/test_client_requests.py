@@ -1,0 +1,422 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The client library against a real daemon: every verb, its failures, restarts, threads and fork."""
+
+from __future__ import annotations
+
+import gc
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.client.connection import Connection
+from shmmap.errors import (
+    BadRequest,
+    LoadFailed,
+    NoAnswer,
+    ProtocolMismatch,
+    StaleSocket,
+    UnknownCell,
+)
+from shmmap.segment.attach import attach
+from tests.support.daemon_process import DaemonProcess, open_files
+from tests.support.divided_map import DividedMap, random_points
+
+Factory = Callable[..., DaemonProcess]
+
+
+def names(cells: object) -> list[str]:
+    return [Path(cell.id).name for cell in cells]  # type: ignore[attr-defined]
+
+
+def assert_bits(cell: shmmap.Cell, made: DividedMap) -> None:
+    """The cell's columns are the file's, bit by bit, by an independent reader."""
+    source = made.points(Path(cell.id).name)
+    xyz = np.stack([source["x"], source["y"], source["z"]], axis=1)
+    assert cell.xyz.tobytes() == xyz.tobytes()
+    assert cell["intensity"].tobytes() == source["intensity"].tobytes()
+    assert cell.box == made.box(Path(cell.id).name)
+    assert cell.points == len(xyz)
+
+
+def test_the_first_program(daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = daemon(divided_map.root)
+    monkeypatch.setenv("SHMMAP_ENDPOINT", one.endpoint)
+    cells = shmmap.connect().around(3.0, 4.0, radius=50)
+    assert sum(len(cell.xyz) for cell in cells) == 500 * len(divided_map.in_circle(3.0, 4.0, 50))
+
+
+def test_areas(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint, name="areas") as client:
+        circle = client.area(shmmap.Circle(5.0, -7.0, 33.0))
+        assert circle.complete
+        assert names(circle) == divided_map.in_circle(5.0, -7.0, 33.0)
+        for cell in circle:
+            assert_bits(cell, divided_map)
+            cell.verify()
+        square = client.area(shmmap.AutowareSquare(5.0, -7.0, 33.0))
+        assert names(square) == divided_map.in_square(5.0, -7.0, 33.0)
+        assert names(client.area(shmmap.Box(1.0, 1.0, 2.0, 2.0))) == ["0_0.pcd"]
+        assert client.around(0, 0, 50, z=(100.0, 200.0)).cells == (), "no point is as high"
+        assert circle.epoch == client.epoch == client.welcome.epoch
+        assert circle.map_version == client.map_version
+
+
+def test_cells_are_mapped_once(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        first = client.around(0, 0, 30)
+        again = client.around(0, 0, 30)
+        assert first.cells == again.cells
+        assert all(a is b for a, b in zip(first, again, strict=True))
+
+
+def test_differential(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        held = {cell.id: cell for cell in client.around(-30, -30, 30)}
+        for x in range(-30, 40, 7):
+            before = set(held)
+            inside = {divided_map.id(name) for name in divided_map.in_circle(x, x / 2, 30)}
+            answer = client.differential(shmmap.Circle(x, x / 2, 30), held.values())
+            assert {cell.id for cell in answer} == inside - before
+            assert answer.removed == tuple(cell_id for cell_id in held if cell_id not in inside)
+            for cell_id in answer.removed:
+                del held[cell_id]
+            held.update({cell.id: cell for cell in answer})
+            assert set(held) == inside
+
+
+def test_differential_with_ids_by_hand(daemon: Factory, divided_map: DividedMap) -> None:
+    area = shmmap.Circle(10, 10, 5)
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        (cell,) = client.area(area)
+        gone = divided_map.id("-60_-60.pcd")
+        answer = client.differential(area, ["nowhere", cell.id, gone])
+        assert (answer.cells, answer.removed) == ((), ("nowhere", gone))
+        assert client.differential(area, [(cell.id, cell.version)]).cells == ()
+        assert names(client.differential(area, [(cell.id, cell.version + 1)])) == names([cell])
+        assert client.differential(area, [cell], by_name=True).cells == ()
+
+
+def test_selected_keeps_order_and_duplicates(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        wanted = ["20_20.pcd", divided_map.id("0_0.pcd"), "none.pcd", "20_20.pcd", "-20_0.pcd"]
+        answer = client.selected(wanted)
+        assert names(answer) == ["20_20.pcd", "0_0.pcd", "20_20.pcd", "-20_0.pcd"]
+        assert answer[0] is answer[2]
+        (failure,) = answer.failed
+        assert isinstance(failure, UnknownCell)
+        assert failure.cell_id == "none.pcd"
+        with pytest.raises(UnknownCell, match=r"none\.pcd"):
+            answer.raise_for_failures()
+
+
+def test_a_broken_cell_costs_only_itself(daemon: Factory, divided_map: DividedMap) -> None:
+    broken = divided_map.pcd_dir / "0_0.pcd"
+    broken.write_bytes(broken.read_bytes()[:-100])
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        answer = client.around(0, 0, 30)
+        assert set(names(answer)) == set(divided_map.in_circle(0, 0, 30)) - {"0_0.pcd"}
+        (failure,) = answer.failed
+        assert isinstance(failure, LoadFailed)
+        assert (failure.cell_id, failure.layer) == (divided_map.id("0_0.pcd"), "points")
+        assert not answer.complete
+
+
+def test_without_waiting_the_rest_is_pending(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        answer = client.around(0, 0, 30, wait=None)
+        assert set(names(answer)) | {Path(p.id).name for p in answer.pending} == set(
+            divided_map.in_circle(0, 0, 30)
+        )
+        assert answer.pending
+        assert client.around(0, 0, 30).complete
+
+
+def test_metadata_and_what_changed_since(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        listing = client.metadata()
+        assert [cell.id for cell in listing] == sorted(divided_map.id(name) for name in divided_map.corners)
+        assert listing[0].box == divided_map.box(Path(listing[0].id).name)
+        assert listing[3:5] == list(listing)[3:5]
+        inside = client.metadata(shmmap.Circle(0, 0, 25))
+        assert [Path(cell.id).name for cell in inside] == divided_map.in_circle(0, 0, 25)
+        rng = np.random.default_rng(5)
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(rng, (0, 0), 77))
+        divided_map.write_cell("80_80.pcd", (80, 80), random_points(rng, (80, 80), 5))
+        divided_map.remove_cell("-60_-60.pcd")
+        divided_map.write_metadata()
+        told = client.reload()
+        assert (told.changed, told.added, told.removed) == (1, 1, 1)
+        since = client.metadata(since=listing.map_version)
+        assert since.since_known
+        assert [Path(cell.id).name for cell in since] == ["0_0.pcd", "80_80.pcd"]
+        assert since.removed == (divided_map.id("-60_-60.pcd"),)
+        assert since.map_version == told.map_version != listing.map_version
+        assert len(client.metadata(since=since.map_version)) == 0
+        unknown = client.metadata(since=1)
+        assert not unknown.since_known
+        assert len(unknown) == len(divided_map.corners)
+
+
+def test_a_reload_brings_a_new_version_and_the_old_one_stays_readable(
+    daemon: Factory, divided_map: DividedMap
+) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        held = client.around(0, 0, 30)
+        old = next(cell for cell in held if cell.id.endswith("/0_0.pcd"))
+        copy = old.xyz.copy()
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(9), (0, 0), 321))
+        client.reload()
+        (new,) = answer = client.differential(shmmap.Circle(0, 0, 30), held)
+        assert answer.removed == ()
+        assert new.id == old.id
+        assert new.version != old.version
+        assert_bits(new, divided_map)
+        np.testing.assert_array_equal(old.xyz, copy)
+        old.verify()
+
+
+def test_show_stats_and_evict(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, name="mine") as client:
+        (cell,) = client.selected(["0_0.pcd"])
+        shown = client.show("0_0.pcd")
+        assert (shown.id, shown.version) == (cell.id, cell.version)
+        assert [segment.segment for segment in shown.segments] == [cell.segment]
+        assert shown.segments[0].holders[0].session == client.welcome.session
+        with pytest.raises(UnknownCell):
+            client.show("none.pcd")
+        (session,) = client.stats().sessions
+        assert (session.client, session.cells) == ("mine", 1)
+        assert client.evict(["0_0.pcd"]).pinned == 1
+        assert_bits(cell, divided_map)
+        del cell
+        gc.collect()
+        assert client.release() == 1
+        assert client.stats().sessions[0].cells == 0
+
+
+def test_a_handle_that_went_stale_is_asked_for_again(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evict everything just before the first attach, through another client of the same daemon."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
+        evicted: list[int] = []
+
+        def attach_late(*args: Any, **options: Any) -> Any:
+            if not evicted:
+                evicted.append(other.evict().freed)
+            return attach(*args, **options)
+
+        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+        answer = client.selected(["20_20.pcd", "0_0.pcd", "20_20.pcd"])
+        assert evicted
+        assert names(answer) == ["20_20.pcd", "0_0.pcd", "20_20.pcd"]
+        assert answer.complete
+        for cell in answer:
+            assert_bits(cell, divided_map)
+
+
+def test_handles_that_stay_stale_end_as_pending(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
+
+        def attach_late(*args: Any, **options: Any) -> Any:
+            other.evict()
+            return attach(*args, **options)
+
+        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+        answer = client.selected(["0_0.pcd"])
+        assert (answer.cells, answer.failed) == ((), ())
+        assert answer.pending == (shmmap.PendingLayer(divided_map.id("0_0.pcd"), "points"),)
+
+
+# --- the daemon's ends and beginnings -----------------------------------------------------------
+
+
+def test_views_and_client_survive_a_killed_and_restarted_daemon(
+    daemon: Factory, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        held = client.around(0, 0, 30)
+        epoch = client.epoch
+        one.kill()
+        for cell in held:
+            assert_bits(cell, divided_map)
+        one.start()
+        answer = client.differential(shmmap.Circle(0, 0, 30), held, by_name=True)
+        assert client.epoch != epoch
+        assert answer.epoch == client.epoch
+        assert (answer.cells, answer.removed) == ((), ())
+        assert client.stats().sessions[0].session == client.welcome.session
+
+
+def test_a_request_in_flight_at_a_killed_daemon_is_answered_by_the_next(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = daemon(divided_map.root)
+    sent = threading.Event()
+    send = Connection._send
+
+    def send_and_tell(connection: Connection, data: bytes) -> bool:
+        done = send(connection, data)
+        sent.set()
+        return done
+
+    with shmmap.connect(one.endpoint, timeout=60) as client, ThreadPoolExecutor(1) as pool:
+        one.send(signal.SIGSTOP)
+        monkeypatch.setattr(Connection, "_send", send_and_tell)
+        answer = pool.submit(client.around, 0, 0, 30)
+        assert sent.wait(60)
+        one.kill()
+        one.start()
+        assert names(answer.result(60)) == divided_map.in_circle(0, 0, 30)
+
+
+def test_a_stopped_daemon_is_no_answer_and_goes_on_later(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, timeout=0.3) as client:
+        before = client.around(0, 0, 30, wait=30)
+        one.send(signal.SIGSTOP)
+        with pytest.raises(NoAnswer, match=r"no answer within 0\.3 s"):
+            client.stats()
+        with pytest.raises(NoAnswer):
+            shmmap.connect(one.endpoint, connect_timeout=0.3)
+        one.send(signal.SIGCONT)
+        assert client.around(0, 0, 30, wait=30).cells == before.cells, (
+            "late replies are not taken for this one"
+        )
+
+
+def test_what_a_killed_daemon_leaves_is_a_stale_socket(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    one.kill()
+    with pytest.raises(StaleSocket):
+        shmmap.connect(one.endpoint)
+
+
+def test_another_major_version_is_refused(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = daemon(divided_map.root)
+    monkeypatch.setattr("shmmap.client.connection.PROTOCOL_VERSION", (2, 0))
+    with pytest.raises(ProtocolMismatch, match=r"2\.0"):
+        shmmap.connect(one.endpoint)
+
+
+# --- the client's own life ----------------------------------------------------------------------
+
+
+def test_views_outlive_the_client(daemon: Factory, divided_map: DividedMap) -> None:
+    client = shmmap.connect(daemon(divided_map.root).endpoint)
+    (cell,) = client.selected(["0_0.pcd"])
+    client.close()
+    client.close()
+    assert_bits(cell, divided_map)
+    with pytest.raises(BadRequest, match="closed"):
+        client.stats()
+
+
+def test_closing_ends_the_session_unless_something_is_held(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as watcher:
+        with shmmap.connect(one.endpoint, name="gone") as client:
+            client.around(0, 0, 10)
+        keeper = shmmap.connect(one.endpoint, name="keeper")
+        kept = keeper.selected(["0_0.pcd"])
+        keeper.close()
+        assert {row.client for row in watcher.stats().sessions} == {"", "keeper"}
+        assert kept.complete
+
+
+def test_a_client_that_nobody_closes_leaves_no_descriptor(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    before = set(open_files())
+    for _ in range(3):
+        cells = shmmap.connect(one.endpoint).around(0, 0, 10)
+        assert cells.complete
+    del cells
+    assert set(open_files()) == before
+
+
+def test_one_client_in_many_threads(daemon: Factory, divided_map: DividedMap) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint, timeout=30) as client:
+        start = threading.Barrier(6)
+
+        def ask(number: int) -> bool:
+            start.wait()
+            good = True
+            for i in range(20):
+                x = (number * 7 + i * 3) % 40 - 20.0
+                good &= names(client.around(x, -x, 20)) == divided_map.in_circle(x, -x, 20)
+                good &= client.stats().epoch == client.epoch
+            return good
+
+        with ThreadPoolExecutor(6) as pool:
+            assert all(pool.map(ask, range(6)))
+
+
+FORK = """
+import os, sys
+import shmmap
+client = shmmap.connect(sys.argv[1], name="fork")
+cells = client.around(0, 0, 30)
+total = float(sum(cell.xyz.astype("f8").sum() for cell in cells))
+session = client.welcome.session
+window = shmmap.MapWindow(client, 30)
+window.move_to(0, 0, wait=20)
+assert window.wait_until_current(20)
+pid = os.fork()
+if pid == 0:
+    code = 1
+    try:
+        assert float(sum(cell.xyz.astype("f8").sum() for cell in cells)) == total
+        assert len(window.cells) == len(cells)
+        try:
+            window.move_to(0, 0)
+        except shmmap.BadRequest as error:
+            assert "after the fork" in str(error)
+        else:
+            raise AssertionError("a window moved in the child")
+        mine = client.around(0, 0, 30)
+        assert [a is b for a, b in zip(mine, cells)] == [True] * len(cells)
+        assert client.welcome.session != session
+        stats = client.stats()
+        assert {row.pid for row in stats.sessions} == {os.getpid(), os.getppid()}, stats.sessions
+        with shmmap.MapWindow(client, 30) as own:
+            assert len(own.move_to(0, 0, wait=20).added) == len(cells)
+        del own, mine, cells
+        client.close()
+        code = 0
+    finally:
+        os._exit(code)
+assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+assert client.welcome.session == session
+assert client.around(0, 0, 30).cells == cells.cells
+assert client.welcome.session == session
+assert float(sum(cell.xyz.astype("f8").sum() for cell in cells)) == total
+window.close()
+print("good")
+"""
+
+
+def test_fork(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORK, one.endpoint],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "good\n"), done.stderr
+    assert done.stderr == ""
