@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which daemon the options mean: flags first, then ``SHMMAP_*`` variables, then the defaults."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shmmap.errors import NoSocket
+from shmmap.protocol.endpoint import DEFAULT_INSTANCE, endpoint_path, runtime_dirs, socket_path
+
+if TYPE_CHECKING:
+    from shmmap.client.client import Client
+    from shmmap.statistics.identity import DaemonIdentity
+    from shmmap.statistics.reader import Snapshot
+
+__all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
+
+_DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108
+
+
+def _setting(args: argparse.Namespace, name: str) -> str:
+    flag: str | None = getattr(args, name)
+    return flag if flag is not None else os.environ.get(f"SHMMAP_{name.upper()}", "")
+
+
+def endpoint(args: argparse.Namespace) -> str | None:
+    """Return the socket the options name; None means "look in the usual places"."""
+    if named := _setting(args, "endpoint"):
+        return endpoint_path(named)
+    directory, name = _setting(args, "runtime_dir"), _setting(args, "instance")
+    if directory:
+        return endpoint_path(socket_path(directory, name or DEFAULT_INSTANCE))
+    if name and name != DEFAULT_INSTANCE:
+        places = [socket_path(place, name) for place in runtime_dirs()]
+        return next((place for place in places if Path(place).exists()), places[0])
+    return None
+
+
+def instance(args: argparse.Namespace) -> str:
+    """Return the instance's name; where only an endpoint is given, it is the socket's name."""
+    if name := _setting(args, "instance"):
+        return name
+    named = _setting(args, "endpoint")
+    return Path(endpoint_path(named)).name.removesuffix(".sock") if named else DEFAULT_INSTANCE
+
+
+def shm_dir(args: argparse.Namespace) -> str:
+    """Return the directory the instance's segments are in."""
+    return _setting(args, "shm_dir") or _DEFAULT_SHM_DIR
+
+
+def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
+    """Read the daemon's statistics segment; nobody is asked, so a stopped daemon does not matter.
+
+    Raises
+    ------
+    NoSocket
+        There is no such segment: the daemon was never started, or was stopped.
+    """
+    from shmmap.statistics.reader import read_statistics
+
+    name, directory = instance(args), shm_dir(args)
+    found = read_statistics(name, directory)
+    if found.identity is None:
+        raise NoSocket(
+            f"no daemon runs as instance {name!r} with segments in {directory}",
+            hint="start one with `shmmap serve MAP`, or say which with --instance and --shm-dir",
+        )
+    return found, found.identity
+
+
+def connect(args: argparse.Namespace) -> Client:
+    """Connect to the daemon; without ``--timeout`` the library's own deadlines hold."""
+    import shmmap
+
+    deadlines = {} if args.timeout is None else {"timeout": args.timeout, "connect_timeout": args.timeout}
+    return shmmap.connect(
+        endpoint(args), **deadlines, name="shmmap", shm_dir=_setting(args, "shm_dir") or None
+    )

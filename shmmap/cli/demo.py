@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap demo``: the whole thing on a generated town, without a map or any configuration."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_json_option, add_verb
+from shmmap.cli.output import Column, format_bytes, format_duration, print_json, print_table
+from shmmap.errors import BadRequest
+
+if TYPE_CHECKING:
+    from shmmap.testing.demo import DemoResult, DriveResult
+
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+  {"town": {"cells", "points", "file_bytes", "build_s"},
+   "shared": DRIVE, "private": DRIVE,
+   "wire": {"requests", "request_bytes", "reply_bytes", "handles"}, "svg": path, "seconds"}
+  DRIVE: {"processes", "cells", "points", "map_bytes": of one consumer's window,
+          "start_s": until all have their first window,
+          "updates": how often a consumer got new cells after that; these are about updates only:
+          "follow_s", "follow_max_s": how long its control loop waited, median and longest,
+          "complete_s": until the new cells were there, median,
+          "warm_updates", "warm_complete_s": those with all cells in memory already (null: none),
+          "handed_bytes": columns that all consumers got,
+          "process_bytes": memory of the processes without shared memory,
+          "shm_bytes": shared memory, counted once, "total_bytes": both,
+          "pss_bytes", "private_bytes": as the kernel counts them"""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "demo",
+        run,
+        help="see it work: no map needed, under a minute",
+        description="Build a town, start a daemon, drive through it with four processes, and "
+        "compare that with four private copies.",
+        json=_JSON,
+    )
+    parser.add_argument("--svg", metavar="FILE", help="where the picture goes (default: ./shmmap-demo.svg)")
+    parser.add_argument("--keep-map", metavar="DIR", help="build the map in DIR, and leave it there")
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the demonstration and print what it measured."""
+    import time
+
+    from shmmap.cli.demo_progress import progress_for
+    from shmmap.testing.demo import DemoSettings, run_demo
+    from shmmap.testing.interrupts import signals_interrupt
+
+    picture = _picture_path(args.svg)
+    started_s = time.monotonic()
+    with signals_interrupt(), progress_for(quiet=args.json) as progress:
+        result = run_demo(DemoSettings(), progress, map_dir=args.keep_map)
+    picture.write_text(_draw(result), encoding="utf-8")
+    duration_s = time.monotonic() - started_s
+    if args.json:
+        print_json(_as_json(result, str(picture), duration_s))
+    else:
+        _print_text(result)
+        print(f"{format_duration(duration_s)} in all.  Picture of town, route and resident cells: {picture}")
+        if args.keep_map:
+            print(f"Serve the town yourself: shmmap serve {args.keep_map}")
+    return 0
+
+
+def _picture_path(named: str | None) -> Path:
+    """Find out before the work begins where the picture can be written."""
+    path = Path(named or "shmmap-demo.svg").absolute()
+    if (
+        path.parent.is_dir()
+        and not path.is_dir()
+        and os.access(path if path.exists() else path.parent, os.W_OK)
+    ):
+        return path
+    if named:
+        raise BadRequest(f"{path} cannot be written", hint="give another --svg FILE")
+    return Path(tempfile.gettempdir(), path.name)
+
+
+def _as_json(result: DemoResult, picture: str, duration_s: float) -> dict[str, object]:
+    return {
+        "town": {
+            "cells": result.town.cells,
+            "points": result.town.points,
+            "file_bytes": result.town.file_bytes,
+            "build_s": round(result.town.build_s, 3),
+        },
+        "shared": _drive_as_json(result.shared),
+        "private": _drive_as_json(result.private),
+        "wire": {
+            "requests": result.traffic.requests,
+            "request_bytes": result.traffic.request_bytes,
+            "reply_bytes": result.traffic.reply_bytes,
+            "handles": result.traffic.handles,
+        },
+        "svg": picture,
+        "seconds": round(duration_s, 3),
+    }
+
+
+def _drive_as_json(drive: DriveResult) -> dict[str, object]:
+    return {
+        "processes": drive.processes,
+        "cells": drive.cells,
+        "points": drive.points,
+        "map_bytes": drive.map_bytes,
+        "start_s": round(drive.start_s, 6),
+        "updates": drive.updates,
+        "follow_s": _seconds(drive.follow_s),
+        "follow_max_s": _seconds(drive.follow_max_s),
+        "complete_s": _seconds(drive.complete_s),
+        "warm_updates": drive.warm_updates,
+        "warm_complete_s": _seconds(drive.warm_complete_s),
+        "handed_bytes": drive.handed_bytes,
+        "process_bytes": drive.memory.own_bytes,
+        "shm_bytes": drive.shm_bytes,
+        "total_bytes": drive.total_bytes,
+        "pss_bytes": drive.memory.pss_bytes,
+        "private_bytes": drive.memory.private_bytes,
+    }
+
+
+def _seconds(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 6)
+
+
+def _print_text(result: DemoResult) -> None:
+    shared, private = result.shared, result.private
+    wire_bytes = result.traffic.request_bytes + result.traffic.reply_bytes
+    rows = [
+        ["processes", f"4 and {shared.processes - 4} of the daemon", "4"],
+        ["cells around the vehicle", f"{shared.cells}", f"{private.cells}"],
+        ["points in them", f"{shared.points / 1e6:.1f} million", f"{private.points / 1e6:.1f} million"],
+        ["shared memory, window and spare", format_bytes(shared.shm_bytes), "none"],
+        [
+            "memory of the processes",
+            format_bytes(shared.memory.own_bytes),
+            format_bytes(private.memory.own_bytes),
+        ],
+        ["all memory", format_bytes(shared.total_bytes), format_bytes(private.total_bytes)],
+        ["until all four have a window", format_duration(shared.start_s), format_duration(private.start_s)],
+        [
+            "an update holds the vehicle up",
+            format_duration(shared.follow_s),
+            format_duration(private.follow_s),
+        ],
+        ["... at most", format_duration(shared.follow_max_s), format_duration(private.follow_max_s)],
+        [
+            "new cells are there after",
+            format_duration(shared.complete_s),
+            format_duration(private.complete_s),
+        ],
+    ]
+    if shared.warm_updates:
+        rows.append(["... if in shared memory already", format_duration(shared.warm_complete_s), "-"])
+    rows.append(["messages, all together", format_bytes(wire_bytes), "-"])
+    print()
+    print_table(
+        (Column(""), Column("ONE SHARED COPY", "right"), Column("FOUR PRIVATE COPIES", "right")), rows
+    )
+    times_less = private.total_bytes / shared.total_bytes
+    print(
+        f"{times_less:.1f} times less memory.  In {len(result.town.route)} poses four processes got"
+        f" {format_bytes(shared.handed_bytes)} of points through {format_bytes(wire_bytes)} of messages."
+    )
+    print("Memory as the kernel counts it (/proc/PID/smaps_rollup), the daemon and its workers included.")
+
+
+def _draw(result: DemoResult) -> str:
+    from shmmap.cli.picture import CellSquare, Raster, Vehicle, top_view_svg
+
+    town = result.town
+    states = {row.box: row for row in result.resident}
+    cells = []
+    for box in town.boxes:
+        row = states.get(box)
+        title = f"{box[0]:g}, {box[1]:g}" + (f": {row.points:,} points, {row.state}" if row else "")
+        cells.append(CellSquare(box, row.state if row else "", title))
+    last = town.route[-1]
+    resident = sum(1 for cell in cells if cell.state == "resident")
+    return top_view_svg(
+        town.bounds,
+        cells,
+        title=f"A generated town: {town.cells} cells, {town.points / 1e6:.1f} million points",
+        note=f"At the end of the drive {resident} cells are in shared memory, once for all processes:"
+        f" {format_bytes(result.shared.shm_bytes)}.",
+        raster=Raster(town.bounds, town.picture_png),
+        driven=[(pose.x, pose.y) for pose in town.route],
+        vehicle=Vehicle(last.x, last.y, last.heading, result.settings.radius),
+    )

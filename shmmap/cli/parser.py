@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The grammar of the command line: every verb, and how wrong usage is answered."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, Final, NoReturn
+
+from shmmap.cli import (
+    clients,
+    demo,
+    evict,
+    export,
+    health,
+    inspect,
+    ls,
+    query,
+    reload,
+    serve,
+    show,
+    status,
+    version,
+)
+
+__all__ = ["VERBS", "build_parser", "join_negative_values"]
+
+VERBS: Final = (
+    demo,
+    serve,
+    status,
+    ls,
+    show,
+    clients,
+    query,
+    export,
+    inspect,
+    reload,
+    evict,
+    health,
+    version,
+)
+
+_NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z"})
+_NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that complains as the rest of the program does: what is wrong, then a hint."""
+
+    def __init__(self, **settings: Any) -> None:
+        # an abbreviation that works today would break with tomorrow's options
+        super().__init__(**settings, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message}\nhint: {self.prog} --help", file=sys.stderr)
+        sys.exit(2)
+
+
+def join_negative_values(words: Sequence[str]) -> list[str]:
+    """Write ``--circle -5,3,40`` as ``--circle=-5,3,40``.
+
+    argparse takes a word that starts with a minus for an option unless it is a single number.
+    """
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] in _NUMBER_OPTIONS and _NEGATIVE_NUMBERS.fullmatch(word):
+            joined[-1] = f"{joined[-1]}={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser; the namespace it gives has ``run``, the verb's function."""
+    parser = _Parser(
+        prog="shmmap",
+        description="Serve a vehicle's point-cloud map to every process of the machine from one copy in "
+        "shared memory.",
+        epilog="Try `shmmap demo`: it needs no map.  `shmmap VERB --help` explains a verb and its JSON.",
+    )
+    parser.add_argument("--version", action="version", version=f"shmmap {version.installed_version()}")
+    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_Parser)
+    for verb in VERBS:
+        verb.add_parser(subparsers)
+    return parser

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A top view of a map as SVG: cells and their state, a route, a vehicle and its window.
+
+The picture is one file without references: a raster of the points, where there is one, is embedded.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+from xml.sax.saxutils import escape
+
+__all__ = ["CellSquare", "Raster", "Vehicle", "top_view_svg"]
+
+BoxTuple: TypeAlias = tuple[float, float, float, float]
+
+WIDTH_PX: Final = 960.0
+MARGIN_PX: Final = 16.0
+CAPTION_PX: Final = 66.0
+
+_STYLE: Final = """
+  text { font-family: system-ui, "DejaVu Sans", sans-serif; font-size: 14px; fill: #1f2933; }
+  .title { font-size: 17px; font-weight: 600; }
+  .cell { fill: none; stroke: #52606d; stroke-opacity: .28; stroke-width: .6; }
+  .resident { fill: #0b7285; fill-opacity: .20; stroke: #0b7285; stroke-opacity: .75; stroke-width: .9; }
+  .stale { fill: #e8590c; fill-opacity: .30; stroke: #e8590c; stroke-width: .9; }
+  .zombie { fill: #868e96; fill-opacity: .40; stroke: #495057; stroke-width: .9; stroke-dasharray: 3 2; }
+  .route { fill: none; stroke: #c92a2a; stroke-width: 2.4; stroke-linejoin: round; stroke-linecap: round; }
+  .ahead { stroke-dasharray: 1 6; }
+  .window { fill: none; stroke: #c92a2a; stroke-width: 1.6; stroke-dasharray: 7 5; }
+  .vehicle { fill: #c92a2a; stroke: #fff; stroke-width: 1.5; }
+  .scale { stroke: #1f2933; stroke-width: 2; fill: none; }
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class CellSquare:
+    """One cell: its box (metres), its state (resident, stale, zombie or empty) and a tooltip."""
+
+    box: BoxTuple
+    state: str = ""
+    title: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """A PNG that fills ``box`` (metres), north up."""
+
+    box: BoxTuple
+    png: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """Where the vehicle is (metres), where it heads (radians from x to y), how far it looks."""
+
+    x: float
+    y: float
+    heading: float
+    radius: float
+
+
+class _Page:
+    """Turns metres (y up) into pixels (y down)."""
+
+    def __init__(self, bounds: BoxTuple) -> None:
+        self.min_x, self.min_y, self.max_x, self.max_y = bounds
+        span_x = max(self.max_x - self.min_x, 1e-9)
+        self.scale = (WIDTH_PX - 2 * MARGIN_PX) / span_x
+        self.map_height = (self.max_y - self.min_y) * self.scale
+        self.height = self.map_height + 2 * MARGIN_PX + CAPTION_PX
+
+    def x(self, metres: float) -> float:
+        return MARGIN_PX + (metres - self.min_x) * self.scale
+
+    def y(self, metres: float) -> float:
+        return MARGIN_PX + (self.max_y - metres) * self.scale
+
+    def rectangle(self, box: BoxTuple) -> str:
+        width, height = (box[2] - box[0]) * self.scale, (box[3] - box[1]) * self.scale
+        return f'x="{self.x(box[0]):.1f}" y="{self.y(box[3]):.1f}" width="{width:.1f}" height="{height:.1f}"'
+
+    def points(self, line: Iterable[tuple[float, float]]) -> str:
+        return " ".join(f"{self.x(x):.1f},{self.y(y):.1f}" for x, y in line)
+
+
+def top_view_svg(
+    bounds: BoxTuple,
+    cells: Sequence[CellSquare],
+    *,
+    title: str,
+    note: str = "",
+    raster: Raster | None = None,
+    driven: Sequence[tuple[float, float]] = (),
+    ahead: Sequence[tuple[float, float]] = (),
+    vehicle: Vehicle | None = None,
+) -> str:
+    """Return the picture.
+
+    Parameters
+    ----------
+    bounds
+        What the picture shows, metres, map frame.
+    cells
+        Drawn in order; those with a state on top of those without.
+    title, note
+        Two lines below the map.
+    raster
+        The ground: points seen from above.
+    driven, ahead
+        The route behind and before the vehicle, (x, y) each, metres.
+    """
+    page = _Page(bounds)
+    parts = [
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH_PX:.0f}" height="{page.height:.0f}"'
+            f' viewBox="0 0 {WIDTH_PX:.0f} {page.height:.0f}" role="img">'
+        ),
+        f"<title>{escape(title)}</title>",
+        f"<style>{_STYLE}</style>",
+        '<rect width="100%" height="100%" fill="#ffffff"/>',
+        f'<clipPath id="map"><rect {page.rectangle(bounds)}/></clipPath>',
+        '<g clip-path="url(#map)">',
+    ]
+    if raster is not None:
+        data = base64.b64encode(raster.png).decode("ascii")
+        parts.append(
+            f'<image {page.rectangle(raster.box)} preserveAspectRatio="none" image-rendering="auto"'
+            f' href="data:image/png;base64,{data}"/>'
+        )
+    for cell in sorted(cells, key=lambda cell: bool(cell.state)):
+        tooltip = f"<title>{escape(cell.title)}</title>" if cell.title else ""
+        parts.append(f'<rect class="cell {cell.state}" {page.rectangle(cell.box)}>{tooltip}</rect>')
+    if ahead:
+        parts.append(f'<polyline class="route ahead" points="{page.points(ahead)}"/>')
+    if driven:
+        parts.append(f'<polyline class="route" points="{page.points(driven)}"/>')
+    if vehicle is not None:
+        parts += _vehicle(page, vehicle)
+    parts += [
+        "</g>",
+        *_caption(page, title, note, {cell.state for cell in cells}, bool(driven)),
+        "</svg>",
+        "",
+    ]
+    return "\n".join(parts)
+
+
+def _vehicle(page: _Page, vehicle: Vehicle) -> list[str]:
+    x, y = page.x(vehicle.x), page.y(vehicle.y)
+    turn = -math.degrees(vehicle.heading)
+    return [
+        f'<circle class="window" cx="{x:.1f}" cy="{y:.1f}" r="{vehicle.radius * page.scale:.1f}"/>',
+        (
+            f'<path class="vehicle" transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})"'
+            ' d="M 12 0 L -8 7 L -4 0 L -8 -7 Z"/>'
+        ),
+    ]
+
+
+def _caption(page: _Page, title: str, note: str, states: set[str], with_route: bool) -> list[str]:
+    top = page.map_height + 2 * MARGIN_PX
+    bar_m = _round_length(0.18 * (page.max_x - page.min_x))
+    right = WIDTH_PX - MARGIN_PX
+    left = right - bar_m * page.scale
+    parts = [
+        f'<text class="title" x="{MARGIN_PX:.0f}" y="{top + 12:.0f}">{escape(title)}</text>',
+        f'<text x="{MARGIN_PX:.0f}" y="{top + 34:.0f}">{escape(note)}</text>',
+        f'<path class="scale" d="M {left:.1f} {top + 42:.0f} v 6 H {right:.1f} v -6"/>',
+        f'<text x="{(left + right) / 2:.1f}" y="{top + 65:.0f}" text-anchor="middle">{bar_m:g} m</text>',
+    ]
+    x, y = MARGIN_PX, top + 58
+    for label, symbol in _legend(states, with_route):
+        parts.append(f'<g transform="translate({x:.0f} {y:.0f})">{symbol}<text x="26">{label}</text></g>')
+        x += 44 + 7.6 * len(label)
+    return parts
+
+
+def _legend(states: set[str], with_route: bool) -> list[tuple[str, str]]:
+    square = '<rect class="cell {}" y="-11" width="16" height="13"/>'
+    names = {
+        "": "cell on disk",
+        "resident": "cell in shared memory",
+        "stale": "stale cell",
+        "zombie": "zombie",
+    }
+    entries = [(label, square.format(state)) for state, label in names.items() if state in states]
+    if with_route:
+        entries.append(("route driven", '<path class="route" d="M 0 -5 h 18"/>'))
+        entries.append(("window", '<path class="window" d="M 0 -5 h 19"/>'))
+    return entries
+
+
+def _round_length(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above ``length``."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(step * power for step in (1, 2, 5) if step * power <= length)

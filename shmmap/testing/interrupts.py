@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ctrl-C at the wrong moment: held back while a process is started or something is cleaned up."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator
+from types import FrameType
+from typing import Final
+
+__all__ = ["ENDINGS", "interrupts_later", "scratch_directory", "signals_interrupt"]
+
+ENDINGS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals by which people and systems end a program."""
+
+
+@contextlib.contextmanager
+def interrupts_later() -> Iterator[None]:
+    """Hold back signals that end the program until the block is done.
+
+    An interrupt inside `subprocess.Popen` would lose the child it has just started.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        del frame
+        held.append(number)
+
+    before = {number: signal.signal(number, hold) for number in ENDINGS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if held:
+            signal.raise_signal(held[0])
+
+
+@contextlib.contextmanager
+def signals_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does; after the first, cleaning up goes on in peace."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        for again in ENDINGS:
+            signal.signal(again, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in ENDINGS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def scratch_directory(prefix: str, parent: str | None = None) -> Iterator[str]:
+    """Make a temporary directory, and remove it with all it holds whatever happens.
+
+    Parameters
+    ----------
+    prefix
+        Start of its name.
+    parent
+        Where; by default where `tempfile` puts things.
+    """
+    with interrupts_later():
+        path = tempfile.mkdtemp(prefix=prefix, dir=parent)
+    try:
+        yield path
+    finally:
+        with interrupts_later():
+            shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of errors: exit code, one line, a hint; no traceback but for defects."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shmmap import errors
+from shmmap.cli import version
+from shmmap.cli.entry import main
+
+EXIT_CODES = {
+    "ConfigError": 78,
+    "BadRequest": 2,
+    "MapDataError": 65,
+    "MapMissing": 66,
+    "NoSocket": 69,
+    "SocketPermission": 69,
+    "StaleSocket": 69,
+    "NoAnswer": 69,
+    "ProtocolMismatch": 76,
+    "InstanceBusy": 75,
+    "OverBudget": 1,
+    "UnknownCell": 1,
+    "InternalError": 70,
+}
+
+
+def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def run(args: argparse.Namespace) -> int:
+        raise error
+
+    monkeypatch.setattr(version, "run", run)
+
+
+@pytest.mark.parametrize(("name", "code"), EXIT_CODES.items())
+def test_exit_codes_of_the_contract(
+    name: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fail_with(monkeypatch, getattr(errors, name)("it broke", hint="mend it"))
+    assert main(["version"]) == code
+    assert capsys.readouterr() == ("", "shmmap: it broke\nhint: mend it\n")
+
+
+def test_no_hint_no_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    fail_with(monkeypatch, errors.MapMissing("no map at /nowhere"))
+    assert main(["version"]) == 66
+    assert capsys.readouterr().err == "shmmap: no map at /nowhere\n"
+
+
+def test_a_defect_shows_its_traceback_and_asks_to_report(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fail_with(monkeypatch, ZeroDivisionError("oops"))
+    assert main(["version"]) == 70
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert "shmmap: internal error: ZeroDivisionError: oops\nhint: " in said
+    assert "report" in said.splitlines()[-1]
+
+
+def test_ctrl_c_is_quiet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    fail_with(monkeypatch, KeyboardInterrupt())
+    assert main(["version"]) == 130
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_reader_that_went_away_is_no_error() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "shmmap.cli", "version"],
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_version_and_its_json(capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    import shmmap
+
+    assert main(["version", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["shmmap"] == shmmap.__version__
+    assert all(re.fullmatch(r"\d+\.\d+", told[name]) for name in ("protocol", "layout"))
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"shmmap {shmmap.__version__}\n"
+
+
+@pytest.mark.parametrize("verb", ["status", "ls", "health"])
+def test_no_daemon_is_69_and_says_where_it_looked(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SHMMAP_INSTANCE", raising=False)
+    assert main([verb, "--shm-dir", str(tmp_path), "--endpoint", "/somewhere/town.sock"]) == 69
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "'town'" in said.err
+    assert str(tmp_path) in said.err

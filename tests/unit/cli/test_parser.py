@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The grammar of the command line: verbs, numbers, areas, and what wrong usage prints."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from shmmap.cli.entry import main
+from shmmap.cli.options import area_from, numbers, seconds
+from shmmap.cli.parser import build_parser, join_negative_values
+from shmmap.errors import BadRequest
+from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
+
+CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evict"]
+CONTRACT += ["inspect", "export", "demo", "health", "version"]
+
+
+def parse(*words: str) -> argparse.Namespace:
+    return build_parser().parse_args(join_negative_values(words))
+
+
+def test_help_lists_exactly_the_verbs_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    listed = [
+        line.split()[0]
+        for line in capsys.readouterr().out.split("verbs:")[1].splitlines()
+        if line.startswith("    ") and line[4] != " "
+    ]
+    assert sorted(set(listed) - {"VERB"}) == sorted(CONTRACT)
+
+
+@pytest.mark.parametrize("verb", CONTRACT)
+def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: shmmap {verb}")
+    assert ("--json" in text) == ("JSON (fields may be added" in text)
+
+
+@pytest.mark.parametrize(
+    ("words", "circle"),
+    [
+        (["--circle", "-5,3,40"], [-5.0, 3.0, 40.0]),
+        (["--circle=-5,3,40"], [-5.0, 3.0, 40.0]),
+        (["--circle", "-5.5,-3e2,40"], [-5.5, -300.0, 40.0]),
+        (["--circle", "-.5,3,40"], [-0.5, 3.0, 40.0]),
+        (["--circle", "5,-3,40"], [5.0, -3.0, 40.0]),
+    ],
+)
+def test_areas_with_negative_numbers(words: list[str], circle: list[float]) -> None:
+    assert parse("query", *words).circle == circle
+
+
+def test_negative_numbers_are_joined_only_behind_their_options() -> None:
+    assert join_negative_values(["--id", "-5,3"]) == ["--id", "-5,3"]
+    assert join_negative_values(["--z", "-2,3", "-1"]) == ["--z=-2,3", "-1"]
+    assert join_negative_values(["--circle", "--json"]) == ["--circle", "--json"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["query", "--circle", "1,2"],
+        ["query", "--circle", "1,2,x"],
+        ["query", "--circle", "1,2,nan"],
+        ["query", "--box", "1,2,3"],
+        ["query", "--circle", "1,2,3", "--square", "1,2,3"],
+        ["query"],
+        ["query", "--circ", "1,2,3"],
+        ["status", "--timeout", "never"],
+        ["nonsense"],
+        [],
+    ],
+)
+def test_wrong_usage_exits_2_and_hints_at_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    complaint, hint = said.err.splitlines()
+    assert complaint.startswith("shmmap")
+    assert hint.startswith("hint: shmmap")
+    assert hint.endswith("--help")
+
+
+def test_area_from_options() -> None:
+    assert area_from(parse("query", "--circle", "1,2,3")) == Circle(1, 2, 3)
+    assert area_from(parse("query", "--square", "1,2,3", "--z", "-4,5")) == AutowareSquare(
+        1, 2, 3, ZRange(-4, 5)
+    )
+    assert area_from(parse("query", "--box", "-1,-2,3,4")) == Box(-1, -2, 3, 4)
+    assert area_from(parse("query", "--id", "a")) is None
+    with pytest.raises(BadRequest, match="--z needs an area"):
+        area_from(parse("query", "--id", "a", "--z", "0,1"))
+
+
+@pytest.mark.parametrize("words", [["--circle", "1,2,-3"], ["--box", "3,0,1,1"], ["--circle", "1,inf,3"]])
+def test_impossible_areas_exit_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", *words]) == 2
+    assert capsys.readouterr().err.startswith("shmmap: ")
+
+
+def test_numbers_and_seconds() -> None:
+    assert numbers("-1,2e3", "A,B") == [-1.0, 2000.0]
+    assert seconds("0.5") == 0.5
+    for text in ("-1", "inf", "nan", "x", ""):
+        with pytest.raises(argparse.ArgumentTypeError):
+            seconds(text)

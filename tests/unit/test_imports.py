@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Imports point one way, stay light where they must, and every ``__all__`` is true."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import shmmap
+
+PACKAGE = Path(shmmap.__file__).parent
+
+LAYERS = {
+    # part: what it may import besides itself
+    "errors": set[str](),
+    "columns": set[str](),
+    "geometry": {"errors"},
+    "formats": {"errors", "columns", "geometry"},
+    "segment": {"errors", "columns", "geometry"},
+    "protocol": {"errors", "columns", "geometry"},
+    "statistics": {"errors", "columns", "geometry", "segment"},
+    "layers": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
+    "origin": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
+    "daemon": {
+        "errors", "columns", "geometry", "formats", "segment", "protocol", "statistics", "layers", "origin",
+    },
+    "client": {"errors", "columns", "geometry", "segment", "protocol"},
+}  # fmt: skip
+
+CLIENT_PACKAGES = {"numpy", "zmq", "posix_ipc", "msgspec"}
+HEAVY = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
+
+
+def modules() -> list[str]:
+    return sorted(
+        m.name for m in pkgutil.walk_packages([str(PACKAGE)], "shmmap.") if not m.name.endswith("__main__")
+    )
+
+
+def source(module: str) -> Path:
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def shmmap_imports(tree: ast.AST) -> Iterator[str]:
+    """Every part of shmmap that a tree imports, wherever in the code; what only types need is left out."""
+    only_types = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in only_types:
+            continue
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            parts = name.split(".")
+            if parts[0] == "shmmap" and len(parts) > 1 and not parts[1].startswith("__"):
+                yield parts[1]
+
+
+@pytest.mark.parametrize("module", modules())
+def test_imports_point_one_way(module: str) -> None:
+    part = module.split(".")[1]
+    used = set(shmmap_imports(ast.parse(source(module).read_text(encoding="utf-8")))) - {part}
+    if part in LAYERS:
+        assert used <= LAYERS[part], f"{module} may not import {sorted(used - LAYERS[part])}"
+    elif not module.startswith("shmmap.cli.demo") and part != "testing":
+        assert "testing" not in used, f"{module} may not import shmmap.testing"
+
+
+@pytest.mark.parametrize("module", modules())
+def test_all_is_sorted_and_true(module: str) -> None:
+    loaded = importlib.import_module(module)
+    names = getattr(loaded, "__all__", None)
+    if names is None:
+        assert source(module).name in {"__init__.py", "__main__.py"}, f"{module} has no __all__"
+        return
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert hasattr(loaded, name), f"{module}.__all__ names {name}, which does not exist"
+
+
+def test_every_module_starts_with_its_licence() -> None:
+    for path in [*PACKAGE.rglob("*.py"), *Path(__file__).parents[1].rglob("*.py")]:
+        if path.stat().st_size:
+            assert path.read_text(encoding="utf-8").startswith("# SPDX-License-Identifier: Apache-2.0\n"), (
+                path
+            )
+
+
+def loaded_after(code: str) -> set[str]:
+    """Top-level modules that are loaded after running ``code`` in a fresh interpreter."""
+    program = f"import sys, json\n{code}\njson.dump(sorted(sys.modules), sys.stdout)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return {name.split(".")[0] for name in json.loads(done.stdout)}
+
+
+def test_client_loads_nothing_heavy() -> None:
+    loaded = loaded_after(
+        "import shmmap, shmmap.segment.attach, shmmap.client\nshmmap.connect, shmmap.MapWindow"
+    )
+    assert loaded >= CLIENT_PACKAGES
+    assert not loaded & HEAVY
+
+
+def test_import_shmmap_alone_loads_no_package() -> None:
+    before = loaded_after("")
+    assert not (loaded_after("import shmmap") - before) & (HEAVY | CLIENT_PACKAGES)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["status", "--help"], ["ls", "--help"], ["query", "--help"]])
+def test_command_line_starts_without_packages(words: list[str]) -> None:
+    code = (
+        "import contextlib, io\nfrom shmmap.cli import main\n"
+        f"with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()): main({words!r})"
+    )
+    assert not loaded_after(code) & (HEAVY | CLIENT_PACKAGES)
+
+
+@pytest.mark.parametrize("verb", ["status", "ls", "health"])
+def test_statistics_verbs_need_no_package(verb: str, tmp_path: Path) -> None:
+    code = (
+        "import contextlib, io\nfrom shmmap.cli import main\n"
+        "with contextlib.redirect_stderr(io.StringIO()):\n"
+        f"  assert main([{verb!r}, '--shm-dir', {str(tmp_path)!r}]) == 69"
+    )
+    assert not loaded_after(code) & (HEAVY | CLIENT_PACKAGES)
