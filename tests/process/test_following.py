@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Eight processes follow a drive differentially: right cells, right bytes, at every step.
+
+What each step must bring is computed here from the files and their corners alone.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.process.conftest import DaemonFactory
+from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.following_client import FollowingClient
+from tests.support.pcd_files import read_pcd, write_pcd
+from tests.support.raw_client import RawClient
+
+Connect = Callable[..., RawClient]
+Pose = tuple[float, float]
+PROCESSES = 8
+
+
+@pytest.fixture
+def followers() -> Iterator[Callable[[str], list[FollowingClient]]]:
+    """Start eight clients, half of them with a window, half asking themselves."""
+    started: list[FollowingClient] = []
+
+    def start(endpoint: str) -> list[FollowingClient]:
+        modes = ("differential", "window") * (PROCESSES // 2)
+        started.extend(FollowingClient(endpoint, mode) for mode in modes)
+        return started
+
+    yield start
+    for client in started:
+        client.kill()
+
+
+def written_map(root: Path) -> DividedMap:
+    """Read back a map that the project's own writer made: corners from its YAML."""
+    made = DividedMap(root)
+    for line in (root / "pointcloud_map_metadata.yaml").read_text().splitlines():
+        name, value = line.rsplit(":", 1)
+        if name.endswith(".pcd"):
+            x, y = value.strip(" []").split(",")
+            made.corners[name.strip("'\"")] = (int(x), int(y))
+    return made
+
+
+def cut(columns: dict[str, np.ndarray], out: Path) -> DividedMap:
+    """Cut a cloud with the project's own writer, as a user would."""
+    from shmmap.origin.map_writer import MapWriter
+
+    xyz = np.column_stack([columns["x"], columns["y"], columns["z"]])
+    with MapWriter(out, cell_size=20.0, durable=False) as writer:
+        writer.add({"xyz": xyz, "intensity": columns["intensity"]})
+        writer.finish()
+    made = written_map(out)
+    assert sum(len(made.points(name)["x"]) for name in made.corners) == len(xyz)
+    return made
+
+
+class Expected:
+    """What the files hold, per cell: CRC-32 of xyz and of the intensity, and which state of the file."""
+
+    def __init__(self, made: DividedMap) -> None:
+        self.made = made
+        self.state: dict[str, int] = dict.fromkeys(made.corners, 0)
+        self._content: dict[str, tuple[int, int, int]] = {}
+
+    def content(self, name: str) -> tuple[int, int, int]:
+        """Points and checksums of a cell, read independently."""
+        if name not in self._content:
+            source = self.made.points(name)
+            xyz = np.column_stack([source["x"], source["y"], source["z"]])
+            self._content[name] = (
+                len(xyz),
+                zlib.crc32(xyz.tobytes()),
+                zlib.crc32(source["intensity"].tobytes()),
+            )
+        return self._content[name]
+
+    def change(self, seed: int, near: Pose) -> None:
+        """Change two cells, delete one and add one close to where everybody is."""
+        rng = np.random.default_rng(seed)
+        around = self.made.in_circle(*near, 30.0)
+        for name in around[:2]:
+            corner = self.made.corners[name]
+            self.made.write_cell(name, corner, random_points(rng, corner, 300 + seed))
+            self.state[name] += 1
+            self._content.pop(name, None)
+        gone = around[2]
+        corner = self.made.corners[gone]
+        self.made.remove_cell(gone)
+        new = f"new_{seed}.pcd"
+        self.made.write_cell(new, corner, random_points(rng, corner, 400 + seed))
+        self.state[new] = 0
+        self.made.write_metadata()
+
+
+def follow(
+    clients: list[FollowingClient],
+    expected: Expected,
+    poses: list[Pose],
+    radius: float,
+    reload: Callable[[], None],
+    changes_at: set[int],
+) -> None:
+    """Drive; at some steps the map changes and is reloaded; check every answer of every process."""
+    made = expected.made
+    held: dict[str, int] = {}  # name -> state of the file
+    for step, (x, y) in enumerate(poses):
+        if step in changes_at:
+            expected.change(step, (x, y))
+            reload()
+        wanted = {name: expected.state[name] for name in made.in_circle(x, y, radius)}
+        new = {name for name, state in wanted.items() if held.get(name) != state}
+        removed = set(held) - set(wanted)
+        for client in clients:
+            client.ask(x, y, radius)
+        versions: dict[str, int] = {}
+        for client in clients:
+            seen = client.answer()
+            assert {row[0].rsplit("/", 1)[1] for row in seen["new"]} == new, step
+            assert len(seen["new"]) == len(new)
+            assert {i.rsplit("/", 1)[1] for i in seen["removed"]} == removed, step
+            assert {row[0] for row in seen["held"]} == {made.id(name) for name in wanted}, step
+            for cell_id, version, *content in seen["new"]:
+                assert tuple(content) == expected.content(cell_id.rsplit("/", 1)[1])
+                assert versions.setdefault(cell_id, version) == version  # the same for everybody
+        held = wanted
+
+
+def drive(count: int, half_side: float) -> list[Pose]:
+    """A closed loop, some corners cut, some places visited twice."""
+    turn = np.linspace(0, 4 * np.pi, count)
+    return [(half_side * np.cos(t), half_side * np.sin(1.5 * t)) for t in turn]
+
+
+def start(
+    daemon: DaemonFactory,
+    connect: Connect,
+    made: DividedMap,
+    followers: Callable[[str], list[FollowingClient]],
+) -> tuple[list[FollowingClient], Callable[[], None]]:
+    one = daemon(made.root)
+    control = connect(one)
+
+    def reload() -> None:
+        control.ask("reload")
+
+    return followers(one.endpoint), reload
+
+
+def test_on_a_generated_map(
+    daemon: DaemonFactory,
+    connect: Connect,
+    tmp_path: Path,
+    followers: Callable[[str], list[FollowingClient]],
+) -> None:
+    made = make_map(tmp_path / "map", columns=14, rows=14, points=300)
+    clients, reload = start(daemon, connect, made, followers)
+    follow(clients, Expected(made), drive(60, 120.0), 40.0, reload, {15, 16, 40})
+
+
+def test_on_the_real_map(
+    daemon: DaemonFactory,
+    connect: Connect,
+    tmp_path: Path,
+    data_dir: Path,
+    followers: Callable[[str], list[FollowingClient]],
+) -> None:
+    """The recorded poses, radius 40 m."""
+    source = read_pcd(data_dir / "kitti0005_map" / "map_static_v005.pcd")
+    made = cut(source, tmp_path / "map")
+    assert len(made.corners) == 59
+    table = np.loadtxt(data_dir / "kitti0005_scans" / "poses_all_tum.txt")
+    poses = [(float(x), float(y)) for x, y in table[:, 1:3]]
+    clients, reload = start(daemon, connect, made, followers)
+    follow(clients, Expected(made), poses, 40.0, reload, {50, 100})
+
+
+def test_on_the_tiled_map(
+    daemon: DaemonFactory,
+    connect: Connect,
+    tmp_path: Path,
+    data_dir: Path,
+    followers: Callable[[str], list[FollowingClient]],
+) -> None:
+    """5 900 cells: the real map, thinned, ten by ten times at 220 m; a route across it, radius 150 m."""
+    from tests.benchmarks.tile_map import tile_map
+
+    source = read_pcd(data_dir / "kitti0005_map" / "map_static_v005.pcd")
+    cells, first = np.unique(
+        np.floor(source["x"] / 20).astype(np.int64) * 1000 + np.floor(source["y"] / 20).astype(np.int64),
+        return_index=True,
+    )
+    keep = np.union1d(np.arange(0, len(source["x"]), 60), first)  # every cell keeps a point at least
+    assert len(cells) == 59
+    write_pcd(tmp_path / "thin.pcd", {name: column[keep] for name, column in source.items()})
+    tile_map(tmp_path / "thin.pcd", tmp_path / "map")
+    made = written_map(tmp_path / "map")
+    assert len(made.corners) == 5900
+    steps = np.linspace(0, 1, 60)
+    poses = [(float(2000 * t), float(1000 + 900 * np.sin(5 * t))) for t in steps]
+    clients, reload = start(daemon, connect, made, followers)
+    follow(clients, Expected(made), poses, 150.0, reload, {20, 45})
