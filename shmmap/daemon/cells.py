@@ -105,6 +105,7 @@ class CellRequests:
     def area(self, session: Session, message: messages.Area, now_s: float) -> None:
         """All cells that touch an area."""
         area = messages.area_from_message(message.area)
+        session.asked_about(*area.center)
         layers = canonical_layers(message.layers)
         indices = self._at_height(self._store.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
@@ -127,6 +128,7 @@ class CellRequests:
     def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
         """Cells that touch an area, minus those the client holds."""
         area = messages.area_from_message(message.area)
+        session.asked_about(*area.center)
         layers = canonical_layers(message.layers)
         found = self._store.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._cannot_exceed_quota(session):

@@ -8,9 +8,11 @@ frees memory.  Files are read and layers built elsewhere (`workers`).
 from __future__ import annotations
 
 import logging
+import math
 import select
 import time
 from collections.abc import Callable
+from itertools import chain
 from typing import Final
 
 import zmq
@@ -201,10 +203,8 @@ class Server:
         session.last_request_s = now_s
         if isinstance(message, messages.Differential | messages.Area | messages.Selected):
             if message.intent is not None:
-                session.intent = message.intent
-            elif session.intent is None and not isinstance(message, messages.Selected):
-                x, y = messages.area_from_message(message.area).center
-                session.intent = messages.Intent(x, y)
+                _check_intent(message.intent)
+                session.intent, session.says_where = message.intent, True
             if isinstance(message, messages.Differential):
                 self.cells.differential(session, message, now_s)
             elif isinstance(message, messages.Area):
@@ -317,6 +317,13 @@ class Server:
     def _refuse(self, identity: bytes, request: int, error: ShmmapError) -> None:
         self._statistics.add("errors_returned")
         self._send_to(identity, encode(messages.ErrorReply(request, error.code, error.message, error.hint)))
+
+
+def _check_intent(intent: messages.Intent) -> None:
+    """Refuse what has no order by distance: one NaN would mix up everybody's evictions and loads."""
+    numbers = (intent.x, intent.y, intent.vx, intent.vy, intent.heading or 0.0, *chain(*intent.route))
+    if not all(map(math.isfinite, numbers)):
+        raise BadRequest("intent: every number in it must be finite")
 
 
 def _nobody_waits(result: Catalogue | ShmmapError) -> None:

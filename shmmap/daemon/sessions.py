@@ -45,7 +45,8 @@ class Session:
     """One client.
 
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
-    naming holders.  Safety never depends on it, pins are the kernel's word.
+    naming holders.  Safety never depends on it, pins are the kernel's word.  ``says_where`` tells
+    an ``intent`` that the client stated from one that was guessed from the area it asked for.
     """
 
     slot: int
@@ -57,8 +58,14 @@ class Session:
     held: dict[int, list[Resident]] = field(default_factory=dict)
     held_bytes: int = 0
     intent: Intent | None = None
+    says_where: bool = False
     requests: int = 0
     last_request_s: float = 0.0
+
+    def asked_about(self, x: float, y: float) -> None:
+        """The session asked for an area about (x, y): that is where it is, unless it says."""
+        if not self.says_where:
+            self.intent = Intent(x, y)
 
     def hold(self, residents: Iterable[Resident]) -> None:
         """The session was handed these segments."""
