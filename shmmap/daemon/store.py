@@ -256,6 +256,8 @@ class Store:
                     self._publish(load, message, fd, now_s)
             finally:
                 os.close(fd)
+        elif load is not None:  # this process had no descriptor left to receive it
+            self._fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
         return True
 
     def _feed_hungry(self, now_s: float) -> None:

@@ -14,6 +14,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+import msgspec
+
 from shmmap.daemon import jobs
 
 __all__ = ["Worker", "WorkerPool"]
@@ -125,7 +127,12 @@ class WorkerPool:
         """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
         worker = min(self._workers.values(), key=lambda w: len(w.queue), default=None)
         if worker is None or (worker.queue and len(self._workers) < self._limit):
-            worker = self.start_one()
+            try:
+                worker = self.start_one()
+            except OSError as error:  # no more processes, memory or descriptors just now
+                _log.error("cannot start a loader: %s", error)
+                if worker is None or len(worker.queue) > JOBS_AHEAD:
+                    return False
         try:
             worker.channel.send(jobs.encode(job))
         except OSError:
@@ -148,19 +155,30 @@ class WorkerPool:
         Raises
         ------
         EOFError
-            When the worker is gone.
+            When the worker is gone, or has lost its mind.
         """
-        try:
-            data, fds, _flags, _address = socket.recv_fds(worker.channel, jobs.MAX_PACKET_BYTES, 1)
-        except BlockingIOError:
-            return None
-        except OSError as error:
-            raise EOFError from error
+        while True:
+            try:
+                data, fds, _flags, _address = socket.recv_fds(worker.channel, jobs.MAX_PACKET_BYTES, 1)
+                break
+            except ConnectionResetError:
+                continue  # told once, before what the dead worker had still said
+            except BlockingIOError:
+                return None
+            except OSError as error:
+                raise EOFError from error
         if not data:
             raise EOFError
-        for fd in fds:
-            os.set_inheritable(fd, False)
-        return jobs.decode_from_worker(data), fds[0] if fds else -1
+        fd = fds[0] if fds else -1
+        try:
+            if fd >= 0:
+                os.set_inheritable(fd, False)
+            return jobs.decode_from_worker(data), fd
+        except msgspec.MsgspecError as error:
+            _log.error("a loader sends nonsense and is ended: %s", error)
+            if fd >= 0:
+                os.close(fd)
+            raise EOFError from error
 
     def finished(self, worker: Worker, number: int, now_s: float) -> None:
         """The worker is done with a job; its next one begins now."""
