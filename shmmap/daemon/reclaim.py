@@ -84,8 +84,10 @@ class Reclaimer:
         """The kernel's word on a segment; None if its name is gone."""
         try:
             fd = self._directory.open(self._on_disk(resident))
-        except OSError:
+        except FileNotFoundError:
             return None
+        except OSError:
+            return True  # out of descriptors, say: who cannot look must not take it for free
         try:
             return is_pinned(fd)
         finally:
