@@ -101,9 +101,9 @@ class RawClient:
         self, endpoint: str, *, timeout: float = 30.0, name: str = "raw", hello: bool = True
     ) -> None:
         self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.connect(f"ipc://{endpoint}")
+        self.socket = self._context.socket(zmq.DEALER)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.connect(f"ipc://{endpoint}")
         self.timeout = timeout
         self._request = 0
         self.name = name
@@ -120,18 +120,26 @@ class RawClient:
 
     def close(self) -> None:
         """End the session."""
-        self._socket.close(linger=0)
+        self.socket.close(linger=0)
         self._context.term()
 
     def send_bytes(self, data: bytes) -> None:
         """Send any frame."""
-        self._socket.send(data)
+        self.socket.send(data)
+
+    def receive_bytes(self) -> bytes:
+        """Wait for the next frame."""
+        return self.socket.recv()
+
+    def readable(self) -> bool:
+        """Whether a frame is there."""
+        return bool(self.socket.poll(0))
 
     def receive(self, timeout: float | None = None) -> list[Any]:
         """Return the next reply, whichever it is."""
-        if not self._socket.poll(int((self.timeout if timeout is None else timeout) * 1000)):
+        if not self.socket.poll(int((self.timeout if timeout is None else timeout) * 1000)):
             raise TimeoutError("no reply")
-        data = self._socket.recv()
+        data = self.socket.recv()
         self.last_bytes = len(data)
         reply = unpack(data)
         assert isinstance(reply, list)
@@ -140,7 +148,7 @@ class RawClient:
     def send(self, tag: str, *elements: Any) -> int:
         """Send a request; returns its id."""
         self._request += 1
-        self._socket.send(pack([tag, self._request, *elements]))
+        self.socket.send(pack([tag, self._request, *elements]))
         return self._request
 
     def wait_for(self, request: int, timeout: float | None = None) -> list[Any]:
