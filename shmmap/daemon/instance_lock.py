@@ -49,6 +49,11 @@ class InstanceLock:
         os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
-        """Remove the file and let the next daemon in."""
-        Path(self.path).unlink(missing_ok=True)
+        """Remove the file and let the next daemon in.
+
+        If somebody removed it meanwhile, the file of this name is another daemon's and stays.
+        """
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.stat(self.path), os.fstat(self._fd)):
+                os.unlink(self.path)
         os.close(self._fd)

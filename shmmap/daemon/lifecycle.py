@@ -15,6 +15,7 @@ import gc
 import grp
 import logging
 import os
+import resource
 import secrets
 import signal
 import socket as sockets
@@ -46,6 +47,7 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.names import segment_prefix
 from shmmap.segment.pins import leases_work, prepare_process
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
@@ -72,7 +74,9 @@ def run(config: DaemonConfig) -> int:
     """
     set_up_logging()
     prepare_process()
+    _raise_descriptor_limit()
     with contextlib.ExitStack() as stack:
+        _prepare_signals()
         path = config.socket()
         gid, mode = _access(config)
         _make_runtime_dir(Path(path).parent, gid)
@@ -86,19 +90,63 @@ def run(config: DaemonConfig) -> int:
             cache_dir=config.cache_dir or None,
         )
         config = dataclasses.replace(config, map_path=origin.path)
-        lock = InstanceLock(path.removesuffix(".sock") + ".lock")
-        stack.callback(lock.release)
-        # a second one beside the segments: two runtime directories may share a directory of segments
-        shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
-        stack.callback(shm_lock.release)
+        with _signals_held():
+            lock = InstanceLock(_lock_path(path))
+            stack.callback(lock.release)
+            # a second one beside the segments: two runtime directories may share a directory of segments
+            shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
+            stack.callback(shm_lock.release)
+            stack.callback(_ignore_signals)  # without the locks no name is ours to take away
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
             _log.warning("%s", problem)
-        life = _Life(config, catalogue, directory, path, mode, gid)
-        stack.callback(life.close)
+        with _signals_held():
+            life = _Life(config, catalogue, directory, path, mode, gid)
+            stack.callback(life.close)
         life.serve(Reloader(origin), started_s)
     return 0
+
+
+_STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
+
+
+def _prepare_signals() -> None:
+    """While the daemon starts: stop means unwinding at once, a reload waits until it serves."""
+    for number in _STOP_SIGNALS:
+        signal.signal(number, _stop_starting)
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
+
+
+def _stop_starting(number: int, frame: object) -> None:
+    del frame
+    _log.info("stopping on %s, before serving", signal.Signals(number).name)
+    raise SystemExit(0)
+
+
+@contextlib.contextmanager
+def _signals_held() -> Iterator[None]:
+    """Keep stop signals for later while something takes a name and has nobody yet to take it away."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOP_SIGNALS)
+
+
+def _ignore_signals() -> None:
+    for number in _STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _raise_descriptor_limit() -> None:
+    """A session takes two descriptors; the customary limit of 1024 would end at 500 clients."""
+    _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def _lock_path(socket_path: str) -> str:
+    return socket_path.removesuffix(".sock") + ".lock"
 
 
 def _access(config: DaemonConfig) -> tuple[int, int]:
@@ -288,9 +336,10 @@ class _Life:
         ours, theirs = sockets.socketpair()
         ours.setblocking(False)
         theirs.setblocking(False)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in (*_STOP_SIGNALS, signal.SIGHUP):
             signal.signal(number, lambda *_: None)
         before = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGHUP])
         try:
             self._wakeup = ours
             yield ours.fileno()
@@ -304,18 +353,24 @@ class _Life:
             for number in self._wakeup.recv(64):
                 if number == signal.SIGHUP:
                     self._running.reload()
-                elif number in (signal.SIGTERM, signal.SIGINT):
+                elif number in _STOP_SIGNALS:
                     _log.info("stopping on %s", signal.Signals(number).name)
-                    for again in (signal.SIGTERM, signal.SIGINT):
+                    for again in _STOP_SIGNALS:
                         signal.signal(again, self._quick_exit)
                     self._running.stop()
 
     def _quick_exit(self, number: int, frame: object) -> None:
-        """A second signal: take the names away and go, without goodbye."""
+        """A second signal: take the names away and go.
+
+        It may come in the middle of the first one's work, so it trusts the disk alone.
+        """
         del number, frame
-        self.close()
-        Path(self._socket_path).unlink(missing_ok=True)
-        os._exit(0)
+        directory = self._directory
+        names = [directory.path + name for name in directory.names(segment_prefix(self._config.instance))]
+        for path in (*names, self._socket_path, _lock_path(self._socket_path)):
+            with contextlib.suppress(OSError):
+                os.unlink(path)
+        os._exit(0)  # the loaders die with this process
 
     def close(self) -> None:
         """Take every name away."""
