@@ -185,7 +185,7 @@ class CellRequests:
         cold = [
             (index, layer)
             for index, layer in wanted.cells
-            if index not in warm.get(layer, {}) and find(index, layer) is None
+            if index not in warm.get(layer, {}) and find(index, layer, now_s) is None
         ]
         self._statistics.add("hits", len(wanted.cells) - len(cold))
         self._check_quota(wanted, cold)

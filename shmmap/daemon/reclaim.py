@@ -28,6 +28,8 @@ TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
 ZOMBIE_INTERVAL_S: Final = 0.1
 """How often a segment that is still mapped is looked at, when nothing else gives a reason to."""
+ZOMBIE_SHARE_S: Final = 0.0005
+"""With very many of them each is looked at less often: at most one per this time (a look takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment just handed out is not evicted for this long, so that its reader can open it."""
 PROBES_AT_ONCE: Final = 64
@@ -124,7 +126,7 @@ class Reclaimer:
         zombie = self._books.adopt_zombie(resident)
         zombie.probe_after_s = now_s + TICK_S
 
-    def revive(self, key: Key, version: int) -> Resident | None:
+    def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
         """Put a retired but still existing segment of exactly this version back into service."""
         zombie = self._by_key.get(key)
         if zombie is None or zombie.resident.version != version:
@@ -133,7 +135,10 @@ class Reclaimer:
             self._forget(zombie)
             return None
         del self._by_key[key]
-        return self._books.revive(zombie)
+        old = self._books.revive(zombie)
+        if old is not None:
+            self.superseded(old, now_s)
+        return zombie.resident
 
     def never_revive(self, key: Key) -> None:
         """What is retired of this key must not be handed out again."""
@@ -175,7 +180,8 @@ class Reclaimer:
         pinned = self.is_pinned(zombie.resident)
         if pinned:
             zombie.condemned = False
-            zombie.probe_after_s = now_s + ZOMBIE_INTERVAL_S
+            interval_s = max(ZOMBIE_INTERVAL_S, ZOMBIE_SHARE_S * len(self._books.zombies))
+            zombie.probe_after_s = now_s + interval_s
             return 0
         if pinned is False and now_s < zombie.probe_after_s:
             zombie.condemned = True  # its tick is not over yet
@@ -196,7 +202,7 @@ class Reclaimer:
         missing = shortage - self._books.condemned_bytes()
         if missing <= 0:
             return Outcome.PENDING
-        candidates, graced_until_s = self._books.candidates(now_s, HAND_OUT_GRACE_S)
+        candidates, graced = self._books.candidates(now_s, HAND_OUT_GRACE_S)
         self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
         unknown = [r for r in candidates if r.name not in self._pinned_until_s]
         ordered = self._policy(unknown, self._sessions.poses())
@@ -214,8 +220,15 @@ class Reclaimer:
         if len(ordered) > PROBES_AT_ONCE:
             self.wake_s = now_s
             return Outcome.PENDING
-        if graced_until_s < float("inf"):
-            self.wake_s = graced_until_s
+        # their readers may be just opening these; those that have done so are no reason to wait
+        unknown = [r for r in graced if r.name not in self._pinned_until_s]
+        for resident in unknown[:PROBES_AT_ONCE]:
+            if not self.is_pinned(resident):
+                self.wake_s = resident.last_use_s + HAND_OUT_GRACE_S
+                return Outcome.PENDING
+            self._pinned_until_s[resident.name] = now_s + PIN_MEMO_S
+        if len(unknown) > PROBES_AT_ONCE:
+            self.wake_s = now_s
             return Outcome.PENDING
         return Outcome.PENDING if self._books.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
 

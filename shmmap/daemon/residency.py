@@ -166,7 +166,7 @@ class Residency:
     @property
     def queued(self) -> int:
         """How many loads wait for a worker or for room."""
-        return sum(1 for _, _, load in self._queue if not load.running and self._is_current(load))
+        return len({load.number for _, _, load in self._queue if not load.running and self._is_current(load)})
 
     def _is_current(self, load: Load) -> bool:
         slot = self.slots.get(load.key)
@@ -204,6 +204,8 @@ class Residency:
         """
         if self.shortage(load.estimate) > 0:
             raise ValueError("the reservation exceeds the budget")
+        if self._queue and self._queue[0][2] is load:
+            heapq.heappop(self._queue)
         load.running = True
         load.started_s = now_s
         load.reserved = load.estimate
@@ -300,15 +302,24 @@ class Residency:
         zombie = self.zombies[resident.name] = Zombie(resident)
         return zombie
 
-    def revive(self, zombie: Zombie) -> Resident:
-        """A retired segment is wanted again and still whole: hand it out as before."""
+    def revive(self, zombie: Zombie) -> Resident | None:
+        """A retired segment is wanted again and still whole: hand it out as before.
+
+        Returns the version that it supersedes, to be retired by name (the map went back to an
+        earlier state).
+        """
         resident = zombie.resident
+        slot = self.slot(resident.key)
+        old = slot.resident
+        if old is not None:
+            self._move_to_zombies(old)
         del self.zombies[resident.name]
         self.zombie_bytes -= resident.nbytes
         self.resident_bytes += resident.nbytes
         self._by_name[resident.name] = resident
-        self.slot(resident.key).resident = resident
-        return resident
+        slot.resident = resident
+        slot.failure = None
+        return old
 
     def freed(self, name: str) -> int:
         """A zombie's memory is back with the kernel; returns its bytes."""
@@ -325,19 +336,16 @@ class Residency:
         """Bytes of zombies that nobody had open at the last look: they are about to be freed."""
         return sum(z.resident.nbytes for z in self.zombies.values() if z.condemned)
 
-    def candidates(self, now_s: float, grace_s: float) -> tuple[list[Resident], float]:
-        """Residents that may be retired now, and when the next one's hand-out grace ends.
+    def candidates(self, now_s: float, grace_s: float) -> tuple[list[Resident], list[Resident]]:
+        """Residents that may be retired now, and those that may be soon, first come first.
 
-        Left out are those a waiting request needs, and those handed out less than ``grace_s`` ago:
-        their reader may not have opened them yet.
+        Left out are those a waiting request needs.  Those handed out less than ``grace_s`` ago come
+        second: their reader may not have opened them yet.
         """
         free: list[Resident] = []
-        next_s = float("inf")
+        graced: list[Resident] = []
         for resident in self._by_name.values():
-            if self.slots[resident.key].waiting:
-                continue
-            if resident.last_use_s + grace_s > now_s:
-                next_s = min(next_s, resident.last_use_s + grace_s)
-                continue
-            free.append(resident)
-        return free, next_s
+            if not self.slots[resident.key].waiting:
+                (graced if resident.last_use_s + grace_s > now_s else free).append(resident)
+        graced.sort(key=lambda resident: resident.last_use_s)
+        return free, graced

@@ -130,12 +130,12 @@ class Store:
 
     # --- wanting ------------------------------------------------------------------------------
 
-    def find_warm(self, index: int, layer: str) -> Resident | None:
+    def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
         """The current version of a cell, if it is in memory (retired ones are put back in service)."""
         resident = self.warm.setdefault(layer, {}).get(index)
         if resident is None and self.books.zombies:
             key = Key(self.catalogue.id(index), layer)
-            resident = self.reclaimer.revive(key, self.catalogue.version(index))
+            resident = self.reclaimer.revive(key, self.catalogue.version(index), now_s)
             if resident is not None:
                 self._enter(resident, index)
         return resident
@@ -213,11 +213,19 @@ class Store:
             message = f"the cell needs {load.estimate} bytes, the whole budget is {self.books.budget_bytes}"
             self._fail(load, "over_budget", message, None, now_s)
             return True
-        if self.reclaimer.free(shortage, now_s) is Outcome.PENDING:
+        if self.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_give_back():
             return False
         message = f"{load.estimate} bytes do not fit: the budget of {self.books.budget_bytes} bytes is in use"
         self._fail(load, "over_budget", message, None, now_s)
         return True
+
+    def _may_give_back(self) -> bool:
+        """Whether a load runs that will end by itself: it may need less than is reserved for it.
+
+        Loads that wait for room do not end by themselves, nor do those that come after them in the
+        same loader's queue.
+        """
+        return any(worker.queue and next(iter(worker.queue)) not in self._hungry for worker in self.pool)
 
     def next_event_s(self) -> float:
         """When `pump` has something to do although nothing arrives; infinity for never."""
@@ -272,7 +280,8 @@ class Store:
             else:
                 shortage = self.books.shortage(nbytes - load.reserved)
                 hopeless = nbytes + self.books.overhead_bytes > self.books.budget_bytes
-                if hopeless or self.reclaimer.free(shortage, now_s) is Outcome.IMPOSSIBLE:
+                outcome = Outcome.IMPOSSIBLE if hopeless else self.reclaimer.free(shortage, now_s)
+                if hopeless or (outcome is Outcome.IMPOSSIBLE and not self._may_give_back()):
                     del self._hungry[number]
                     self.pool.answer(worker, jobs.Refuse(number))
 
