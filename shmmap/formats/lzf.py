@@ -16,12 +16,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LITERAL_RUN", "MAX_RATIO", "compress", "decompress", "first_error"]
+__all__ = [
+    "LITERAL_RUN",
+    "MAX_RATIO",
+    "TRUST_BYTES",
+    "compress",
+    "decompress",
+    "first_error",
+    "reachable",
+]
 
 LITERAL_RUN: Final = 32
 MAX_RATIO: Final = 88  # three bytes of input make at most 264 of output
 _LONG: Final = 7 << 5
-_TRUST_BYTES: Final = 64 << 20  # streams that claim more output are walked before memory is committed
+TRUST_BYTES: Final = 64 << 20  # walk streams that claim more output (`first_error`) before allocating it
 _LIMIT_BYTES: Final = (1 << 32) - 1
 
 _Bytes = NDArray[np.uint8]
@@ -31,16 +39,18 @@ _PROBE: Final = (b"\x01ab\x20\x01", b"ababa")  # two literals, then three bytes 
 def decompress(data: _Bytes, output: _Bytes) -> bool:
     """Fill ``output`` with what the stream ``data`` stands for; False if it is not exactly that.
 
-    Both are contiguous, and shorter than 4 GiB (the format's size words).  A bad stream that claims
-    more than 64 MiB is recognised before the memory behind ``output`` is touched.
+    Both are contiguous, and shorter than 4 GiB (the format's size words).
     """
     if not output.size:
         return not data.size
-    if not data.size or output.size > min(_LIMIT_BYTES, MAX_RATIO * data.size):
-        return False
-    if output.size > _TRUST_BYTES and first_error(data.data, output.size) is not None:
+    if not reachable(data.size, output.size):
         return False
     return (_native() or _through_module)(data, output)
+
+
+def reachable(input_bytes: int, output_bytes: int) -> bool:
+    """Whether any stream of ``input_bytes`` bytes can make ``output_bytes`` bytes."""
+    return 0 < output_bytes <= min(_LIMIT_BYTES, MAX_RATIO * input_bytes)
 
 
 @lru_cache(maxsize=1)

@@ -85,13 +85,19 @@ def compressed_blocks(
             path=source.path,
             offset=at,
         )
+    sound = lzf.reachable(compressed_bytes, output_bytes)
     rows = _balanced(header.points, block_points)
     with borrow_scratch() as scratch:
-        packed, data, xyz = scratch.cut(
-            ((compressed_bytes,), _BYTE), ((output_bytes,), _BYTE), ((rows, 3), table.xyz_dtype)
-        )
-        source.read_into(packed)
-        if not lzf.decompress(packed, data):
+        shapes = (((output_bytes,), _BYTE), ((rows, 3), table.xyz_dtype))
+        if sound and output_bytes > lzf.TRUST_BYTES:
+            packed = source.read(compressed_bytes)
+            sound = lzf.first_error(packed.data, output_bytes) is None
+            if sound:
+                data, xyz = scratch.cut(*shapes)
+        elif sound:
+            data, xyz, packed = scratch.cut(*shapes, ((compressed_bytes,), _BYTE))
+            source.read_into(packed)
+        if not sound or not lzf.decompress(packed, data):
             raise refusal(
                 "bad_lzf",
                 f"{compressed_bytes} bytes do not decompress to {output_bytes}",

@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 import random
+import struct
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shmmap.errors import MapDataError
 from shmmap.formats import lzf
-from tests.support.pcd_bytes import lzf_decode, lzf_encode
+from shmmap.formats.pcd_reader import PcdReader
+from tests.support.pcd_bytes import Field, column, header, lzf_decode, lzf_encode
 
 PLAIN = [
     b"a",
@@ -78,18 +82,42 @@ def test_an_impossible_ratio_is_refused_without_trying() -> None:
     assert not lzf.decompress(np.zeros(1000, np.uint8), output)
 
 
-def test_a_large_bad_stream_leaves_its_output_untouched() -> None:
-    """Highly compressed zeros, with a reference before the start at the very end."""
-    packed = b"\x00\x00" + b"\xe0\xff\x00" * (70 * 1024 * 1024 // 264) + b"\xff\xff\xff"
-    made = 1 + 264 * ((len(packed) - 5) // 3) + 264
-    output = np.full(made, 7, np.uint8)
-    bad = packed[:2] + b"\xff\xff\xff" + packed[5:]
-    assert lzf.first_error(bad, made) == 2
-    tracemalloc.start()
-    assert not lzf.decompress(np.frombuffer(bad, np.uint8), output)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 1 << 20
-    assert output[0] == 7
-    assert lzf.decompress(np.frombuffer(packed[:-3] + b"\xe0\xff\x00", np.uint8), output)
-    assert not output.any()
+@pytest.mark.parametrize("bad_at", ["start", "end"])
+def test_a_large_bad_stream_is_refused_before_its_output_exists(tmp_path: Path, bad_at: str) -> None:
+    """A megabyte that claims 79 MB of zeros, with a reference before the start."""
+    runs = 300_000
+    plain = 1 + 264 * runs
+    good = b"\x00\x00" + b"\xe0\xff\x00" * runs
+    assert lzf.first_error(good, plain) is None
+    bad = good[:2] + b"\xff\xff\xff" + good[5:] if bad_at == "start" else good[:-1]
+    fields = [*(column(name, "F4", []) for name in "xyz"), Field("w", "U", 1, (), plain % 12 + 12)]
+    points = plain // (12 + fields[3].count)
+    size = points * (12 + fields[3].count)
+    change: dict[str, str | None] = {"POINTS": str(points), "WIDTH": str(points)}
+    for packed in (bad, good[: 2 + 3 * (size // 264)]):
+        path = tmp_path / "cloud.pcd"
+        head = header(fields, "binary_compressed", change=change)
+        path.write_bytes(head + struct.pack("<II", len(packed), size) + packed)
+        tracemalloc.start()
+        with PcdReader(path) as reader, pytest.raises(MapDataError) as caught:
+            next(reader.blocks())
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert caught.value.cause == "bad_lzf"
+        assert peak < 10 << 20
+
+
+def test_a_large_sound_stream_is_read(tmp_path: Path) -> None:
+    runs = 300_000
+    size = 264 * runs
+    packed = b"\x00\x00" + b"\xe0\xff\x00" * (runs - 1) + b"\xe0\xfe\x00"
+    fields = [column(name, "F8", []) for name in "xyz"]
+    points = size // 24
+    change: dict[str, str | None] = {"POINTS": str(points), "WIDTH": str(points)}
+    path = tmp_path / "cloud.pcd"
+    head = header(fields, "binary_compressed", change=change)
+    path.write_bytes(head + struct.pack("<II", len(packed), size) + packed)
+    with PcdReader(path) as reader:
+        assert (
+            sum(len(block[0]) - np.count_nonzero(block[0].any(axis=1)) for block in reader.blocks()) == points
+        )
