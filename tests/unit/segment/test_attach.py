@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Attaching: right bytes, read-only, for exactly as long as any view lives."""
+
+from __future__ import annotations
+
+import gc
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.segment.attach import attach, unmap
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.layout import PublishBlock
+from tests.support.segment_reader import read_segment
+from tests.unit.segment.conftest import Publish, write_segment
+
+
+def mapped_times(name: str) -> int:
+    return Path("/proc/self/maps").read_text().count(name.lstrip("/"))
+
+
+def test_the_same_as_an_independent_reader(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish(1000)
+    segment = attach(name, shm_dir=shm.path, slot=5)
+    expected = read_segment(f"{shm.path}{name}")
+    assert [column[0] for column in segment.columns] == list(expected.columns)
+    for index, column in enumerate(expected.columns.values()):
+        view = segment.column(index)
+        assert view.dtype == column.dtype
+        assert np.array_equal(view, column)
+        assert view.flags.c_contiguous
+        assert view.ctypes.data % 64 == 0
+    assert segment.header.cell_id == expected.fields["cell_id"]
+    assert segment.header.box == expected.fields["box"]
+    assert segment.published == PublishBlock(7, 8)
+    segment.verify()
+
+
+def test_views_cannot_be_written_nor_made_writable(shm: ShmDirectory, publish: Publish) -> None:
+    view = attach(publish(), shm_dir=shm.path).column(0)
+    with pytest.raises(ValueError, match="read-only"):
+        view[0] = 1
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        view.flags.writeable = True
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        view.reshape(-1)[5:9].flags.writeable = True
+
+
+@pytest.mark.parametrize("kind", ["column", "slice", "reshaped", "raw", "memoryview"])
+def test_the_mapping_lives_as_long_as_any_view(shm: ShmDirectory, publish: Publish, kind: str) -> None:
+    """Also when the name is gone, and the segment object."""
+    name = publish(5000)
+    calls: list[tuple[int, int]] = []
+
+    def on_unmap(address: int, nbytes: int) -> None:
+        calls.append((address, nbytes))
+        unmap(address, nbytes)
+
+    segment = attach(name, shm_dir=shm.path, on_unmap=on_unmap)
+    xyz = segment.column(0)
+    expected = xyz.copy()
+    view: object = {
+        "column": xyz,
+        "slice": xyz[100:200, 1],
+        "reshaped": xyz.reshape(-1)[::7],
+        "raw": segment.raw,
+        "memoryview": memoryview(xyz),  # type: ignore[arg-type]
+    }[kind]
+    shm.unlink(name)
+    del segment, xyz
+    gc.collect()
+    assert calls == []
+    assert mapped_times(name) == 1
+    if kind == "column":
+        assert np.array_equal(view, expected)  # type: ignore[arg-type]
+    del view
+    gc.collect()
+    assert len(calls) == 1
+    assert mapped_times(name) == 0
+
+
+def test_no_descriptor_is_kept(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    before = os.listdir("/proc/self/fd")
+    held = [attach(name, shm_dir=shm.path, slot=i) for i in range(50)]
+    assert os.listdir("/proc/self/fd") == before
+    held.clear()
+
+
+def test_three_thousand_with_few_descriptors(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        held = [attach(name, shm_dir=shm.path, slot=i) for i in range(3000)]
+        assert mapped_times(name) > 0
+        assert float(held[0].column(0).sum()) == float(held[-1].column(0).sum())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_many_small_layers_may_share_one_object(shm: ShmDirectory) -> None:
+    rng = np.random.default_rng(1)
+    xyz, intensity = rng.random((10, 3)), np.arange(10, dtype="<u2")
+    with open(f"{shm.path}/one", "w+b") as file:
+        write_segment(file.fileno(), xyz, intensity)
+        one = Path(file.name).read_bytes()
+    one += bytes(-len(one) % 4096)
+    Path(shm.path, "slab").write_bytes(bytes(8192) + one)
+    segment = attach("/slab", shm_dir=shm.path, offset=8192, nbytes=len(one))
+    assert np.array_equal(segment.column(0), xyz)
+    assert np.array_equal(segment.column(1), intensity)
+    for name in ("one", "slab"):
+        os.unlink(f"{shm.path}/{name}")
+
+
+def test_gone(shm: ShmDirectory) -> None:
+    with pytest.raises(StaleHandle):
+        attach("/shmmap.unit.0000", shm_dir=shm.path)
+    with pytest.raises(StaleHandle):
+        attach("/shmmap.unit.nobody-has-this")  # plain POSIX shared memory
+
+
+def test_what_is_no_segment(shm: ShmDirectory, publish: Publish) -> None:
+    whole = Path(f"{shm.path}{publish(100)}").read_bytes()
+    for content in (b"", b"x", bytes(4096), whole[:100], whole[:4096], os.urandom(5000)):
+        Path(shm.path, "bad").write_bytes(content)
+        with pytest.raises(SegmentCorrupt):
+            attach("/bad", shm_dir=shm.path)
+    Path(shm.path, "bad").write_bytes(whole)
+    with pytest.raises(SegmentCorrupt):
+        attach("/bad", shm_dir=shm.path, nbytes=len(whole) + 1)
+    with pytest.raises(SegmentCorrupt):
+        attach("/bad", shm_dir=shm.path, offset=4096)
+    os.unlink(f"{shm.path}/bad")
+    assert mapped_times("/bad") == 0
+
+
+def test_other_things_of_that_name(shm: ShmDirectory, publish: Publish) -> None:
+    os.mkdir(f"{shm.path}/folder")
+    os.symlink(f"{shm.path}{publish()}", f"{shm.path}/link")
+    for name in ("/folder", "/link"):
+        with pytest.raises(SegmentError):
+            attach(name, shm_dir=shm.path)
+    os.rmdir(f"{shm.path}/folder")
+    os.unlink(f"{shm.path}/link")
+
+
+def test_a_changed_column_is_found(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    path = Path(f"{shm.path}{name}")
+    data = bytearray(path.read_bytes())
+    data[4096 + 500] ^= 1
+    path.unlink()
+    path.write_bytes(data)
+    segment = attach(name, shm_dir=shm.path)  # its header is right
+    with pytest.raises(SegmentCorrupt, match="xyz"):
+        segment.verify()
+
+
+@pytest.mark.root
+def test_no_permission(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    os.chmod(shm.path, 0o755)
+    os.seteuid(65534)
+    try:
+        with pytest.raises(SegmentError, match="may not read") as refusal:
+            attach(name, shm_dir=shm.path)
+    finally:
+        os.seteuid(0)
+    assert not isinstance(refusal.value, StaleHandle)
+
+
+def test_no_room_for_a_mapping(shm: ShmDirectory, publish: Publish) -> None:
+    """In a process of its own: the address space is limited below what the segment needs."""
+    name = publish(400_000)
+    code = (
+        "import resource, sys\n"
+        "from shmmap.segment.attach import attach\n"
+        "from shmmap.errors import SegmentError\n"
+        "used = int(open('/proc/self/statm').read().split()[0]) * 4096\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 20), -1))\n"
+        "try:\n    attach(sys.argv[2], shm_dir=sys.argv[1])\n"
+        "except SegmentError as error:\n    print(error.hint)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, shm.path, name], capture_output=True, text=True, check=True
+    )
+    assert "RLIMIT_AS" in done.stdout
+
+
+def test_populated_pages_are_there_at_once(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish(200_000)
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    segment = attach(name, shm_dir=shm.path, populate=True)
+    after_attach = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    pages = len(segment.raw) // 4096
+    assert int(segment.raw[::4096].sum()) >= 0
+    after_reading = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    assert after_reading - after_attach < pages / 4
+    assert after_attach >= faults

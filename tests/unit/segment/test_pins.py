@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The kernel's word on who uses a segment."""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import random
+import signal
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.segment.attach import AttachedSegment, attach
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import MAX_SLOT, holders, is_pinned, leases_work, lock_slot, prepare_process
+from tests.support.mapping_process import MappingProcess
+from tests.unit.segment.conftest import Publish
+
+
+@pytest.fixture(autouse=True)
+def sigio() -> Iterator[None]:
+    """Whoever takes leases ignores SIGIO."""
+    before = signal.getsignal(signal.SIGIO)
+    prepare_process()
+    yield
+    signal.signal(signal.SIGIO, before)
+
+
+def pinned(shm: ShmDirectory, name: str) -> bool:
+    fd = shm.open(name)
+    try:
+        return is_pinned(fd)
+    finally:
+        os.close(fd)
+
+
+def who(shm: ShmDirectory, name: str) -> list[int]:
+    fd = shm.open(name)
+    try:
+        return holders(fd)
+    finally:
+        os.close(fd)
+
+
+def test_nobody_an_open_file_a_mapping(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    assert not pinned(shm, name)
+    fd = shm.open(name)
+    assert pinned(shm, name)
+    mapped = mmap.mmap(fd, 0, prot=mmap.PROT_READ)
+    os.close(fd)
+    assert pinned(shm, name)
+    mapped.close()
+    assert not pinned(shm, name)
+
+
+def test_a_pin_follows_a_rename_and_outlives_a_stop(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    with MappingProcess([f"{shm.path}{name}"]) as reader:
+        os.kill(reader.pid, signal.SIGSTOP)
+        assert pinned(shm, name)
+        assert shm.rename(name, name + ".zombie")
+        assert pinned(shm, name + ".zombie")
+        os.kill(reader.pid, signal.SIGCONT)
+    assert not pinned(shm, name + ".zombie")
+
+
+def test_looking_does_not_disturb_whoever_opens_meanwhile(shm: ShmDirectory, publish: Publish) -> None:
+    """A lease is held for a moment only; an open in that moment waits and succeeds."""
+    name = publish()
+    fd = shm.open(name)
+    for _ in range(200):
+        assert not is_pinned(fd)
+        os.close(os.open(f"{shm.path}{name}", os.O_RDONLY))
+    os.close(fd)
+
+
+def test_who_holds(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    slots = [0, 1, 2, 5, 1000, 2**32, 2**61 + 1, MAX_SLOT]
+    held = [attach(name, shm_dir=shm.path, slot=slot) for slot in slots]
+    anonymous = attach(name, shm_dir=shm.path)
+    assert who(shm, name) == slots
+    del held[3]
+    assert who(shm, name) == [s for s in slots if s != 5]
+    held.clear()
+    assert who(shm, name) == []
+    assert pinned(shm, name)  # the one that told nobody
+    assert anonymous.published is not None
+    del anonymous
+    assert not pinned(shm, name)
+
+
+def test_many_holders_are_counted_up_to_a_limit(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    rng = random.Random(3)
+    slots = sorted(rng.sample(range(MAX_SLOT), 300))
+    held = [attach(name, shm_dir=shm.path, slot=slot) for slot in slots]
+    assert who(shm, name) == slots
+    fd = shm.open(name)
+    some = holders(fd, limit=10)
+    os.close(fd)
+    assert len(some) == 10
+    assert set(some) <= set(slots)
+    held.clear()
+
+
+def test_locks_over_ranges_are_nobody_s_and_hide_nobody(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    stranger = shm.open(name)
+    fcntl.fcntl(stranger, 37, struct.pack("@hhqqi4x", fcntl.F_RDLCK, 0, 100, 50, 0))
+    held = attach(name, shm_dir=shm.path, slot=99), attach(name, shm_dir=shm.path, slot=150)
+    assert who(shm, name) == [99, 150]
+    os.close(stranger)
+    del held
+
+
+def test_readers_cannot_take_the_writer_s_lock(shm: ShmDirectory, publish: Publish) -> None:
+    fd = shm.open(publish())
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        fcntl.fcntl(fd, 37, struct.pack("@hhqqi4x", fcntl.F_WRLCK, 0, 0, 1, 0))
+    lock_slot(fd, 5)
+    os.close(fd)
+
+
+def test_whether_leases_work(shm: ShmDirectory) -> None:
+    fd = shm.create()
+    assert leases_work(fd)
+    other = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY)
+    assert leases_work(fd)  # used by somebody else: the file system grants them all the same
+    os.close(other)
+    os.close(fd)
+
+
+def test_a_random_life_against_a_model(shm: ShmDirectory, publish: Publish) -> None:
+    """Many segments, mapped and dropped in any order: pins and holders are always exact."""
+    rng = random.Random(11)
+    names = [publish(seed=i) for i in range(6)]
+    held: dict[str, list[tuple[int | None, AttachedSegment]]] = {name: [] for name in names}
+    zombie = dict.fromkeys(names, "")
+    for _ in range(400):
+        name = rng.choice(names)
+        current = name + zombie[name]
+        action = rng.randrange(4)
+        if action == 0 and len(held[name]) < 5:
+            slot = rng.choice([None, rng.randrange(MAX_SLOT)])
+            held[name].append((slot, attach(current, shm_dir=shm.path, slot=slot)))
+        elif action == 1 and held[name]:
+            held[name].pop(rng.randrange(len(held[name])))
+        elif action == 2:
+            zombie[name] = "" if zombie[name] else ".zombie"
+            assert shm.rename(current, name + zombie[name])
+            current = name + zombie[name]
+        assert pinned(shm, current) == bool(held[name])
+        assert who(shm, current) == sorted({slot for slot, _ in held[name] if slot is not None})
+
+
+def test_nothing_of_it_needs_the_name(shm: ShmDirectory, publish: Publish) -> None:
+    name = publish()
+    keeper = shm.open(name)
+    with MappingProcess([f"{shm.path}{name}"]):
+        assert shm.unlink(name)
+        assert is_pinned(keeper)
+    assert not is_pinned(keeper)
+    os.close(keeper)
+    assert not Path(f"{shm.path}{name}").exists()
