@@ -13,7 +13,7 @@ import os
 import threading
 from collections.abc import Callable
 
-from shmmap.errors import ShmmapError
+from shmmap.errors import InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_origin import MapOrigin
 
@@ -57,6 +57,9 @@ class Reloader:
             self._result = error
         except OSError as error:
             self._result = ShmmapError(f"{self._origin.path}: {error}")
+        except Exception as error:  # noqa: BLE001  else nobody would ever hear of this reload or a later one
+            _log.exception("the map could not be read again; this is a defect in shmmap")
+            self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
     def collect(self, apply: Callable[[Catalogue], None]) -> None:

@@ -183,7 +183,7 @@ class Store:
                 return
             index = self.index_of(load.key.cell_id)
             if index is None:
-                self._fail(load, "unknown_cell", "the cell left the map", None, now_s)
+                self._abandon(load)
                 continue
             shortage = self.books.shortage(load.estimate)
             if shortage > 0:
@@ -335,16 +335,22 @@ class Store:
         self.books.failed(load, Failure(code, message, stamp, now_s + delay_s, delay_s))
         self._on_settled(load.key)
 
+    def _abandon(self, load: Load) -> None:
+        """The cell left the map: nobody asks for this any more, so no failure is remembered."""
+        self.books.failed(load, None)
+        self._on_settled(load.key)
+
     # --- publishing -----------------------------------------------------------------------------
 
     def _publish(self, load: Load, done: jobs.Done, fd: int, now_s: float) -> None:
         index = self.index_of(load.key.cell_id)
         if index is None:
-            self._fail(load, "unknown_cell", "the cell left the map", None, now_s)
+            self._statistics.add("loads_failed")
+            self._abandon(load)
             return
         stamp, known = Stamp(*done.stamp), self.catalogue.stamp(index)
         if stamp != known:
-            if stamp.ctime_ns < known.ctime_ns:
+            if self._lies_on_disk(index, known):
                 self.books.requeue(load)  # it read what a reload has already found replaced
                 return
             self._remember({load.key.cell_id}, ())
@@ -389,6 +395,12 @@ class Store:
             _log.info("%s: %d points left out, not finite", load.key.cell_id, done.dropped)
         self._on_settled(load.key)
 
+    def _lies_on_disk(self, index: int, stamp: Stamp) -> bool:
+        try:
+            return Stamp.of(os.stat(self.catalogue.path(index))) == stamp
+        except OSError:
+            return False
+
     def _enter(self, resident: Resident, index: int) -> None:
         """A resident can be handed out: encode its handle, find it by index if it is current."""
         self._encode(resident)
@@ -398,7 +410,7 @@ class Store:
             if versions is None:
                 versions = self.versions[resident.key.layer] = np.zeros(len(self.catalogue), np.uint64)
             versions[index] = resident.version
-        self.heights[index] = (resident.z_min, resident.z_max)
+            self.heights[index] = (resident.z_min, resident.z_max)
         self.index_of_version[resident.version] = index
         self._indices[self.wire_id(resident.key.cell_id)] = index
         self._show(resident, "resident" if resident.version == self.catalogue.version(index) else "stale")
@@ -452,7 +464,8 @@ class Store:
     # --- leaving --------------------------------------------------------------------------------
 
     def _chill(self, index: int) -> None:
-        """What is resident of this cell is not its current version any more."""
+        """What is resident of this cell is not its current version any more, nor are its heights."""
+        self.heights.pop(index, None)
         for layer, warm in self.warm.items():
             if warm.pop(index, None) is not None:
                 self.versions[layer][index] = 0
@@ -478,8 +491,14 @@ class Store:
                 index = self.index_of(zombie.resident.key.cell_id)
                 if index is not None:
                     self.index_of_version[zombie.resident.version] = index
+        changed = set(change.changed)
+        for index in [index for index in self.heights if new.id(index) in changed]:
+            self._chill(index)
         gone = set(change.removed)
         moved = set(change.moved)
+        for zombie in self.books.zombies.values():
+            if zombie.resident.key.cell_id in moved:
+                self.reclaimer.never_revive(zombie.resident.key)
         for resident in list(self.books.residents()):
             if resident.key.cell_id in gone:
                 self.evict(resident, now_s)
