@@ -104,6 +104,7 @@ class CellRequests:
 
     def area(self, session: Session, message: messages.Area, now_s: float) -> None:
         """All cells that touch an area."""
+        _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         session.asked_about(*area.center)
         layers = canonical_layers(message.layers)
@@ -113,6 +114,7 @@ class CellRequests:
 
     def selected(self, session: Session, message: messages.Selected, now_s: float) -> None:
         """Cells by id, in the order asked for."""
+        _check_wait(message.wait)
         layers = canonical_layers(message.layers)
         cells: list[tuple[int, str]] = []
         unknown: list[tuple[str, str]] = []
@@ -127,6 +129,7 @@ class CellRequests:
 
     def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
         """Cells that touch an area, minus those the client holds."""
+        _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         session.asked_about(*area.center)
         layers = canonical_layers(message.layers)
@@ -178,8 +181,6 @@ class CellRequests:
     # --- waiting and answering ------------------------------------------------------------------
 
     def _begin(self, wanted: Wanted, wait_s: float | None, area: Area | None, now_s: float) -> None:
-        if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
-            raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
         warm = self._store.warm
         find = self._store.find_warm
         cold = [
@@ -234,8 +235,12 @@ class CellRequests:
             order = np.argsort(distance_to_boxes(*wanted.area.center, boxes), kind="stable")
         else:
             order = np.arange(len(boxes))
+        counted: set[tuple[int, str]] = set()
         for position in order.tolist():
             index, layer = wanted.cells[position]
+            if (index, layer) in counted:
+                continue
+            counted.add((index, layer))
             key = Key(store.catalogue.id(index), layer)
             resident = None if (index, layer) in chilled else store.warm[layer][index]
             if resident is not None and resident.sessions - {session.slot}:
@@ -332,11 +337,13 @@ class CellRequests:
             answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
         for index, layer in wanted.cells:
             resident = warm[layer].get(index) if layer in warm else None
+            if resident is None:  # evicted since the request came, perhaps, and still whole
+                resident = self._store.find_warm(index, layer, now_s)
             if resident is not None and not wanted.refused:
                 answer.handles.append(resident.handle)
                 answer.residents.append(resident)
             else:
-                self._answer_cold(wanted, index, layer, answer)
+                self._answer_cold(wanted, index, layer, answer, now_s)
         self._reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
         self._hand_out(wanted.session, answer, now_s)
 
@@ -367,7 +374,7 @@ class CellRequests:
         session.hold(answer.residents)
         self._statistics.add("handles_sent", len(answer.handles))
 
-    def _answer_cold(self, wanted: Wanted, index: int, layer: str, answer: _Answer) -> None:
+    def _answer_cold(self, wanted: Wanted, index: int, layer: str, answer: _Answer, now_s: float) -> None:
         """Answer for one cell that is not simply warm."""
         store = self._store
         key = Key(store.catalogue.id(index), layer)
@@ -390,5 +397,12 @@ class CellRequests:
                 holders = answer.blockers
             answer.failed.append(FailedCell(wire_id, layer, slot.failure.code, slot.failure.message, holders))
         elif not current:
+            if slot.load is None:  # evicted, or no longer out of room: "pending" promises a load
+                store.want(index, layer, float("inf"), now_s)
             answer.pending.append(PendingCell(wire_id, layer))
         store.books.forget_if_empty(key)
+
+
+def _check_wait(wait_s: float | None) -> None:
+    if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
+        raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
