@@ -239,6 +239,9 @@ class Server:
         else:
             if old is not None:
                 self.end_session(old)
+            idle = self._sessions.idlest_unwatched() if self._sessions.full else None
+            if idle is not None:
+                self.end_session(idle)
             if self._sessions.full:
                 raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
             session = self._sessions.open(identity, peer, message.client, now_s)

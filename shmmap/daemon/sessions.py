@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from shmmap.daemon.residency import Resident
+from shmmap.errors import NoSession
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
@@ -157,13 +158,31 @@ class Sessions:
         """Whether no more sessions are accepted."""
         return len(self._by_slot) >= self.LIMIT
 
+    def idlest_unwatched(self) -> Session | None:
+        """The session to give up when there are too many: nobody tells us when its process ends.
+
+        Should it still be alive, it is told ``no_session`` and opens another.
+        """
+        unwatched = [session for session in self if session.pidfd < 0]
+        return min(unwatched, key=lambda session: session.last_request_s, default=None)
+
     def open(self, identity: bytes, peer: Peer, client: str, now_s: float) -> Session:
-        """Begin a session; ``pidfd`` is -1 where the process cannot be watched."""
+        """Begin a session; ``pidfd`` is -1 where the process cannot be watched.
+
+        Raises
+        ------
+        NoSession
+            The process has ended already: nobody would ever end its session.
+        """
         slot = secrets.randbelow(MAX_SLOT) + 1
         pidfd = -1
         if peer.pid > 0:
-            with contextlib.suppress(OSError):
+            try:
                 pidfd = os.pidfd_open(peer.pid)
+            except ProcessLookupError:
+                raise NoSession(f"process {peer.pid} has ended") from None
+            except OSError:
+                pidfd = -1  # a kernel without pidfds, or no descriptor left
         session = Session(
             slot, identity, peer, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s
         )
