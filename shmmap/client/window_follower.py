@@ -63,6 +63,7 @@ class WindowFollower:
         self._refresh_interval_s = refresh_interval_s
         self._mailbox: SimpleQueue[Mapping | None] = SimpleQueue()
         self._pose: Intent | None = None
+        self._called = False
         self._stopping = False
         self._pause_s = 0.0
         self._changed = threading.Condition()
@@ -82,7 +83,8 @@ class WindowFollower:
     def follow(self, pose: Intent) -> None:
         """Take a new pose; returns at once."""
         self._pose = pose
-        if moved(self.state, pose, self._update_distance):
+        if not self._called and moved(self.state, pose, self._update_distance):
+            self._called = True  # once is enough, however often poses come
             self._mailbox.put(None)
 
     def wait_until_current(self, timeout_s: float) -> bool:
@@ -138,7 +140,9 @@ class WindowFollower:
                 return not self._stopping
             if mapping is not None:
                 self._unmapper.finish(mapping)
-            elif remaining_s > 0 or self._stopping:
+                continue
+            self._called = False  # before the pose is read: the next one calls again
+            if remaining_s > 0 or self._stopping:
                 return not self._stopping
 
     def _refresh(self, pose: Intent) -> float:

@@ -27,7 +27,16 @@ __all__ = [
 MAX_REQUEST_BYTES: Final = 4 << 20
 """Larger requests are refused by the socket itself: 10^5 packed held cells fit 800 kB."""
 
-_encoder: Final = msgspec.msgpack.Encoder()
+
+def _plain(value: object) -> object:
+    """Numbers that numpy computed (a pose, a radius) travel as the plain numbers they are."""
+    item = getattr(value, "item", None)
+    if item is None or getattr(value, "shape", None) != ():
+        raise TypeError(f"a message cannot carry {type(value).__name__}")
+    return item()
+
+
+_encoder: Final = msgspec.msgpack.Encoder(enc_hook=_plain)
 _requests: Final[msgspec.msgpack.Decoder[Request]] = msgspec.msgpack.Decoder(Request)
 _replies: Final[msgspec.msgpack.Decoder[Reply]] = msgspec.msgpack.Decoder(Reply)
 

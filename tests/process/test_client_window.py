@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`MapWindow` against a real daemon: every step equals an independent set difference."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.errors import BadRequest, DaemonUnreachable, NoAnswer
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, make_map, random_points
+
+Factory = Callable[..., DaemonProcess]
+LONG_S = 60.0
+
+ROUTE = [(-50 + 7.0 * i, 20 * np.sin(i / 3)) for i in range(15)]
+
+
+def by_name(cells: tuple[shmmap.Cell, ...]) -> dict[str, shmmap.Cell]:
+    return {Path(cell.id).name: cell for cell in cells}
+
+
+def assert_window(window: shmmap.MapWindow, made: DividedMap, x: float, y: float, radius: float) -> None:
+    """The window holds exactly the cells of the circle, with the bits of the files."""
+    cells = by_name(window.cells)
+    assert sorted(cells) == made.in_circle(x, y, radius)
+    for name, cell in cells.items():
+        source = made.points(name)
+        assert cell.xyz.tobytes() == np.stack([source["x"], source["y"], source["z"]], axis=1).tobytes()
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_every_step_is_the_set_difference(daemon: Factory, divided_map: DividedMap, background: bool) -> None:
+    one = daemon(divided_map.root)
+    before: set[str] = set()
+    with shmmap.MapWindow(one.endpoint, 35, update_distance=0, background=background) as window:
+        for x, y in ROUTE:
+            update = window.move_to(x, y, vx=7.0, wait=LONG_S)
+            inside = set(divided_map.in_circle(x, y, 35))
+            assert set(by_name(update.added)) == inside - before
+            assert set(by_name(update.kept)) == inside & before
+            assert {Path(cell_id).name for cell_id in update.removed} == before - inside
+            assert (update.changed, update.pending, update.failed) == ((), (), ())
+            assert window.complete
+            assert_window(window, divided_map, x, y, 35)
+            before = inside
+        unmoved = window.move_to(*ROUTE[-1], wait=LONG_S)
+        assert not unmoved.any
+        assert set(by_name(unmoved.kept)) == before
+        assert window.error is None
+        assert window.stale_since is None
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_reload_mid_drive(daemon: Factory, divided_map: DividedMap, background: bool) -> None:
+    one = daemon(divided_map.root)
+    rng = np.random.default_rng(3)
+    with (
+        shmmap.connect(one.endpoint) as admin,
+        shmmap.MapWindow(one.endpoint, 30, update_distance=0, background=background) as window,
+    ):
+        window.move_to(0, 0, wait=LONG_S)
+        old = by_name(window.cells)
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(rng, (0, 0), 99))
+        divided_map.write_cell("20_0.pcd", (20, 0), random_points(rng, (20, 0), 1))
+        divided_map.remove_cell("-20_-20.pcd")
+        divided_map.write_metadata()
+        admin.reload()
+        update = window.move_to(0.5, 0, wait=LONG_S)
+        assert set(by_name(update.changed)) == {"0_0.pcd", "20_0.pcd"}
+        assert [Path(cell_id).name for cell_id in update.removed] == ["-20_-20.pcd"]
+        assert update.added == ()
+        assert_window(window, divided_map, 0.5, 0, 30)
+        old["0_0.pcd"].verify()
+        assert old["0_0.pcd"].points == 500
+
+
+def test_a_window_that_stands_still_learns_of_a_reload(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with (
+        shmmap.connect(one.endpoint) as admin,
+        shmmap.MapWindow(one.endpoint, 30, refresh_interval=0.05) as window,
+    ):
+        window.move_to(0, 0, wait=LONG_S)
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(3), (0, 0), 99))
+        told = admin.reload()
+        wait_for(window, lambda: window.map_version == told.map_version and window.complete)
+        assert by_name(window.cells)["0_0.pcd"].points == 99
+        (changed,) = window.move_to(0, 0).changed
+        assert changed.points == 99
+
+
+def wait_for(window: shmmap.MapWindow, reached: Callable[[], bool]) -> None:
+    """Wait until the window's thread has published a state that fits."""
+    assert window._follower is not None
+    with window._follower._changed:
+        assert window._follower._changed.wait_for(reached, LONG_S)
+
+
+def test_small_moves_ask_nothing(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, name="me") as client:
+        window = shmmap.MapWindow(client, 30, update_distance=20, refresh_interval=1e6, background=False)
+        window.move_to(0, 0)
+        asked = client.stats().sessions[0].requests
+        for x in (3.0, 19.9, -19.9):
+            assert not window.move_to(x, 0).any
+        assert client.stats().sessions[0].requests == asked + 1, "the statistics themselves"
+        assert window.move_to(20.0, 0).any
+        assert_window(window, divided_map, 20, 0, 30)
+        window.close()
+        assert client.stats().sessions[0].cells == 0, "what was dropped was told"
+
+
+def test_the_square_and_heights(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        client.around(0, 0, 200)  # heights are known from the first load on
+        with shmmap.MapWindow(client, 25, shape="square", background=False) as window:
+            window.move_to(1, 2)
+            assert sorted(by_name(window.cells)) == divided_map.in_square(1, 2, 25)
+        with shmmap.MapWindow(client, 25, z=(50, 60), background=False) as window:
+            window.move_to(1, 2)
+            assert window.cells == ()
+
+
+def test_points_around_and_retention(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    keep = shmmap.Retention(distance=200.0)
+    with shmmap.connect(one.endpoint) as client:
+        with shmmap.MapWindow(client, 25, update_distance=0, retention=keep, background=False) as window:
+            window.move_to(-30, 0)
+            first = window.cells
+            assert len(window.points_around(-30, 0, 5)) == 2
+            window.move_to(30, 0)
+            assert_window(window, divided_map, 30, 0, 25)
+            assert not len(window.points_around(-30, 0, 5)), "what is retained is not in the window"
+            handed_out = client.stats().counters["handles_sent"]
+            window.move_to(-30, 0)
+            assert client.stats().counters["handles_sent"] == handed_out + len(first)
+            assert all(a is b for a, b in zip(window.cells, first, strict=True)), "nothing was attached again"
+        del first
+        client.release()
+        assert client.stats().sessions[0].cells == 0
+
+
+# --- failing daemons ------------------------------------------------------------------------------
+
+
+def test_a_background_window_survives_its_daemon(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = shmmap.connect(one.endpoint, timeout=0.3)
+    with shmmap.MapWindow(client, 30, update_distance=0, refresh_interval=0.05) as window:
+        window.move_to(0, 0, wait=LONG_S)
+        one.kill()
+        wait_for(window, lambda: window.error is not None)
+        assert isinstance(window.error, DaemonUnreachable)
+        assert window.stale_since is not None
+        for x in range(5):
+            update = window.move_to(x * 5.0, 0)
+            assert not update.any
+            assert len(window.points_around(0, 0, 10)) == 4
+        assert not window.wait_until_current(0)
+        one.start()
+        assert window.wait_until_current(LONG_S)
+        assert [window.error, window.stale_since] == [None, None]
+        assert_window(window, divided_map, 20, 0, 30)
+        inside, before = set(divided_map.in_circle(20, 0, 30)), set(divided_map.in_circle(0, 0, 30))
+        update = window.move_to(20, 0)
+        assert set(by_name(update.kept)) == inside & before
+        assert set(by_name(update.added)) == inside - before
+    client.close()
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_restart_with_a_changed_map(daemon: Factory, divided_map: DividedMap, background: bool) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.MapWindow(one.endpoint, 30, refresh_interval=0.05, background=background) as window:
+        window.move_to(0, 0, wait=LONG_S)
+        one.kill()
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(4), (0, 0), 50))
+        divided_map.remove_cell("-20_0.pcd")
+        divided_map.write_metadata()
+        one.start()
+        before = window.map_version
+        if background:
+            wait_for(window, lambda: window.map_version != before and window.complete)
+        update = window.move_to(25, 0, wait=LONG_S)
+        assert {"0_0.pcd"} == set(by_name(update.changed))
+        assert "-20_0.pcd" in {Path(cell_id).name for cell_id in update.removed}
+        assert_window(window, divided_map, 25, 0, 30)
+
+
+def test_a_blocking_window_raises_and_keeps_what_it_has(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = shmmap.connect(one.endpoint, timeout=0.3)
+    with shmmap.MapWindow(client, 30, background=False) as window:
+        window.move_to(0, 0, wait=LONG_S)
+        held = window.cells
+        one.send(signal.SIGSTOP)
+        with pytest.raises(NoAnswer):
+            window.move_to(50, 0, wait=0)
+        assert window.cells == held
+        one.send(signal.SIGCONT)
+        window.move_to(50, 0, wait=LONG_S)
+        assert_window(window, divided_map, 50, 0, 30)
+    client.close()
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
+    daemon: Factory, tmp_path: Path, background: bool
+) -> None:
+    made = make_map(tmp_path / "map", columns=4, rows=4, points=20_000)
+    everything = (0, 0, 100)
+    roomy = daemon(made.root)
+    with shmmap.connect(roomy.endpoint) as client:
+        assert client.around(*everything, wait=LONG_S).complete
+        largest = max(os.stat(f"{roomy.shm_dir}/{name}").st_blocks * 512 for name in roomy.segments())
+        statistics = Path(roomy.shm_dir, f"shmmap.{roomy.instance}.statistics").stat().st_blocks * 512
+        need = roomy.segment_bytes() + statistics
+    roomy.stop()
+    # the quota is about several clients: here one may fill all of it
+    tight = daemon(made.root, "--budget", str(need + largest + 65_536), "--session-quota", "1.0")
+    with (
+        shmmap.connect(tight.endpoint) as admin,
+        shmmap.MapWindow(
+            tight.endpoint, 100, background=background, refresh_interval=0.05, retention=shmmap.Retention(1e6)
+        ) as window,
+    ):
+        window.move_to(0, 0, wait=LONG_S)
+        assert_window(window, made, *everything)
+        rng = np.random.default_rng(8)
+        for name, corner in list(made.corners.items()):
+            made.write_cell(name, corner, random_points(rng, corner, 20_000))
+        told = admin.reload()
+        if background:
+            wait_for(window, lambda: window.map_version == told.map_version and window.complete)
+        for _ in range(100):
+            window.move_to(0, 0, wait=LONG_S)
+            if window.complete and window.map_version == told.map_version:
+                break
+        assert_window(window, made, *everything)
+
+
+# --- threads and system calls -----------------------------------------------------------------------
+
+
+def test_a_window_nobody_closes_ends_with_the_program(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    before = threading.active_count()
+    window = shmmap.MapWindow(one.endpoint, 30)
+    window.move_to(0, 0, wait=LONG_S)
+    view = window.cells[0].xyz
+    assert threading.active_count() == before + 1
+    del window
+    assert threading.active_count() == before
+    assert np.isfinite(view).all()
+    program = f"""
+import shmmap
+window = shmmap.MapWindow({one.endpoint!r}, 30)
+print(len(window.move_to(0, 0, wait={LONG_S}).added))
+cells = window.cells
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert int(done.stdout) == len(divided_map.in_circle(0, 0, 30))
+
+
+def test_a_closed_window(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        window = shmmap.MapWindow(client, 30)
+        window.move_to(0, 0, wait=LONG_S)
+        cell = window.cells[0]
+        window.close()
+        window.close()
+        assert window.cells == ()
+        with pytest.raises(BadRequest, match="closed"):
+            window.move_to(0, 0)
+        cell.verify()
+        assert client.around(0, 0, 30).complete, "the client is the caller's"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"radius": -1.0},
+        {"shape": "hexagon"},
+        {"update_distance": -1.0},
+        {"refresh_interval": 0.0},
+        {"z": (2.0, 1.0)},
+    ],
+)
+def test_impossible_parameters_are_refused(
+    daemon: Factory, divided_map: DividedMap, options: dict[str, float]
+) -> None:
+    one = daemon(divided_map.root)
+    before = threading.active_count()
+    with pytest.raises(BadRequest):
+        shmmap.MapWindow(one.endpoint, **options)  # type: ignore[arg-type]
+    assert threading.active_count() == before
+
+
+SWAP = """
+import os, sys, threading
+import shmmap
+endpoint, length = sys.argv[1], float(sys.argv[2])
+window = shmmap.MapWindow(endpoint, 180, update_distance=0, refresh_interval=1e6)
+def drive(rounds):
+    most = 0
+    for number in range(rounds):
+        x = length if number % 2 else -length
+        window.move_to(x, 0.0)
+        while True:
+            update = window.move_to(x, 0.0)
+            around = window.points_around(x, 0.0, 50.0)
+            sum(len(view) for view in around)
+            if update.added:
+                most = max(most, len(update.added))
+                break
+    return most
+drive(6)
+print(threading.get_native_id(), flush=True)
+os.write(2, b"BEGIN\\n")
+most = drive(4)
+os.write(2, b"END\\n")
+print(most)
+os._exit(0)
+"""
+
+
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
+def test_a_swap_makes_no_system_call_that_maps_on_the_control_thread(daemon: Factory, tmp_path: Path) -> None:
+    made = make_map(tmp_path / "map", columns=50, rows=16, points=20)
+    one = daemon(made.root)
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(shmmap.Box(-500, -160, 500, 160), wait=LONG_S).complete
+    calls = tmp_path / "calls.txt"
+    done = subprocess.run(
+        [
+            "strace", "-f", "--seccomp-bpf", "-o", str(calls), "-e", "trace=open,openat,mmap,munmap,mremap,close,write",
+            sys.executable, "-c", SWAP, one.endpoint, "250",
+        ],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    control, swapped = (int(word) for word in done.stdout.split())
+    assert swapped >= 256
+    lines = calls.read_text().splitlines()
+    (begin,) = [i for i, line in enumerate(lines) if '"BEGIN' in line]
+    (end,) = [i for i, line in enumerate(lines) if '"END' in line]
+    between = lines[begin:end]
+    elsewhere = [line for line in between if not line.startswith(f"{control} ")]
+    assert sum("munmap(" in line for line in elsewhere) >= 256, "the window's thread does it"
+    here = [line for line in between if line.startswith(f"{control} ")]
+    assert [line for line in here if re.search(r" (open|openat|mmap|munmap|mremap|close)\(", line)] == []
