@@ -18,6 +18,7 @@ from tests.process.test_requests import assert_same_points, names
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.memory_watch import MemoryWatch
+from tests.support.patience import Patience
 from tests.support.raw_client import RawCells, RawClient, RawHandle, circle
 from tests.support.segment_reader import map_segment
 
@@ -131,7 +132,8 @@ def test_a_full_budget_names_who_fills_it(
         assert stranger.checksums()
         holder.drop_all()
     done: set[str] = set()
-    while len(done) < 12:  # once others let go it goes on, a few at a time as the budget allows
+    waiting = Patience()
+    while waiting(len(done) < 12):  # once others let go it goes on, a few at a time as the budget allows
         reply = other.selected([i for i in ids[20:40] if i not in done][:8], wait=10.0)
         done |= {h.id for h in reply.cells}
     assert one.segment_bytes() <= budget
@@ -235,7 +237,8 @@ def test_a_full_file_system_is_reported_and_survived(
     assert {f.code for f in reply.failed} == {"no_space"}
     assert len(holder.client.area(circle(0, 0, 5)).cells) == 4
     filler.unlink()
-    while reply.failed:
+    waiting = Patience()
+    while waiting(bool(reply.failed)):
         reply = holder.client.area(circle(60, 60, 15), wait=10.0)
     assert names(reply.cells) == heavy_map.in_circle(60, 60, 15)
     holder.drop_all()

@@ -14,6 +14,7 @@ import pytest
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, wait_ended
 from tests.support.divided_map import DividedMap
+from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -24,7 +25,8 @@ def stop_loaders(one: DaemonProcess) -> list[int]:
     loaders = one.children()
     for pid in loaders:
         os.kill(pid, signal.SIGSTOP)
-        while Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T":
+        waiting = Patience()
+        while waiting(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T"):
             os.sched_yield()
     return loaders
 
@@ -103,7 +105,8 @@ def test_a_loader_that_is_killed_costs_one_cell(
     assert (failure.code, "SIGKILL" in failure.message) == ("load_failed", True)
     assert client.ask("stats")[4]["worker_crashes"] == 1
     reply = client.area(circle(40, 40, 5))  # not tried again at once
-    while reply.failed:
+    waiting = Patience()
+    while waiting(bool(reply.failed)):
         reply = client.area(circle(40, 40, 5))
     assert len(reply.cells) == 4
 
@@ -169,7 +172,8 @@ def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
     interim.write_bytes(whole)
     interim.rename(path)
     reply = client.area(circle(0, 0, 5))
-    while reply.failed:  # a file that could not even be looked at is tried again after a while
+    waiting = Patience()
+    while waiting(bool(reply.failed)):  # a file that could not even be looked at is tried again after a while
         reply = client.area(circle(0, 0, 5))
     assert len(reply.cells) == 4
 

@@ -19,6 +19,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
+from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -135,7 +136,8 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
     assert read_statistics(one.instance, one.shm_dir).state == "stopped"
     one.send(signal.SIGCONT)
-    while (seen := read_statistics(one.instance, one.shm_dir)).counters["cells_resident"] < 12:
+    waiting = Patience()
+    while waiting((seen := read_statistics(one.instance, one.shm_dir)).counters["cells_resident"] < 12):
         client.ask("stats")
     assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
     assert {cell.state for cell in seen.cells} == {"resident"}
@@ -209,7 +211,8 @@ def test_strangers_segments_are_left_alone(
     one.start()
     client = connect(one)
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    while len(one.segments()) > 4:
+    waiting = Patience()
+    while waiting(len(one.segments()) > 4):
         client.ask("stats")
     assert (other.read_bytes(), longer.read_bytes()) == (b"mine", b"mine")
     other.unlink()

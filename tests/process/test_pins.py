@@ -13,6 +13,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
+from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -20,7 +21,8 @@ Connect = Callable[..., RawClient]
 
 def until_freed(one: DaemonProcess, client: RawClient) -> None:
     """Ask until no segment is left (the daemon looks at retired ones by itself)."""
-    while one.segments():
+    waiting = Patience()
+    while waiting(bool(one.segments())):
         client.ask("stats")
 
 
@@ -35,10 +37,12 @@ def test_evicting_everything_frees_what_nobody_maps(
     with MappingProcess(paths) as reader:
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (len(handles) - 2, 2)
-        while len(one.segments()) > 2:
+        waiting = Patience()
+        while waiting(len(one.segments()) > 2):
             client.ask("stats")
         assert all(name.endswith(".zombie") for name in one.segments())
-        while client.ask("stats")[4]["zombies"] != 2:  # gauges are written a few times a second
+        waiting = Patience()
+        while waiting(client.ask("stats")[4]["zombies"] != 2):  # gauges are written a few times a second
             pass
         os.kill(reader.pid, signal.SIGSTOP)
         client.ask("evict")
@@ -106,5 +110,6 @@ def test_a_name_removed_behind_the_daemon_s_back(
     again = client.selected(["0_0.pcd"]).cells[0]
     assert again.segment != handle.segment
     assert Path(client.path(again)).exists()
-    while client.ask("stats")[4]["bytes_resident"] != one.segment_bytes():
+    waiting = Patience()
+    while waiting(client.ask("stats")[4]["bytes_resident"] != one.segment_bytes()):
         pass

@@ -14,6 +14,7 @@ from tests.process.conftest import DaemonFactory
 from tests.process.test_requests import assert_same_points, names
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
+from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 from tests.support.segment_reader import map_segment, parse
 
@@ -81,7 +82,8 @@ def test_the_signal(daemon: DaemonFactory, connect: Connect, divided_map: Divide
     change(divided_map, "0_0.pcd", 5)
     one.send(signal.SIGHUP)
     reply = client.selected(["0_0.pcd"])
-    while reply.map_version == old.map_version:
+    waiting = Patience()
+    while waiting(reply.map_version == old.map_version):
         reply = client.selected(["0_0.pcd"])
     assert_same_points(client, reply.cells[0], divided_map)
 
@@ -162,10 +164,12 @@ def test_old_versions_stay_while_somebody_maps_them(
         new = client.selected(["0_0.pcd"]).cells[0]
         assert new.segment != old.segment
         assert reader.checksums() == before
-        while not any(name.endswith(".zombie") for name in one.segments()):
+        waiting = Patience()
+        while waiting(not any(name.endswith(".zombie") for name in one.segments())):
             client.ask("stats")
         assert len(one.segments()) == 2
-    while len(one.segments()) > 1:
+    waiting = Patience()
+    while waiting(len(one.segments()) > 1):
         client.ask("stats")
 
 
