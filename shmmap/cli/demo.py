@@ -48,7 +48,23 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--svg", metavar="FILE", help="where the picture goes (default: ./shmmap-demo.svg)")
     parser.add_argument("--keep-map", metavar="DIR", help="build the map in DIR, and leave it there")
+    parser.add_argument(
+        "--density",
+        metavar="POINTS",
+        type=_density,
+        help="points per square metre of ground; fewer are quicker (default: 100, or what fits)",
+    )
     add_json_option(parser)
+
+
+def _density(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 2.0 <= value <= 1000.0:
+        raise argparse.ArgumentTypeError(f"expected 2 to 1000 points per square metre, not {text!r}")
+    return value
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
     picture = _picture_path(args.svg)
     started_s = time.monotonic()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
-        result = run_demo(DemoSettings(), progress, map_dir=args.keep_map)
+        settings = DemoSettings() if args.density is None else DemoSettings(density=args.density)
+        result = run_demo(settings, progress, map_dir=args.keep_map)
     picture.write_text(_draw(result), encoding="utf-8")
     duration_s = time.monotonic() - started_s
     if args.json:

@@ -73,7 +73,7 @@ class LiveProgress(QuietProgress):
     def close(self) -> None:
         """Leave only the list of finished stages on the screen."""
         self._finish_stage()
-        self._text = ""
+        self._text, self._reports, self._counters = "", (), None
         self._draw()
 
     def _finish_stage(self) -> None:

@@ -94,9 +94,12 @@ class SharedMap:
 
     def complete(self) -> list[Cloud]:
         """Wait for the window's thread; returns the cells that are new."""
-        self._window.wait_until_current(_PATIENCE_S)
-        if not self._window.complete:
-            raise NoAnswer(f"the window is not complete after {_PATIENCE_S:g} s: {self._window.error}")
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while not self._window.wait_until_current(1.0):
+            if self._window.error is not None:
+                raise self._window.error
+            if time.monotonic() >= deadline_s:
+                raise NoAnswer(f"the window is not complete after {_PATIENCE_S:g} s")
         before, self.clouds = self.clouds, {}
         new = []
         for cell in self._window.cells:

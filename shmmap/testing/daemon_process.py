@@ -98,7 +98,7 @@ class DaemonProcess:
 
     def __enter__(self) -> DaemonProcess:
         # under /tmp whatever TMPDIR says: a socket's path holds 107 bytes
-        directory = self._scratch.enter_context(scratch_directory("shmmap-", "/tmp"))  # noqa: S108
+        directory = self._scratch.enter_context(scratch_directory(f"shmmap-{os.getpid()}-", "/tmp"))  # noqa: S108
         self._directory = Path(directory)
         try:
             self._start(self._directory)

@@ -51,6 +51,8 @@ _POINTS_PER_GROUND_POINT: Final = 1.65  # roofs, walls and leaves add to the gro
 _CELL_METRES: Final = 20.0
 _SMALLEST_DENSITY: Final = 2.0
 _FILL: Final = 0.8  # of what is free, at most
+_STATISTICS_BYTES: Final = 256 << 10
+_CELL_OVERHEAD_BYTES: Final = 12 << 10  # its header, and columns rounded up to pages
 _SPARE: Final = 1.25  # budget over window
 
 
@@ -221,7 +223,7 @@ def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None 
             watched = _WatchedDaemon(daemon, client)
             shared = _drive(fleet, town.route, settings.pace_s, progress, watched)
             traffic = watched.traffic()
-            resident = read_statistics(daemon.instance, daemon.shm_dir).cells
+            resident = _resident_now(daemon)
         with Fleet("private", map_dir, settings.radius) as fleet:
             progress.stage("The same drive, four private copies", len(town.route))
             private = _drive(fleet, town.route, 0.0, progress, None)
@@ -262,9 +264,10 @@ def fit(settings: DemoSettings, *, shm_bytes: int, disk_bytes: int) -> tuple[Dem
     per_metre2 = _POINTS_PER_GROUND_POINT * _POINT_BYTES
     window_metres2 = math.pi * (settings.radius + _CELL_METRES / 2) ** 2
     town_metres2 = math.prod(settings.blocks) * BLOCK_METRES**2
+    overhead_bytes = _STATISTICS_BYTES + window_metres2 / _CELL_METRES**2 * _CELL_OVERHEAD_BYTES
     density = min(
         settings.density,
-        _FILL * shm_bytes / (_SPARE * window_metres2 * per_metre2),
+        (_FILL * shm_bytes / _SPARE - overhead_bytes) / (window_metres2 * per_metre2),
         _FILL * disk_bytes / (town_metres2 * per_metre2),
     )
     if density < _SMALLEST_DENSITY:
@@ -272,7 +275,8 @@ def fit(settings: DemoSettings, *, shm_bytes: int, disk_bytes: int) -> tuple[Dem
             f"too little room: {shm_bytes >> 20} MiB of shared memory, {disk_bytes >> 20} MiB of disk",
             hint="a container gets more shared memory with `--shm-size=512m`; TMPDIR names another disk",
         )
-    return replace(settings, density=density), int(_SPARE * window_metres2 * per_metre2 * density)
+    budget_bytes = _SPARE * (window_metres2 * per_metre2 * density + overhead_bytes)
+    return replace(settings, density=density), int(budget_bytes)
 
 
 def build_town(settings: DemoSettings, map_dir: str, progress: Progress) -> TownMap:
@@ -280,8 +284,8 @@ def build_town(settings: DemoSettings, map_dir: str, progress: Progress) -> Town
     started_s = time.perf_counter()
     town = Town(seed=settings.seed, blocks=settings.blocks, density=settings.density)
     image = HeightImage(town.bounds)
-    progress.stage("Building a town", settings.blocks[0] * settings.blocks[1])
     with MapWriter(map_dir, prefix="town", durable=False) as writer:
+        progress.stage("Building a town", settings.blocks[0] * settings.blocks[1])
         for columns in town.tiles():
             writer.add(columns, complete=True)
             image.add(columns["xyz"], columns["intensity"])
@@ -347,6 +351,16 @@ def _drive(
         memory=sum_memory(pids),
         shm_bytes=_shm_bytes(daemon.process) if daemon else 0,
     )
+
+
+def _resident_now(daemon: DaemonProcess) -> list[CellRow]:
+    """Read the table of resident cells as it is now or later: the daemon writes it four times a second."""
+    asked_s = time.monotonic()
+    while True:
+        found = read_statistics(daemon.instance, daemon.shm_dir)
+        if found.beat_age_s < time.monotonic() - asked_s or found.state != "healthy":
+            return found.cells
+        time.sleep(0.02)
 
 
 def _median(values: Sequence[float]) -> float:

@@ -23,7 +23,6 @@ __all__ = ["Fleet", "StepReport"]
 
 _ANSWER_S: Final = 60.0
 _STOP_S: Final = 5.0
-_LAST_WORDS: Final = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,5 +174,6 @@ class Fleet:
 
     def _failure(self, index: int, what: str) -> InternalError:
         self._complaints[index].seek(0)
-        last_words = self._complaints[index].read()[-_LAST_WORDS:].strip()
-        return InternalError(f"consumer {index} {what}" + (f":\n{last_words}" if last_words else ""))
+        words = self._complaints[index].read().split("\n")
+        last = next((line for line in reversed(words) if line.strip()), "")  # of a traceback: the error
+        return InternalError(f"a consumer {what}" + (f": {last}" if last else ""))

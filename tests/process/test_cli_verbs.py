@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every verb against a real daemon: its JSON to the field, its text, its exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.divided_map import DividedMap, random_points
+from tests.support.pcd_files import read_pcd
+
+HEX = re.compile(r"[0-9a-f]{16}")
+
+
+class Shmmap:
+    """Runs ``shmmap`` as a user does, aimed at one daemon."""
+
+    def __init__(self, daemon: DaemonProcess, cwd: Path) -> None:
+        self.daemon = daemon
+        self.cwd = cwd
+        self.environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")} | {
+            "PYTHONPATH": str(ROOT),
+            "SHMMAP_INSTANCE": daemon.instance,
+            "SHMMAP_RUNTIME_DIR": daemon.runtime_dir,
+            "SHMMAP_SHM_DIR": daemon.shm_dir,
+        }
+
+    def __call__(self, *words: str, code: int = 0) -> str:
+        done = self.run(*words)
+        assert done.returncode == code, done.stderr + done.stdout
+        return done.stdout
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "shmmap.cli", *words],
+            env=self.environment,
+            cwd=self.cwd,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    def json(self, *words: str, code: int = 0) -> Any:
+        return json.loads(self(*words, "--json", code=code))
+
+
+@pytest.fixture
+def shmmap(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> Shmmap:
+    return Shmmap(daemon(divided_map.root), tmp_path)
+
+
+def test_query_has_exactly_the_fields_of_the_contract(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    found = shmmap.json("query", "--circle", "-5,3,25")
+    assert list(found) == ["epoch", "map_version", "frame_id", "cells", "removed", "pending", "failed"]
+    assert HEX.fullmatch(found["epoch"])
+    assert HEX.fullmatch(found["map_version"])
+    assert (found["frame_id"], found["removed"], found["pending"], found["failed"]) == ("map", [], [], [])
+    names = divided_map.in_circle(-5, 3, 25)
+    assert [cell["id"] for cell in found["cells"]] == [divided_map.id(name) for name in names]
+    for name, cell in zip(names, found["cells"], strict=True):
+        assert sorted(cell) == sorted(
+            ["id", "version", "layer", "segment", "offset", "bytes", "points", "stale", "box"]
+        )
+        assert HEX.fullmatch(cell["version"])
+        assert (cell["layer"], cell["offset"], cell["stale"]) == ("points", 0, False)
+        assert cell["box"] == list(divided_map.box(name))
+        assert cell["points"] == len(divided_map.points(name)["x"])
+        segment = Path(shmmap.daemon.shm_dir, cell["segment"].lstrip("/"))
+        assert cell["bytes"] <= segment.stat().st_size
+
+
+def test_areas_and_ids(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    def names(*words: str, code: int = 0) -> list[str]:
+        return [Path(cell["id"]).name for cell in shmmap.json("query", *words, code=code)["cells"]]
+
+    assert names("--circle=-5,3,25") == divided_map.in_circle(-5, 3, 25)
+    assert names("--square", "-5,3,25") == divided_map.in_square(-5, 3, 25)
+    assert names("--box", "-1,-1,1,1") == ["-20_-20.pcd", "-20_0.pcd", "0_-20.pcd", "0_0.pcd"]
+    assert names("--box", "-1,-1,1,1", "--z", "100,200") == []
+    assert names("--id", "0_0.pcd", divided_map.id("20_0.pcd"), "0_0.pcd") == [
+        "0_0.pcd",
+        "20_0.pcd",
+        "0_0.pcd",
+    ]
+    assert names("--id", "nowhere.pcd", "0_0.pcd", code=1) == ["0_0.pcd"]
+
+
+def test_query_differential(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    first = shmmap.json("query", "--circle", "0,0,5")["cells"]
+    held = [f"{cell['id']}@{cell['version']}" for cell in first]
+    moved = shmmap.json("query", "--circle", "20,0,5", "--held", *held, "/unknown/cell.pcd")
+    before, after = divided_map.in_circle(0, 0, 5), divided_map.in_circle(20, 0, 5)
+    assert [Path(cell["id"]).name for cell in moved["cells"]] == [n for n in after if n not in before]
+    gone = [cell["id"] for cell in first if Path(cell["id"]).name not in after]
+    assert moved["removed"] == [*gone, "/unknown/cell.pcd"]
+    # another version is not the one held; no version means the current one
+    other = f"{int(first[0]['version'], 16) ^ 1:x}"
+    again = shmmap.json("query", "--circle", "0,0,5", "--held", f"{first[0]['id']}@{other}", *held[1:])
+    assert [cell["id"] for cell in again["cells"]] == [first[0]["id"]]
+    assert shmmap.json("query", "--circle", "0,0,5", "--held", *(cell["id"] for cell in first))["cells"] == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--id", "a", "--held", "b"], ["--circle", "0,0,5", "--held", "a@xyz"], ["--id", "a", "--z", "0,1"]],
+)
+def test_query_usage(shmmap: Shmmap, words: list[str]) -> None:
+    done = shmmap.run("query", *words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("shmmap: ")
+
+
+def test_query_names_what_failed(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    (divided_map.pcd_dir / "0_0.pcd").write_bytes(b"not a point cloud")
+    found = shmmap.json("query", "--id", "0_0.pcd", "20_0.pcd", code=1)
+    assert [Path(cell["id"]).name for cell in found["cells"]] == ["20_0.pcd"]
+    (failed,) = found["failed"]
+    assert sorted(failed) == ["code", "holders", "id", "layer", "message"]
+    assert (failed["id"], failed["code"]) == (divided_map.id("0_0.pcd"), "load_failed")
+    text = shmmap("query", "--id", "0_0.pcd", code=1)
+    assert "load_failed" in text
+
+
+def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    shmmap("query", "--circle", "0,0,5")
+    pid = shmmap.daemon.pid
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        os.waitpid(pid, os.WUNTRACED)
+        status = shmmap.json("status")
+        assert (status["state"], status["pid"], status["instance"]) == (
+            "stopped",
+            pid,
+            shmmap.daemon.instance,
+        )
+        assert status["endpoint"] == shmmap.daemon.endpoint
+        assert status["counters"]["map_cells"] == 36
+        assert shmmap.json("health", code=1)["state"] == "stopped"
+        assert shmmap.json("ls")["state"] == "stopped"
+        done = shmmap.run("clients")
+        assert done.returncode == 69
+        assert "hint: " in done.stderr
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    assert shmmap.json("health")["state"] in ("healthy", "hung")
+    assert "0_0.pcd" in shmmap("ls")
+
+
+def test_status_of_a_dead_daemon(shmmap: Shmmap) -> None:
+    shmmap.daemon.kill()
+    assert shmmap.json("health", code=69)["state"] == "dead"
+    assert shmmap.json("status", code=69)["state"] == "dead"
+    assert shmmap.run("query", "--circle", "0,0,5").returncode == 69
+
+
+def test_ls_tells_what_is_resident(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    handles = {cell["id"]: cell for cell in shmmap.json("query", "--circle", "0,0,25")["cells"]}
+    listed: dict[str, Any] = {}
+    while len(listed) < len(handles):  # the daemon writes its table a few times a second
+        listed = {cell["id"]: cell for cell in shmmap.json("ls")["cells"]}
+    assert set(listed) == set(handles)
+    for cell_id, row in listed.items():
+        for name in ("version", "layer", "segment", "points", "box"):
+            assert row[name] == handles[cell_id][name]
+        assert row["state"] == "resident"
+        blocks = Path(shmmap.daemon.shm_dir, row["segment"].lstrip("/")).stat().st_blocks
+        assert row["bytes"] == blocks * 512
+
+
+def test_show_and_clients(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    before = shmmap.json("show", "0_0.pcd")
+    assert (before["id"], before["segments"], before["z"]) == (divided_map.id("0_0.pcd"), [], None)
+    (cell,) = shmmap.json("query", "--id", "0_0.pcd")["cells"]
+    shown = shmmap.json("show", "0_0.pcd")
+    (segment,) = shown["segments"]
+    assert segment["segment"] == cell["segment"]
+    assert (segment["state"], segment["points"], segment["holders"]) == ("resident", 500, [])
+    z = divided_map.points("0_0.pcd")["z"]
+    assert shown["z"] == [float(z.min()), float(z.max())]
+    assert shmmap.run("show", "nowhere.pcd").returncode == 1
+    told = shmmap.json("clients")
+    me = [row for row in told["clients"] if row["client"] == "shmmap"]
+    assert [row["uid"] for row in me] == [os.getuid()]
+    assert (told["unknown_holders"], told["unknown_bytes"]) == (0, 0)
+
+
+def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    first = shmmap.json("query", "--id", "0_0.pcd", "20_0.pcd")
+    rng = np.random.default_rng(7)
+    divided_map.write_cell("0_0.pcd", (0, 0), random_points(rng, (0, 0), 77))
+    divided_map.write_cell("200_0.pcd", (200, 0), random_points(rng, (200, 0), 5))
+    divided_map.remove_cell("40_40.pcd")
+    divided_map.write_metadata()
+    answer = shmmap.json("reload")
+    assert (answer["changed"], answer["added"], answer["removed"]) == (1, 1, 1)
+    second = shmmap.json("query", "--id", "0_0.pcd", "20_0.pcd")
+    assert second["map_version"] == answer["map_version"] != first["map_version"]
+    assert [cell["points"] for cell in second["cells"]] == [77, 500]
+    assert second["cells"][0]["version"] != first["cells"][0]["version"]
+    assert second["cells"][1] == first["cells"][1]
+    assert shmmap.json("evict", "20_0.pcd", "nowhere.pcd", code=1)["unknown"] == ["nowhere.pcd"]
+    assert not Path(shmmap.daemon.shm_dir, first["cells"][1]["segment"].lstrip("/")).exists()
+    assert shmmap.run("evict").returncode == 2
+    assert shmmap.json("evict", "--all")["pinned"] == 0
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_export_merged_pcd(shmmap: Shmmap, divided_map: DividedMap, encoding: str) -> None:
+    told = shmmap.json("export", "--circle", "0,0,5", "-o", "out.pcd", "--encoding", encoding)
+    names = divided_map.in_circle(0, 0, 5)
+    (file,) = told["files"]
+    assert (file["path"], file["points"]) == ("out.pcd", 500 * len(names))
+    described = shmmap.json("inspect", "out.pcd")
+    assert (described["encoding"], described["points"], described["dropped"]) == (encoding, 2000, 0)
+    if encoding == "binary":  # what the oracle reads
+        merged = read_pcd(shmmap.cwd / "out.pcd")
+        for field in ("x", "y", "z", "intensity"):
+            wanted = np.concatenate([divided_map.points(name)[field] for name in names])
+            assert merged[field].tobytes() == wanted.tobytes()
+
+
+def test_export_npz_and_single_cells(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    shmmap("export", "--id", "0_0.pcd", "-o", "cell.npz")
+    with np.load(shmmap.cwd / "cell.npz") as archive:
+        source = divided_map.points("0_0.pcd")
+        assert sorted(archive.files) == ["intensity", "xyz"]
+        assert archive["xyz"].tobytes() == np.column_stack([source[axis] for axis in "xyz"]).tobytes()
+    shmmap("export", "--id", "0_0.pcd", "20_0.pcd", "--output-dir", "cells")
+    assert sorted(path.name for path in (shmmap.cwd / "cells").iterdir()) == ["0_0.pcd", "20_0.pcd"]
+    copy, original = read_pcd(shmmap.cwd / "cells" / "20_0.pcd"), divided_map.points("20_0.pcd")
+    assert all(copy[name].tobytes() == original[name].tobytes() for name in original)
+
+
+def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
+    shmmap: Shmmap, divided_map: DividedMap
+) -> None:
+    target = shmmap.cwd / "out.pcd"
+    target.write_bytes(b"precious")
+    done = shmmap.run("export", "--id", "0_0.pcd", "-o", "out.pcd")
+    assert done.returncode == 2
+    assert "--force" in done.stderr
+    assert target.read_bytes() == b"precious"
+    shmmap("export", "--id", "nowhere.pcd", "0_0.pcd", "-o", "other.pcd", code=1)
+    shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", code=2)
+    shmmap("export", "--id", "0_0.pcd", "-o", "other.xyz", code=2)
+    (divided_map.pcd_dir / "20_0.pcd").write_bytes(b"broken")
+    shmmap("export", "--id", "0_0.pcd", "20_0.pcd", "--output-dir", ".", code=1)
+    assert sorted(path.name for path in shmmap.cwd.iterdir()) == ["map", "out.pcd"]
+    shmmap("export", "--id", "0_0.pcd", "-o", "out.pcd", "--force")
+    assert len(read_pcd(target)["x"]) == 500
+
+
+def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:
+    shmmap.environment.pop("SHMMAP_INSTANCE")
+    shmmap.environment.pop("SHMMAP_RUNTIME_DIR")
+    for endpoint in (shmmap.daemon.endpoint, f"ipc://{shmmap.daemon.endpoint}"):
+        assert shmmap.json("query", "--circle", "0,0,5", "--endpoint", endpoint)["cells"]
+        assert shmmap.json("health", "--endpoint", endpoint)["state"] == "healthy"
+    done = shmmap.run("query", "--circle", "0,0,5", "--endpoint", "tcp://127.0.0.1:1")
+    assert done.returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["serve", "/nowhere/at/all"], 66),
+        (["serve", ".", "--budget", "much"], 78),
+        (["serve", ".", "--instance", "a/b"], 78),
+        (["serve", ".", "--config", "missing.toml"], 78),
+        (["inspect", "missing.pcd"], 66),
+        (["inspect", "broken.pcd"], 65),
+    ],
+)
+def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path) -> None:
+    (tmp_path / "broken.pcd").write_bytes(b"\0" * 100)
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")} | {
+        "PYTHONPATH": str(ROOT),
+        "XDG_RUNTIME_DIR": str(tmp_path),
+        "SHMMAP_SHM_DIR": "/dev/shm",
+        "SHMMAP_INSTANCE": f"test-{os.getpid()}-unused",
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap.cli", *words],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    assert any(line.startswith("shmmap: ") for line in done.stderr.splitlines())
