@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A warm differential request against a bare ZeroMQ echo of equal sizes, and while cells load.
 
-    python -m tests.benchmarks.warm_request [--rounds 40]
+    python -m tests.benchmarks.warm_request [--rounds 40] [--pin]
 
 The client holds 256 cells and asks for an area that brings it 40 new ones and takes 40 away; all are
 in memory.  The echo is a ROUTER in another process that answers a frame as long as our request
 with a frame as long as our reply.  Rounds of both alternate in one run; compare the ratios.
+``--pin`` gives the client one processor and both servers another: without it the scheduler may
+place the two differently, which alone is worth a factor of two.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -77,6 +80,12 @@ def time_block(socket: zmq.Socket[bytes], request: bytes, *, decode: bool = Fals
     return times
 
 
+def pin(pid: int, processors: set[int]) -> None:
+    """Keep every thread of a process on these processors."""
+    for thread in os.listdir(f"/proc/{pid}/task"):
+        os.sched_setaffinity(int(thread), processors)
+
+
 def heavy_cells(made: DividedMap, count: int, points: int) -> list[str]:
     """Add cells far away whose loading is work."""
     rng = np.random.default_rng(9)
@@ -119,6 +128,7 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--passes", type=int, default=6)
+    parser.add_argument("--pin", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
@@ -147,6 +157,11 @@ def main() -> None:
             assert len(reply.removed or reply.removed_versions) == NEW
             sizes[name] = (len(request), reply.wire_bytes)
         echoes = {n: Echo(f"{one.runtime_dir}/echo-{n}.sock", *sizes[n]) for n in sizes}
+        if arguments.pin:
+            first, *others = sorted(os.sched_getaffinity(0))
+            pin(os.getpid(), {first})
+            for pid in (one.pid, *(echo.process.pid for echo in echoes.values())):
+                pin(pid, set(others[:1]) or {first})
         times: dict[str, list[float]] = {}
         try:
             for _ in range(arguments.rounds):

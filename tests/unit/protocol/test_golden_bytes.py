@@ -6,10 +6,11 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from shmmap.protocol import messages as m
-from shmmap.protocol.codec import decode_reply, decode_request, encode, encode_handle
+from shmmap.protocol.codec import decode_reply, decode_request, encode, encode_cells, encode_handle
 from tests.support.message_pack import pack, unpack
 
 U64 = 2**64 - 1
@@ -299,6 +300,24 @@ def test_a_handle_packed_once_is_the_same_bytes_inside_a_reply() -> None:
     raw = msgspec.Raw(encode_handle(HANDLE))
     reply = ("cells", 4, 3, 5, [raw, raw], (), b"", (), ())
     assert decode_reply(encode(reply)) == m.Cells(4, 3, 5, (HANDLE, HANDLE))
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65535, 65536])
+def test_a_reply_put_together_from_packed_handles_is_the_same_bytes(count: int) -> None:
+    """At every size at which MessagePack changes the form of an array."""
+    rest = (("b.pcd",), bytes(8), (m.PendingCell("c", "points"),), (m.FailedCell("d", "points", "x", "y"),))
+    whole = m.Cells(4, U64, 5, (HANDLE,) * count, *rest)
+    together = encode_cells(4, U64, 5, [encode_handle(HANDLE)] * count, *rest)
+    assert together == encode(whole)
+    assert encode_cells(4, 3, 5, [], (), b"", (), ()) == encode(m.Cells(4, 3, 5))
+
+
+def test_numbers_that_numpy_computed() -> None:
+    plain = m.Intent(1.5, 2.0, 3.0, 0.0, None, ())
+    numpy = m.Intent(np.float32(1.5), np.float64(2), np.int64(3))  # type: ignore[arg-type]
+    assert unpack(encode(numpy))[:3] == unpack(encode(plain))[:3]
+    with pytest.raises(TypeError):
+        encode(m.Show(1, object()))  # type: ignore[arg-type]
 
 
 def test_a_warm_handle_stays_under_200_bytes() -> None:
