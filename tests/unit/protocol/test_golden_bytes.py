@@ -314,7 +314,7 @@ def test_a_reply_put_together_from_packed_handles_is_the_same_bytes(count: int) 
 
 def test_numbers_that_numpy_computed() -> None:
     plain = m.Intent(1.5, 2.0, 3.0, 0.0, None, ())
-    numpy = m.Intent(np.float32(1.5), np.float64(2), np.int64(3))  # type: ignore[arg-type]
+    numpy = m.Intent(np.float32(1.5), np.float64(2), np.int64(3))
     assert unpack(encode(numpy))[:3] == unpack(encode(plain))[:3]
     with pytest.raises(TypeError):
         encode(m.Show(1, object()))  # type: ignore[arg-type]
