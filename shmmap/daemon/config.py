@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 import sys
@@ -31,7 +32,9 @@ else:
 __all__ = ["DaemonConfig", "load_config", "parse_bytes"]
 
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
+LARGEST_BYTES: Final = 1 << 62
 _ENVIRONMENT: Final = "SHMMAP_"
+_TRUTHS: Final = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 _NOT_SETTINGS: Final = ("SHMMAP_TEST_", "SHMMAP_ENDPOINT")
 
 
@@ -104,11 +107,18 @@ def _default_runtime_dir() -> str:
 
 
 def parse_bytes(text: str) -> int:
-    """Read a size such as ``512M``, ``2GiB`` or ``1000000`` (powers of 1024)."""
+    """Read a size such as ``512M``, ``2GiB`` or ``1000000`` (powers of 1024), at most 2^62 bytes.
+
+    Raises
+    ------
+    ConfigError
+        It is no size, or a larger one.
+    """
     match = _SIZE.fullmatch(text)
-    if match is None:
+    nbytes = float(match[1]) * 1024.0 ** " kmgt".index(match[2].lower() or " ") if match else math.inf
+    if not nbytes <= LARGEST_BYTES:
         raise ConfigError(f"{text!r} is no size", hint="write for example 512M or 2G")
-    return int(float(match[1]) * 1024 ** " kmgt".index(match[2].lower() or " "))
+    return int(nbytes)
 
 
 def _convert(name: str, value: Any, origin: str) -> Any:
@@ -119,31 +129,33 @@ def _convert(name: str, value: Any, origin: str) -> Any:
             value = parse_bytes(value) if isinstance(value, str) else value
         if name == "session_quota" and isinstance(value, str) and not value.replace(".", "").isdigit():
             value = float(parse_bytes(value))
+        if name == "instance" and isinstance(value, str):
+            check_instance(value)
         if kind is bool and isinstance(value, str):
-            value = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}[
-                value.lower()
-            ]
+            value = _TRUTHS[value.lower()]
         elif kind in (int, float) and isinstance(value, str):
             value = kind(value)
         elif kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise ValueError
-    except (KeyError, ValueError):
+    except ConfigError as error:
+        raise ConfigError(
+            f"{origin}: {name}: {error.message}", key=name, origin=origin, hint=error.hint
+        ) from None
+    except (KeyError, ValueError, OverflowError):
         raise ConfigError(
             f"{origin}: {name} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
         ) from None
     allowed: dict[str, Callable[[Any], bool]] = {
-        "session_quota": lambda v: v > 0,
+        "session_quota": lambda v: 0 < v <= LARGEST_BYTES,
         "workers": lambda v: 1 <= v <= 64,
         "load_timeout_s": lambda v: 0 < v <= 86400,
-        "budget_bytes": lambda v: v >= 0,
+        "budget_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
         "eviction": lambda v: v in ("distance", "lru"),
     }
     if name in allowed and not allowed[name](value):
         raise ConfigError(f"{origin}: {name} cannot be {value!r}", key=name, origin=origin)
-    if name == "instance":
-        check_instance(value)
     return value
 
 
