@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.layout import (
+    PAGE_BYTES,
     ColumnRow,
     PublishBlock,
     SegmentHeader,
@@ -209,10 +210,19 @@ def attach(
         end = offset + nbytes if nbytes else available
         if end > available or end == 0:
             raise SegmentCorrupt(f"segment {name} has {available} bytes, the handle needs {end}")
+        size = end - offset
+        # Reading the header is cheaper than the page fault that looking at it would cost
+        page = os.pread(fd, min(size, PAGE_BYTES), offset)
+        header_bytes = int.from_bytes(page[16:24], "little")
+        if PAGE_BYTES < header_bytes <= size:
+            page = os.pread(fd, header_bytes, offset)
+        _, columns = read_columns(memoryview(page), size)
         mapping = _Mapping(fd, end, populate, on_unmap)
+    except OSError as error:
+        raise SegmentError(f"segment {name} cannot be read: {error.strerror}") from error
     finally:
         os.close(fd)
     raw: NDArray[np.uint8] = np.asarray(mapping)
     if offset:
         raw = raw[offset:]
-    return AttachedSegment(read_columns(raw.data, len(raw))[1], raw)
+    return AttachedSegment(columns, raw)

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cost of attaching a cell, and of importing the client.
+
+Attaching includes the open, the session's lock, the mapping, the header's checksum and the cell object
+with its coordinates and one more column; what it is compared with: ``posix_ipc`` and ``mmap`` bare.
+
+    python tests/benchmarks/attach.py [--cells 500] [--rounds 20] [--points 20000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import mmap
+import os
+import statistics
+import subprocess
+import sys
+import time
+
+import numpy as np
+import posix_ipc
+
+from shmmap.client.attaching import Attacher
+from shmmap.client.cell import Cell
+from shmmap.columns import ColumnSpec
+from shmmap.protocol.messages import Handle
+from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
+from shmmap.segment.layout import PublishBlock, SourceStamp
+from shmmap.segment.names import new_segment_name
+from shmmap.segment.writer import SegmentWriter
+
+__all__ = ["main"]
+
+_IMPORTS = """
+import json, re, time
+began = time.process_time()
+import numpy, zmq, posix_ipc, msgspec
+bare = time.process_time() - began
+import shmmap
+shmmap.connect
+whole = time.process_time() - began
+with open("/proc/self/status") as status:
+    print(json.dumps([bare, whole, int(re.search(r"VmHWM:\\s+(\\d+) kB", status.read())[1])]))
+"""
+
+
+def publish(directory: ShmDirectory, number: int, points: int) -> tuple[str, Handle]:
+    """Make one published segment of random points, as the daemon does."""
+    rng = np.random.default_rng(number)
+    box = (20.0 * number, 0.0, 20.0 * number + 20, 20.0)
+    cell_id = f"/maps/town/pointcloud_map.pcd/{20 * number}_0.pcd"
+    specs = [ColumnSpec("xyz", np.dtype("<f4"), 3, "m"), ColumnSpec("intensity", np.dtype("<f4"))]
+    writer = SegmentWriter(specs, points, cell_id=cell_id, layer="points", box=box)
+    fd = directory.create()
+    writer.start(fd)
+    writer.append(0, rng.random((points, 3), np.float32))
+    writer.append(1, rng.random(points, np.float32))
+    header = writer.finish(
+        z_min=0.0,
+        z_max=1.0,
+        source=SourceStamp(1, 2, 3),
+        source_digest=bytes(16),
+        source_points=points,
+        dropped_points=0,
+        builder_version=1,
+    )
+    name = new_segment_name("benchmark")
+    block = PublishBlock(1, number)
+    directory.publish(fd, name, block=block, header_bytes=header.header_bytes, mode=0o400, gid=-1)
+    os.close(fd)
+    return name, Handle(cell_id, number, "points", name, 0, header.total_bytes, points, *box)
+
+
+def time_cells(segments: list[tuple[str, Handle]]) -> list[int]:
+    """Attach every segment once; nanoseconds each."""
+    attacher = Attacher()
+    kept: list[Cell] = []
+    took = []
+    for name, handle in segments:
+        began = time.perf_counter_ns()
+        cell = attacher.attach(
+            handle, handle.id, name, shm_dir=DEFAULT_SHM_DIR, slot=0x1234_5678_9ABC, populate=False
+        )
+        cell.xyz, cell["intensity"]
+        took.append(time.perf_counter_ns() - began)
+        kept.append(cell)
+    return took
+
+
+def time_bare(segments: list[tuple[str, Handle]]) -> list[int]:
+    """Open and map every segment with posix_ipc and mmap, one array each; nanoseconds each."""
+    kept = []
+    took = []
+    for name, _ in segments:
+        began = time.perf_counter_ns()
+        shm = posix_ipc.SharedMemory(name, read_only=True)
+        mapping = mmap.mmap(shm.fd, 0, prot=mmap.PROT_READ)
+        shm.close_fd()
+        array = np.frombuffer(mapping, np.float32)
+        took.append(time.perf_counter_ns() - began)
+        kept.append((mapping, array))
+    return took
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--cells", type=int, default=500)
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--points", type=int, default=20_000)
+    args = parser.parse_args()
+    directory = ShmDirectory()
+    segments = [publish(directory, number, args.points) for number in range(1, args.cells + 1)]
+    try:
+        cells: list[int] = []
+        bare: list[int] = []
+        for _ in range(args.rounds):
+            cells += time_cells(segments)
+            bare += time_bare(segments)
+    finally:
+        for name, _ in segments:
+            directory.unlink(name)
+        directory.close()
+    imports = [
+        json.loads(subprocess.run([sys.executable, "-c", _IMPORTS], capture_output=True, check=True).stdout)
+        for _ in range(9)
+    ]
+    json.dump(
+        {
+            "attach_and_wrap_us": {
+                "median": statistics.median(cells) / 1e3,
+                "p99": float(np.percentile(cells, 99)) / 1e3,
+            },
+            "posix_ipc_and_mmap_us": {"median": statistics.median(bare) / 1e3},
+            "import_cpu_ratio": statistics.median(whole / bare_s for bare_s, whole, _ in imports),
+            "import_rss_mb": max(rss for _, _, rss in imports) / 1024,
+        },
+        sys.stdout,
+        indent=2,
+    )
+    print()
+
+
+if __name__ == "__main__":
+    main()
