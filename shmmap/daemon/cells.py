@@ -372,6 +372,7 @@ class CellRequests:
             resident.last_use_s = now_s
             resident.hits += 1
         session.hold(answer.residents)
+        self._store.used.update(answer.residents)
         self._statistics.add("handles_sent", len(answer.handles))
 
     def _answer_cold(self, wanted: Wanted, index: int, layer: str, answer: _Answer, now_s: float) -> None:

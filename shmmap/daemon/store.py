@@ -62,6 +62,8 @@ class Store:
     ----------
     history : deque
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
+    used : set
+        Segments handed out since the statistics last showed them.
     warm : dict
         Per layer, catalogue index to resident segment of the cell's *current* version.
     versions : dict
@@ -107,6 +109,7 @@ class Store:
         self._job_numbers = 0
         self._hungry: dict[int, tuple[Worker, int]] = {}
         self.index_of_version: dict[int, int] = {}
+        self.used: set[Resident] = set()
         self.history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=64)
         reclaimer.on_retired = self._leave
         reclaimer.on_freed = lambda resident: statistics.cell_removed(resident.name)
@@ -417,6 +420,7 @@ class Store:
 
     def _leave(self, resident: Resident) -> None:
         """A resident was retired: nobody finds it any more, its bytes still show."""
+        self.used.discard(resident)
         index = self.index_of(resident.key.cell_id)
         warm = self.warm.get(resident.key.layer, {})
         if index is not None and warm.get(index) is resident:
@@ -455,6 +459,13 @@ class Store:
                 load_ns=resident.load_ns,
             ),
         )
+
+    def show_used(self, limit: int) -> None:
+        """Bring hits and last use of at most ``limit`` segments in ``used`` up to date in the statistics."""
+        for _ in range(min(limit, len(self.used))):
+            resident = self.used.pop()
+            if self.books.resident_named(resident.name) is resident:
+                self._show(resident, "resident" if self.is_current(resident) else "stale")
 
     def is_current(self, resident: Resident) -> bool:
         """Whether a resident segment is the newest version of its cell."""

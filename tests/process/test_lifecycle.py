@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.statistics.layout import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, wait_ended
@@ -142,6 +143,16 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
     assert {cell.state for cell in seen.cells} == {"resident"}
     assert sum(cell.bytes for cell in seen.cells) == seen.counters["bytes_resident"] == one.segment_bytes()
+    before = {cell.id: cell for cell in seen.cells}
+    for _ in range(3):
+        client.selected(["0_0.pcd"])
+    waiting = Patience()
+    while waiting(read_statistics(one.instance, one.shm_dir).counters["handles_sent"] < 15):
+        client.ask("stats")
+    waiting = Patience()
+    while waiting(_row(one, "0_0.pcd").hits < before["0_0.pcd"].hits + 3):
+        client.ask("stats")
+    assert _row(one, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
     one.kill()
     assert read_statistics(one.instance, one.shm_dir).state == "dead"
     one.start()
@@ -152,6 +163,11 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     assert again.identity.epoch != seen.identity.epoch
     assert one.stop() == 0
     assert read_statistics(one.instance, one.shm_dir).state == "absent"
+
+
+def _row(one: DaemonProcess, name: str) -> CellRow:
+    """The row of a cell."""
+    return next(c for c in read_statistics(one.instance, one.shm_dir).cells if c.id == name)
 
 
 def test_nothing_is_open_to_others_without_a_group(
