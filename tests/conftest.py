@@ -8,6 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.skips import (  # noqa: F401  hooks
+    pytest_collectreport,
+    pytest_runtest_logreport,
+    pytest_sessionfinish,
+    pytest_terminal_summary,
+)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs root where we are not."""

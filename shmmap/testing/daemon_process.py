@@ -19,6 +19,7 @@ from typing import Final
 
 from shmmap.errors import InternalError
 from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.testing.environment import without_settings
 from shmmap.testing.interrupts import interrupts_later, scratch_directory
 from shmmap.testing.process_memory import descendants
 
@@ -29,7 +30,7 @@ _LOG_LINES: Final = 20
 
 
 class DaemonProcess:
-    """Runs ``python -m shmmap.daemon`` with a name, socket and log of its own.
+    """Runs ``python -m shmmap.daemon`` with a name, socket and log of its own; ``SHMMAP_*`` does not matter.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ class DaemonProcess:
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    env=os.environ | {"NOTIFY_SOCKET": str(directory / "notify")},
+                    env=without_settings() | {"NOTIFY_SOCKET": str(directory / "notify")},
                     start_new_session=True,  # a Ctrl-C is ours to handle, in order
                 )
             self._wait_until_ready(ready)

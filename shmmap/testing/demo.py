@@ -216,7 +216,7 @@ def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None 
         ]
         with (
             DaemonProcess(map_dir, options=options) as daemon,
-            connect(daemon.endpoint, name="demo") as client,
+            connect(daemon.endpoint, name="demo", shm_dir=daemon.shm_dir) as client,
             Fleet("shared", daemon.endpoint, settings.radius) as fleet,
         ):
             progress.stage("Driving, four processes on one copy", len(town.route))

@@ -17,6 +17,7 @@ from typing import IO, Final, Literal
 
 from shmmap.errors import InternalError
 from shmmap.testing.consumer import TASKS, Pose
+from shmmap.testing.environment import without_settings
 from shmmap.testing.interrupts import interrupts_later
 
 __all__ = ["Fleet", "StepReport"]
@@ -104,6 +105,7 @@ class Fleet:
                         stdout=subprocess.PIPE,
                         stderr=complaints,
                         text=True,
+                        env=without_settings(),
                         start_new_session=True,  # a Ctrl-C is not for them: their stdin ends when we end
                     )
                     self._processes.append(process)

@@ -32,7 +32,9 @@ class Demo:
             stderr=subprocess.PIPE,
             text=True,
             env={k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
-            | {"PYTHONPATH": str(ROOT), "TMPDIR": str(self.scratch), "SHMMAP_TEST_RUN": self.mark},
+            | {"PYTHONPATH": str(ROOT), "TMPDIR": str(self.scratch), "SHMMAP_TEST_RUN": self.mark}
+            # settings of a real daemon must not matter
+            | {"SHMMAP_SHM_DIR": "/nowhere", "SHMMAP_ENDPOINT": "/nowhere.sock", "SHMMAP_INSTANCE": "other"},
         )
 
     def leftovers(self) -> list[str]:

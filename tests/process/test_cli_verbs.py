@@ -302,3 +302,28 @@ def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path
     assert done.stdout == ""
     assert "Traceback" not in done.stderr
     assert any(line.startswith("shmmap: ") for line in done.stderr.splitlines())
+
+
+def test_help_status_and_errors_need_only_the_standard_library(shmmap: Shmmap) -> None:
+    """A client-only install has no rich, yaml or Open3D, and a broken one perhaps not even numpy."""
+    program = (
+        "import sys\n"
+        "for name in ('numpy', 'zmq', 'msgspec', 'posix_ipc', 'rich', 'yaml', 'xxhash', 'lzf', 'open3d'):\n"
+        "    sys.modules[name] = None\n"
+        "from shmmap.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    for words, code in (
+        (["status"], 0),
+        (["ls"], 0),
+        (["health"], 0),
+        (["health", "--instance", "other"], 69),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-c", program, *words],
+            env=shmmap.environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == code, done.stderr

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hooks that fail a run in which a test was skipped that is not on a list.
+
+Active where ``SHMMAP_TEST_ALLOWED_SKIPS`` names that list: one pattern a line (``*`` and ``?`` as in a
+shell) for the test's id, then blanks and why it may be skipped; ``#`` starts a comment.
+"""
+
+from __future__ import annotations
+
+import os
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import pytest
+
+__all__ = [
+    "allowed_patterns",
+    "pytest_collectreport",
+    "pytest_runtest_logreport",
+    "pytest_sessionfinish",
+    "pytest_terminal_summary",
+]
+
+_skipped: dict[str, str] = {}
+
+
+def allowed_patterns(text: str) -> list[str]:
+    """Return the patterns of a list."""
+    lines = (line.strip() for line in text.splitlines())
+    return [line.split(maxsplit=1)[0] for line in lines if line and not line.startswith("#")]
+
+
+def _note(report: pytest.TestReport | pytest.CollectReport) -> None:
+    # an expected failure reports itself as skipped, too
+    if report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        _skipped[report.nodeid] = reason
+
+
+def _unexpected() -> dict[str, str]:
+    named = os.environ.get("SHMMAP_TEST_ALLOWED_SKIPS", "")
+    if not named:
+        return {}
+    patterns = allowed_patterns(Path(named).read_text(encoding="utf-8"))
+    return {
+        test: reason
+        for test, reason in _skipped.items()
+        if not any(fnmatchcase(test, pattern) for pattern in patterns)
+    }
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note a skipped test."""
+    _note(report)
+
+
+def pytest_collectreport(report: pytest.CollectReport) -> None:
+    """Note a skipped module."""
+    _note(report)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """Fail a run that would have passed."""
+    if exitstatus == pytest.ExitCode.OK and _unexpected():
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say which tests should not have been skipped."""
+    unexpected = _unexpected()
+    if unexpected:
+        terminalreporter.section("skipped, but not on the list of allowed skips", red=True)
+        for test, reason in unexpected.items():
+            terminalreporter.write_line(f"{test}: {reason}")

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A skipped test that is not on the list fails the run, and only then."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.daemon_process import ROOT
+from tests.support.skips import allowed_patterns
+
+TESTS = """
+import pytest
+def test_good(): pass
+@pytest.mark.skip(reason="no reason")
+def test_skipped(): pass
+@pytest.mark.xfail
+def test_expected(): assert False
+"""
+
+
+def run(where: Path, listed: str | None, tests: str = TESTS) -> subprocess.CompletedProcess[str]:
+    (where / "test_it.py").write_text(tests)
+    environment = {k: v for k, v in os.environ.items() if k != "SHMMAP_TEST_ALLOWED_SKIPS"} | {
+        "PYTHONPATH": str(ROOT)
+    }
+    if listed is not None:
+        (where / "allowed.txt").write_text(listed)
+        environment["SHMMAP_TEST_ALLOWED_SKIPS"] = str(where / "allowed.txt")
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:dash", "-p", "tests.support.skips", "--rootdir=."],
+        cwd=where,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("listed", "code"),
+    [(None, 0), ("", 1), ("# *\n", 1), ("*::test_skipped  because\n", 0), ("*::test_other\n", 1)],
+)
+def test_only_listed_tests_may_be_skipped(tmp_path: Path, listed: str | None, code: int) -> None:
+    done = run(tmp_path, listed)
+    assert done.returncode == code, done.stdout + done.stderr
+    assert ("test_it.py::test_skipped: Skipped: no reason" in done.stdout) == bool(code)
+
+
+def test_a_skipped_module_counts(tmp_path: Path) -> None:
+    tests = "import pytest\npytest.importorskip('no_such_module_at_all')\ndef test_good(): pass\n"
+    assert run(tmp_path, "", tests + "\n").returncode in (1, 5)
+    (tmp_path / "test_more.py").write_text("def test_good(): pass\n")
+    assert run(tmp_path, "", tests).returncode == 1
+    assert run(tmp_path, "test_it.py why\n", tests).returncode == 0
+
+
+def test_the_list_names_reasons() -> None:
+    text = (ROOT / "tests" / "allowed_skips.txt").read_text(encoding="utf-8")
+    entries = [line for line in text.splitlines() if line and not line.startswith("#")]
+    assert len(allowed_patterns(text)) == len(entries)
+    assert all(len(entry.split(maxsplit=1)) == 2 for entry in entries)
