@@ -24,6 +24,8 @@ from shmmap.protocol.messages import Intent
 __all__ = ["MapWindow"]
 
 _BLOCKING_WAIT_S: Final = 5.0
+_FIRST_PAUSE_S: Final = 0.005  # between requests for what does not fit; doubles
+_STALLED_S: Final = 0.5  # a blocking call gives up on what does not fit after this long without progress
 
 
 class MapWindow:
@@ -178,7 +180,8 @@ class MapWindow:
             The polyline ahead, (x, y) each; the daemon keeps what lies along it.
         wait
             Seconds this call may take until the window is current.  None: no waiting in the background mode,
-            5 s in the blocking one.
+            5 s in the blocking one, which waits no longer than half a second for cells that do not fit in
+            the budget.
 
         Raises
         ------
@@ -230,16 +233,25 @@ class MapWindow:
         if state.settled and not due and not moved(state, pose, self._update_distance):
             return
         deadline_s = now_s + wait_s
+        progress_s = now_s
+        pause_s = _FIRST_PAUSE_S
         del state
         patience_s: float | None = None
         while True:
             after, progress = self._refresher.refresh(self._state, pose, patience_s)
             self._state = after
             self._asked_s = now_s = time.monotonic()
-            if after.settled or now_s >= deadline_s or not (progress or after.pending):
+            if after.settled or now_s >= deadline_s:
                 return
+            if progress or after.pending:
+                progress_s, pause_s = now_s, _FIRST_PAUSE_S
+            elif now_s - progress_s >= _STALLED_S:
+                return  # what is missing waits for memory that others have
+            else:
+                time.sleep(min(pause_s, deadline_s - now_s))  # what was just dropped has to be freed
+                pause_s *= 2
             del after
-            patience_s = min(PENDING_WAIT_S, deadline_s - now_s)
+            patience_s = max(0.0, min(PENDING_WAIT_S, deadline_s - now_s))
 
     # --- what the window holds ------------------------------------------------------------------------
 

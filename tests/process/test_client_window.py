@@ -236,7 +236,12 @@ def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
     with (
         shmmap.connect(tight.endpoint) as admin,
         shmmap.MapWindow(
-            tight.endpoint, 100, background=background, refresh_interval=0.05, retention=shmmap.Retention(1e6)
+            tight.endpoint,
+            100,
+            background=background,
+            update_distance=0,
+            refresh_interval=0.05,
+            retention=shmmap.Retention(1e6),
         ) as window,
     ):
         window.move_to(0, 0, wait=LONG_S)
@@ -247,8 +252,8 @@ def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
         told = admin.reload()
         if background:
             wait_for(window, lambda: window.map_version == told.map_version and window.complete)
-        for _ in range(100):
-            window.move_to(0, 0, wait=LONG_S)
+        for turn in range(100):
+            window.move_to(1e-3 * turn, 0, wait=LONG_S)
             if window.complete and window.map_version == told.map_version:
                 break
         assert_window(window, made, *everything)
@@ -352,8 +357,8 @@ def test_a_swap_makes_no_system_call_that_maps_on_the_control_thread(daemon: Fac
     calls = tmp_path / "calls.txt"
     done = subprocess.run(
         [
-            "strace", "-f", "--seccomp-bpf", "-o", str(calls), "-e", "trace=open,openat,mmap,munmap,mremap,close,write",
-            sys.executable, "-c", SWAP, one.endpoint, "250",
+            "strace", "-f", "--seccomp-bpf", "-o", str(calls), "-e",
+            "trace=open,openat,mmap,munmap,mremap,close,write", sys.executable, "-c", SWAP, one.endpoint, "250",
         ],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
