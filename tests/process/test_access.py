@@ -7,14 +7,18 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.divided_map import DividedMap
+from tests.support.divided_map import DividedMap, make_map
+from tests.support.mapping_process import MappingProcess
+from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 pytestmark = pytest.mark.root
@@ -149,3 +153,55 @@ def test_without_a_group_nobody_else_reads(
     assert 0 not in found.values(), found
     python = os.path.realpath(sys.executable)
     assert as_user(STRANGER, STRANGER, python, "-I", "-c", CONNECT, one.endpoint).returncode != 0
+
+
+@pytest.fixture
+def open_directory() -> Iterator[Path]:
+    """Return a directory that every account may read (pytest's own are closed)."""
+    with tempfile.TemporaryDirectory(prefix="shmmap-open-", dir="/tmp") as path:
+        os.chmod(path, 0o755)
+        yield Path(path)
+
+
+def test_a_daemon_without_privileges_serves_the_group(
+    daemon: DaemonFactory, connect: Connect, open_directory: Path
+) -> None:
+    """As the service runs: leases, eviction and reload need no capability, only ownership."""
+    check = (
+        "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import shmmap, numpy'], check=True)"
+    )
+    if as_user(DAEMON_UID, DAEMON_UID, sys.executable, "-c", check).returncode:
+        pytest.skip("this Python and its packages cannot be read by other accounts")
+    one: DaemonProcess = daemon(
+        make_map(open_directory / "map").root,
+        "--group",
+        str(GROUP),
+        start=False,
+        command=["setpriv", f"--reuid={DAEMON_UID}", f"--regid={DAEMON_UID}", f"--groups={GROUP}"],
+    )
+    one.give_to(DAEMON_UID)
+    os.chmod(one.runtime_dir, 0o755)
+    os.chmod(one.shm_dir, 0o1777)
+    one.start()
+    client = connect(one)
+    handles = client.area(circle(0, 0, 25)).cells
+    path = client.path(handles[0])
+    status = os.stat(path)
+    assert (status.st_uid, status.st_gid, status.st_mode & 0o777) == (DAEMON_UID, GROUP, 0o440)
+    found = attempts(path, MEMBER, GROUP)
+    assert found.pop("read") == 0
+    assert 0 not in found.values(), found
+    owner = attempts(path, DAEMON_UID, DAEMON_UID)  # even its own user does not write by mistake
+    assert owner["open for writing"] == 13
+    with MappingProcess(
+        [client.path(handles[1])],
+        command=["setpriv", f"--reuid={MEMBER}", f"--regid={GROUP}", "--clear-groups"],
+    ) as reader:
+        before = reader.checksums()
+        evicted = client.ask("evict")
+        assert (evicted[2], evicted[3]) == (len(handles) - 1, 1)
+        assert reader.checksums() == before
+    waiting = Patience()
+    while waiting(bool(one.segments())):
+        client.ask("stats")
+    assert client.ask("reload")[3:6] == [0, 0, 0]

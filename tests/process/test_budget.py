@@ -83,7 +83,7 @@ def test_never_exceeded_while_clients_wander(
     budget = 24 * CELL_BYTES + STATISTICS_BYTES
     one = daemon(heavy_map.root, "--budget", str(budget), shm_dir=directory)
     rng = random.Random(7)
-    with MemoryWatch(directory) as watch:
+    with MemoryWatch(directory, one.pid) as watch:
         holders = [Holder(connect(one)) for _ in range(3)]
         for step in range(40):
             holder = holders[step % 3]
@@ -100,6 +100,7 @@ def test_never_exceeded_while_clients_wander(
         for holder in holders:
             holder.drop_all()
     assert 0 < watch.peak_bytes <= budget
+    assert 0 < watch.peak_descriptors < 64  # of the daemon and of any loader, however many cells come and go
     assert evictions > 0 or watch.peak_bytes < budget
     assert one.stop() == 0
     assert os.listdir(directory) == []
@@ -185,7 +186,7 @@ def test_a_reload_finishes_with_room_for_one_more_cell_only(
     rows_and_counters = 128 << 10
     budget = len(window) * CELL_BYTES + largest + rows_and_counters
     one = daemon(heavy_map.root, "--budget", str(budget), "--session-quota", "1", shm_dir=directory)
-    with MemoryWatch(directory) as watch:
+    with MemoryWatch(directory, one.pid) as watch:
         holders = [Holder(connect(one, name=f"client {i}")) for i in range(2)]
         for holder in holders:
             reply = holder.client.area(circle(0, 0, 25))

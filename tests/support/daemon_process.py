@@ -115,6 +115,13 @@ class DaemonProcess:
             **(environment or {}),
         }
 
+    def give_to(self, uid: int) -> None:
+        """Let the daemon run as another user: its directories become that user's."""
+        for path in (self.runtime_dir, self.shm_dir, self._private):
+            os.chown(path, uid, -1)
+            for name in os.listdir(path):
+                os.chown(f"{path}/{name}", uid, -1)
+
     @property
     def pid(self) -> int:
         """Process id of the daemon."""
