@@ -358,7 +358,8 @@ def test_a_swap_makes_no_system_call_that_maps_on_the_control_thread(daemon: Fac
     done = subprocess.run(
         [
             "strace", "-f", "--seccomp-bpf", "-o", str(calls), "-e",
-            "trace=open,openat,mmap,munmap,mremap,close,write", sys.executable, "-c", SWAP, one.endpoint, "250",
+            "trace=open,openat,mmap,munmap,mremap,close,write",
+            sys.executable, "-c", SWAP, one.endpoint, "250",
         ],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip

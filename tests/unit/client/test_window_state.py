@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""States of a window, and what changed between two of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from shmmap.client.cell import Cell
+from shmmap.client.cell_set import PendingLayer
+from shmmap.client.window_follower import moved
+from shmmap.client.window_state import EMPTY, WindowState, update_between
+from shmmap.errors import CellError, LoadFailed, OverBudget
+from shmmap.protocol.messages import Intent
+
+HERE = Intent(0.0, 0.0)
+
+
+def build(
+    *cells: Cell, pending: tuple[PendingLayer, ...] = (), failed: tuple[CellError, ...] = ()
+) -> WindowState:
+    return WindowState.build(
+        {(cell.id, cell.layer): cell for cell in cells},
+        pending=pending,
+        failed=failed,
+        asked=HERE,
+        epoch=1,
+        map_version=1,
+    )
+
+
+def test_cells_are_in_id_order_with_their_boxes(make_cell: Callable[..., Cell]) -> None:
+    b = make_cell("/b", (20.0, 0.0, 40.0, 20.0))
+    a = make_cell("/a", (0.0, 0.0, 20.0, 20.0))
+    voxel = make_cell("/a", (0.0, 0.0, 20.0, 20.0), version=3, layer="voxel")
+    state = build(b, voxel, a)
+    assert list(state.cells) == [("/a", "points"), ("/a", "voxel"), ("/b", "points")]
+    assert state.by_layer == {"points": (a, b), "voxel": (voxel,)}
+    np.testing.assert_array_equal(state.boxes["points"], [a.box, b.box])
+
+
+def test_the_difference_of_two_states(make_cell: Callable[..., Cell]) -> None:
+    box = (0.0, 0.0, 20.0, 20.0)
+    gone, stays, old = (make_cell(name, box) for name in ("/gone", "/stays", "/changes"))
+    new, fresh = make_cell("/changes", box, version=99), make_cell("/new", box)
+    pending = (PendingLayer("/later", "points"),)
+    before = build(gone, stays, old)
+    update = update_between(before.versions, build(stays, new, fresh, pending=pending))
+    assert (update.added, update.kept, update.changed) == ((fresh,), (stays,), (new,))
+    assert (update.removed, update.pending) == (("/gone",), pending)
+    assert update.any
+    assert not update.complete
+    same = update_between(before.versions, before)
+    assert not same.any
+    assert set(same.kept) == {gone, stays, old}
+    assert set(update_between(EMPTY.versions, before).added) == {gone, stays, old}
+
+
+def test_remembering_versions_keeps_nothing_mapped(make_cell: Callable[..., Cell]) -> None:
+    import weakref
+
+    cell = make_cell("/a", (0.0, 0.0, 20.0, 20.0))
+    alive = weakref.ref(cell)
+    versions = build(cell).versions
+    del cell
+    assert alive() is None
+    assert list(versions) == [("/a", "points")]
+
+
+@pytest.mark.parametrize(
+    ("failed", "settled"),
+    [((), True), ((LoadFailed("broken"),), True), ((LoadFailed("broken"), OverBudget("full")), False)],
+)
+def test_settled(failed: tuple[CellError, ...], settled: bool) -> None:
+    assert build(failed=failed).settled is settled
+    assert not build(pending=(PendingLayer("/a", "points"),)).settled
+    assert not EMPTY.settled
+
+
+def test_moved_by_the_update_distance() -> None:
+    state = build()
+    assert moved(EMPTY, HERE, 1e9)
+    assert not moved(state, Intent(0.0, 0.0), 0.0)
+    assert moved(state, Intent(1e-9, 0.0), 0.0)
+    assert not moved(state, Intent(11.9, 15.9), 20.0)
+    assert moved(state, Intent(12.0, 16.0), 20.0)
