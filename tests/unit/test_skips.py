@@ -25,7 +25,7 @@ def test_expected(): assert False
 
 def run(where: Path, listed: str | None, tests: str = TESTS) -> subprocess.CompletedProcess[str]:
     (where / "test_it.py").write_text(tests)
-    environment = {k: v for k, v in os.environ.items() if k != "SHMMAP_TEST_ALLOWED_SKIPS"} | {
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("SHMMAP_", "PYTEST_"))} | {
         "PYTHONPATH": str(ROOT)
     }
     if listed is not None:
