@@ -340,6 +340,8 @@ class Machine(RuleBasedStateMachine):
     def make_room(self, pages: int) -> None:
         """Asked often enough it comes to an end, and to the right one."""
         self.now_s += 0.25  # nobody remembers older looks at pins
+        self.reclaimer.sweep(self.now_s)  # as the store does before
+        self.follow()
         mapped = sum(s.pages for s in self.segments.values() if s.maps)
         needed = sum(s.pages for s in self.of_state("resident") if not s.maps and self.waiting[s.key])
         reserved = sum(w.reserved for w in self.loads.values()) // PAGE
