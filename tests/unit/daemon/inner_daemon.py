@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon's parts joined as the daemon joins them, without its socket: requests go in, replies come out.
+
+Files are real, segments are real, loaders are real processes.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+from shmmap.daemon.admin import Admin
+from shmmap.daemon.cells import CellRequests
+from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.eviction import POLICIES
+from shmmap.daemon.reclaim import Reclaimer
+from shmmap.daemon.residency import Key, Residency
+from shmmap.daemon.sessions import Peer, Session, Sessions
+from shmmap.daemon.store import Store
+from shmmap.daemon.workers import WorkerPool
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.map_directory import open_map
+from shmmap.protocol.codec import decode_reply
+from shmmap.protocol.messages import Cells
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import prepare_process
+from shmmap.statistics.identity import DaemonIdentity
+from shmmap.statistics.writer import StatisticsWriter
+
+EPOCH = 77
+PATIENCE_S = 60.0
+
+
+class InnerDaemon:
+    """Store, sessions and requests over one map; ``offset_s`` moves its clock ahead of the real one."""
+
+    def __init__(
+        self,
+        map_path: str,
+        *,
+        budget_bytes: int = 64 << 20,
+        quota_bytes: int = 64 << 20,
+        workers: int = 1,
+        load_timeout_s: float = 30.0,
+        cache_dir: str,
+    ) -> None:
+        prepare_process()
+        self.shm_dir = tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
+        self.directory = ShmDirectory(self.shm_dir)
+        self.origin = open_map(map_path, cache_dir=cache_dir)
+        catalogue = self.origin.load()
+        identity = DaemonIdentity(
+            pid=os.getpid(), start_time_ticks=1, pid_namespace=1, epoch=EPOCH, instance="inner",
+            endpoint="", map_path=map_path, map_version=catalogue.map_version, shm_dir=self.shm_dir,
+            id_prefix=catalogue.id_prefix, library_version="0", started_unix_ns=0, frame_id="map",
+        )  # fmt: skip
+        self.statistics = StatisticsWriter(self.directory, "inner", identity)
+        self.sessions = Sessions()
+        self.books = Residency(budget_bytes)
+        self.books.overhead_bytes = self.statistics.size_bytes
+        self.reclaimer = Reclaimer(self.books, self.directory, self.sessions, POLICIES["distance"])
+        self._poll = select.epoll()
+        self.pool = WorkerPool(
+            workers,
+            self.shm_dir,
+            load_timeout_s,
+            watch=lambda fd: self._poll.register(fd, select.EPOLLIN),
+            unwatch=self._poll.unregister,
+        )
+        self.settled: list[Key] = []
+        self.store = Store(
+            catalogue, self.books, self.reclaimer, self.pool, self.directory, self.statistics,
+            instance="inner", epoch=EPOCH, id_prefix=catalogue.id_prefix, mode=0o400, gid=-1,
+            on_settled=self._on_settled,
+        )  # fmt: skip
+        self.offset_s = 0.0
+        self.replies: list[tuple[Session, Any]] = []
+        self.cells = CellRequests(
+            self.store,
+            self.statistics,
+            epoch=EPOCH,
+            quota_bytes=quota_bytes,
+            send=lambda session, data: self.replies.append((session, decode_reply(data))),
+            clock=self.now_s,
+        )
+        config = DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir)
+        self.admin = Admin(config, self.store, self.sessions, self.statistics, epoch=EPOCH)
+
+    def _on_settled(self, key: Key) -> None:
+        self.settled.append(key)
+        self.cells.settled(key)
+
+    def now_s(self) -> float:
+        """Return the time of the daemon's clock."""
+        return time.monotonic() + self.offset_s
+
+    def session(self, name: str = "") -> Session:
+        """Open a session of a process that nobody watches."""
+        return self.sessions.open(os.urandom(5), Peer(), name, self.now_s())
+
+    def turn(self, timeout_s: float = 0.02) -> None:
+        """One turn of the serving loop."""
+        for fd, _ in self._poll.poll(timeout_s):
+            worker = self.pool.by_fd(fd)
+            if worker is not None:
+                self.store.on_worker(worker, self.now_s())
+        now_s = self.now_s()
+        self.store.end_overdue(now_s)
+        self.store.pump(now_s)
+        self.cells.answer_overdue(now_s)
+
+    def run_until(self, done: Callable[[], object]) -> None:
+        """Turn until ``done()``."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not done():
+            self.turn()
+            assert time.monotonic() < end_s, "the daemon never came to it"
+
+    def reply_to(self, request: int) -> Any:
+        """Run until this request is answered; returns the reply."""
+        found: list[Any] = []
+
+        def answered() -> bool:
+            found.extend(reply for _, reply in self.replies if reply.request == request)
+            return bool(found)
+
+        self.run_until(answered)
+        return found[0]
+
+    def cells_of(self, request: int) -> Cells:
+        """Run until this request is answered with cells; returns them."""
+        reply = self.reply_to(request)
+        assert isinstance(reply, Cells)
+        return reply
+
+    def reload(self) -> Catalogue:
+        """Read the map again and serve what it is now."""
+        old = self.store.catalogue
+        new = self.origin.load(fresh=True)
+        self.cells.renumber(lambda index: new.find(old.id(index)), old.id)
+        self.store.replace_catalogue(new, self.now_s())
+        return new
+
+    def close(self) -> None:
+        """End everything and remove the directory."""
+        for session in list(self.sessions):
+            self.sessions.close(session)
+        self.store.close()
+        self.statistics.close()
+        self._poll.close()
+        self.directory.close()
+        shutil.rmtree(self.shm_dir)
