@@ -228,6 +228,8 @@ class CellRequests:
             return
         self._refresh(session)
         left = self._quota_bytes - session.exclusive_bytes()
+        # a new version takes the place of the old one that its holder is about to drop
+        replaced = {r.key: r.nbytes for r in session.residents() if not store.is_current(r)}
         boxes = store.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
         if session.intent is not None:
             order = np.argsort(distance_to_boxes(session.intent.x, session.intent.y, boxes), kind="stable")
@@ -247,7 +249,7 @@ class CellRequests:
                 continue  # somebody else keeps it anyway
             if resident is not None and session.slot in resident.sessions:
                 continue
-            left -= sizes[position]
+            left -= sizes[position] - replaced.get(key, 0)
             if left < 0:
                 message = (
                     f"this client would keep more than {self._quota_bytes} bytes (its quota) for itself alone"
