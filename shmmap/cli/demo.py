@@ -187,10 +187,14 @@ def _print_text(result: DemoResult) -> None:
     print_table(
         (Column(""), Column("ONE SHARED COPY", "right"), Column("FOUR PRIVATE COPIES", "right")), rows
     )
-    times_less = private.total_bytes / shared.total_bytes
     print(
-        f"{times_less:.1f} times less memory.  In {len(result.town.route)} poses four processes got"
-        f" {format_bytes(shared.handed_bytes)} of points through {format_bytes(wire_bytes)} of messages."
+        f"In {len(result.town.route)} poses four processes got {format_bytes(shared.handed_bytes)} of points"
+        f" through {format_bytes(wire_bytes)} of messages."
+    )
+    each_bytes = shared.memory.own_bytes / shared.processes
+    print(
+        f"One process more takes about {format_bytes(each_bytes)}, with a copy of its own"
+        f" {format_bytes(private.total_bytes / 4)}."
     )
     print("Memory as the kernel counts it (/proc/PID/smaps_rollup), the daemon and its workers included.")
 
