@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings: where they come from, which wins, and what is said of a wrong one."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap.daemon.config import DaemonConfig, load_config, parse_bytes
+from shmmap.errors import ConfigError
+
+
+def load(
+    flags: dict[str, Any] | None = None, environ: dict[str, str] | None = None, file: str = ""
+) -> DaemonConfig:
+    return load_config(flags or {}, file=file, environ=environ or {})
+
+
+def test_defaults() -> None:
+    assert load() == DaemonConfig()
+    assert load({"budget": None, "workers": None}) == DaemonConfig()
+
+
+def test_later_origins_win(tmp_path: Path) -> None:
+    file = tmp_path / "shmmap.toml"
+    file.write_text('budget = "1G"\nworkers = 2\ninstance = "file"\nload_timeout_s = 5\nstrict = true\n')
+    environ = {"SHMMAP_WORKERS": "3", "SHMMAP_INSTANCE": "variable", "HOME": "/root", "SHMMAP_STRICT": "no"}
+    config = load({"instance": "flag"}, environ, str(file))
+    assert (config.budget_bytes, config.workers, config.instance) == (1 << 30, 3, "flag")
+    assert (config.load_timeout_s, config.strict) == (5.0, False)
+    assert isinstance(config.load_timeout_s, float)
+
+
+def test_variables_that_are_no_settings() -> None:
+    environ = {"SHMMAP_TEST_DATA": "/x", "SHMMAP_ENDPOINT": "/run/other.sock", "SHMMAPX": "1"}
+    assert load(environ=environ) == DaemonConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "nbytes"),
+    [
+        ("0", 0), ("1", 1), ("1000000", 1_000_000), ("1k", 1024), ("1K", 1024), ("2M", 2 << 20),
+        ("2MB", 2 << 20), ("2MiB", 2 << 20), ("1.5g", 3 << 29), (" 3 T ", 3 << 40),
+        ("4gib", 4 << 30), ("7B", 7),
+    ],
+)  # fmt: skip
+def test_sizes(text: str, nbytes: int) -> None:
+    assert parse_bytes(text) == nbytes
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "M", "-1", "1e9", "1 000", "12Q", "0x10", "1.M", ".5G", "nan", "inf", "9" * 400, "9" * 30 + "T"],
+)
+def test_no_sizes(text: str) -> None:
+    with pytest.raises(ConfigError, match="is no size"):
+        parse_bytes(text)
+
+
+@given(st.text(max_size=20))
+def test_any_text_is_a_size_or_refused(text: str) -> None:
+    with contextlib.suppress(ConfigError):
+        assert 0 <= parse_bytes(text) <= 1 << 62
+
+
+BAD: list[tuple[str, Any]] = [
+    ("workers", 0), ("workers", 65), ("workers", "many"), ("workers", 1.5), ("workers", True),
+    ("workers", "1e9"), ("load_timeout_s", float("nan")),
+    ("load_timeout_s", 0), ("load_timeout_s", -1.0), ("load_timeout_s", "soon"),
+    ("load_timeout_s", 86401), ("load_timeout_s", True), ("load_timeout_s", 10**400),
+    ("session_quota", 0), ("session_quota", -0.5), ("session_quota", "x"), ("session_quota", float("inf")),
+    ("session_quota", float("nan")), ("session_quota", "1.2.3"), ("session_quota", "\u00b2"),
+    ("budget_bytes", -1), ("budget_bytes", "lots"), ("budget_bytes", 1.5), ("budget_bytes", 1 << 70),
+    ("budget_bytes", True), ("eviction", "fifo"), ("eviction", 3), ("strict", "maybe"), ("strict", 1),
+    ("instance", "a/b"), ("instance", ""), ("instance", "x" * 65), ("instance", "a.b"), ("instance", 5),
+    ("map_path", 5), ("group", ["x"]), ("shm_dir", None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, v in BAD if v is not None])
+def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None:
+    with pytest.raises(ConfigError) as failure:
+        load({name: value})
+    assert failure.value.origin == "command line"
+    assert failure.value.key == name
+    assert failure.value.message.startswith("command line: ")
+    assert name in failure.value.message
+    assert failure.value.exit_code == 78
+
+
+def test_a_wrong_variable_is_named() -> None:
+    with pytest.raises(ConfigError) as failure:
+        load(environ={"SHMMAP_BUDGET": "lots"})
+    assert failure.value.origin == "SHMMAP_BUDGET"
+    assert "SHMMAP_BUDGET: " in failure.value.message
+
+
+def test_a_wrong_line_of_the_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "shmmap.toml"
+    file.write_text("workers = 'x'\n")
+    with pytest.raises(ConfigError) as failure:
+        load(file=str(file))
+    assert failure.value.origin == str(file)
+
+
+@pytest.mark.parametrize(
+    ("given_name", "suggestion"),
+    [("budgett", "budget"), ("bugdet", "budget"), ("worker", "workers"), ("shmdir", "shm_dir"), ("qqqq", "")],
+)
+def test_unknown_settings_with_a_suggestion(given_name: str, suggestion: str) -> None:
+    for flags, environ in (({given_name: "1"}, {}), ({}, {f"SHMMAP_{given_name.upper()}": "1"})):
+        with pytest.raises(ConfigError, match="unknown setting") as failure:
+            load(flags, environ)
+        if suggestion:
+            assert f"did you mean '{suggestion}" in failure.value.hint
+        else:
+            assert "settings are: " in failure.value.hint
+
+
+@pytest.mark.parametrize("content", [b"workers = ", b"= 3", b"\xff\xfe", b"[table]\nworkers = 3\n"])
+def test_files_that_are_no_settings(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "shmmap.toml"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError, match=str(file)):
+        load(file=str(file))
+
+
+def test_a_file_that_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="No such file"):
+        load(file=str(tmp_path / "none.toml"))
+
+
+def test_quotas_are_parts_or_bytes() -> None:
+    assert load({"session_quota": "0.5"}).session_quota == 0.5
+    assert load({"session_quota": "1"}).session_quota == 1.0
+    assert load({"session_quota": "64M"}).session_quota == float(64 << 20)
+    assert load({"session_quota": 1}).session_quota == 1.0
+
+
+def test_the_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert DaemonConfig(endpoint="ipc:///run/a.sock").socket() == "/run/a.sock"
+    assert DaemonConfig(endpoint="/run/a.sock", runtime_dir="/other").socket() == "/run/a.sock"
+    assert DaemonConfig(runtime_dir=str(tmp_path), instance="car").socket() == f"{tmp_path}/car.sock"
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/service")
+    assert DaemonConfig(instance="car").socket() == "/run/service/car.sock"
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert DaemonConfig().socket() == f"{tmp_path}/shmmap/default.sock"
