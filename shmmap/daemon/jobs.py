@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the daemon and its loader workers say to each other.
 
-One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Done` also
-carries the finished segment's file descriptor.  Both ends are always the same version of shmmap,
+One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Segment`
+also carries the finished segment's file descriptor.  Both ends are always the same version of shmmap,
 so this is no public protocol.
 """
 
@@ -21,6 +21,7 @@ __all__ = [
     "Need",
     "Ready",
     "Refuse",
+    "Segment",
     "ToWorker",
     "decode_from_worker",
     "decode_to_worker",
@@ -65,8 +66,15 @@ class Need(msgspec.Struct, array_like=True, tag="need"):
     bytes: int
 
 
+class Segment(msgspec.Struct, array_like=True, tag="segment"):
+    """A finished segment, as the descriptor that comes with the packet; `Done` follows."""
+
+
 class Done(msgspec.Struct, array_like=True, tag="done"):
-    """A finished segment; its descriptor comes with the packet."""
+    """The segment sent just before is finished, and the worker has closed its own descriptor of it.
+
+    That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
+    """
 
     number: int
     header_bytes: int
@@ -89,7 +97,7 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
 
 
 ToWorker: TypeAlias = Job | Grant | Refuse
-FromWorker: TypeAlias = Ready | Need | Done | Failed
+FromWorker: TypeAlias = Ready | Need | Segment | Done | Failed
 
 encode: Final = msgspec.msgpack.Encoder().encode
 _to_worker: Final[msgspec.msgpack.Decoder[ToWorker]] = msgspec.msgpack.Decoder(ToWorker)

@@ -246,10 +246,17 @@ class Store:
         if received is None:
             return False
         message, fd = received
+        if fd >= 0 and not isinstance(message, jobs.Segment):
+            os.close(fd)
         if isinstance(message, jobs.Ready):
             worker.ready = True
             worker.head_since_s = now_s
             self.pool.failed_starts = 0
+            return True
+        if isinstance(message, jobs.Segment):
+            if worker.segment_fd >= 0:
+                os.close(worker.segment_fd)
+            worker.segment_fd = fd
             return True
         if isinstance(message, jobs.Need):
             self._hungry[message.number] = (worker, message.bytes)
@@ -258,7 +265,10 @@ class Store:
         self.pool.finished(worker, message.number, now_s)
         self._hungry.pop(message.number, None)
         load = self._jobs.pop(message.number, None)
+        fd, worker.segment_fd = worker.segment_fd, -1
         if isinstance(message, jobs.Failed):
+            if fd >= 0:
+                os.close(fd)
             if load is not None:
                 self._fail(load, message.code, message.message, message.stamp, now_s)
         elif fd >= 0:

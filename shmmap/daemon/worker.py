@@ -106,9 +106,10 @@ class _Worker:
                     time.monotonic_ns() - started_ns,
                     tuple(warning[:500] for warning in warnings[:20]),
                 )
-                self._send(done, fd)
+                self._send(jobs.Segment(), fd)
             finally:
                 os.close(fd)
+            self._send(done)
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except MapDataError as error:

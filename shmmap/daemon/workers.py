@@ -28,13 +28,17 @@ JOBS_AHEAD = 4
 
 @dataclass(eq=False, slots=True)
 class Worker:
-    """One worker process; ``queue`` holds its jobs, the first is the one it works on."""
+    """One worker process; ``queue`` holds its jobs, the first is the one it works on.
+
+    ``segment_fd`` is the segment whose `jobs.Done` has yet to come.
+    """
 
     process: subprocess.Popen[bytes]
     channel: socket.socket
     queue: OrderedDict[int, jobs.Job] = field(default_factory=OrderedDict)
     head_since_s: float = 0.0
     ready: bool = False
+    segment_fd: int = -1
 
     @property
     def fd(self) -> int:
@@ -190,6 +194,8 @@ class WorkerPool:
         self._unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
+        if worker.segment_fd >= 0:
+            os.close(worker.segment_fd)
         worker.process.kill()
         code = worker.process.wait()
         how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
