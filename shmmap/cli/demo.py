@@ -72,7 +72,8 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.demo_progress import progress_for
-    from shmmap.testing.demo import DemoSettings, run_demo
+    from shmmap.testing.demo import run_demo
+    from shmmap.testing.demo_town import DemoSettings
     from shmmap.testing.interrupts import signals_interrupt
 
     picture = _picture_path(args.svg)

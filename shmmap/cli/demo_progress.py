@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.live import Live
 
-    from shmmap.testing.demo import Progress
+    from shmmap.testing.demo_town import Progress
     from shmmap.testing.fleet import StepReport
 
 __all__ = ["LiveProgress", "PlainProgress", "QuietProgress", "progress_for"]

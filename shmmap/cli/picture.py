@@ -19,7 +19,7 @@ BoxTuple: TypeAlias = tuple[float, float, float, float]
 
 WIDTH_PX: Final = 960.0
 MARGIN_PX: Final = 16.0
-CAPTION_PX: Final = 66.0
+CAPTION_PX: Final = 72.0
 
 _STYLE: Final = """
   text { font-family: system-ui, "DejaVu Sans", sans-serif; font-size: 14px; fill: #1f2933; }

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shmmap.errors import ConfigError
-from shmmap.testing.demo import DemoSettings, fit
+from shmmap.testing.demo_town import DemoSettings, fit
 from shmmap.testing.height_image import HeightImage
 
 GIB = 1 << 30
