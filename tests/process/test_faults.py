@@ -78,7 +78,7 @@ def test_patience_ends(daemon: DaemonFactory, connect: Connect, divided_map: Div
 def test_a_loader_that_hangs_ends_at_its_deadline(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    one = daemon(divided_map.root, "--workers", "1", "--load-timeout", "1")
+    one = daemon(divided_map.root, "--workers", "1", "--load-timeout", "4")
     client = connect(one)
     client.area(circle(0, 0, 5))
     (loader,) = stop_loaders(one)
@@ -126,7 +126,7 @@ def test_idle_loaders_that_are_killed_are_replaced(
 
 def test_a_pipe_instead_of_a_file(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     """Opening it would wait for ever."""
-    one = daemon(divided_map.root, "--load-timeout", "2")
+    one = daemon(divided_map.root, "--load-timeout", "4")
     path = divided_map.pcd_dir / "0_0.pcd"
     path.unlink()
     os.mkfifo(path)
