@@ -9,13 +9,17 @@ import secrets
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from shmmap.daemon.residency import Resident
 from shmmap.errors import NoSession
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["Peer", "Session", "Sessions"]
+__all__ = ["Peer", "Session", "Sessions", "predicted_path"]
+
+LOOK_AHEAD_S: Final = 5
+ROUTE_VERTICES: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +117,19 @@ class Session:
         return Holder(self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells)
 
 
+def predicted_path(intent: Intent) -> list[tuple[float, float]]:
+    """Where a client is, and where it says it will be: along its route, else straight on.
+
+    Positions every second of the next five; of a route its first vertices, as long as it may be.
+    """
+    path = [(intent.x, intent.y)]
+    if intent.route:
+        path += intent.route[:ROUTE_VERTICES]
+    elif intent.vx or intent.vy:
+        path += [(intent.x + s * intent.vx, intent.y + s * intent.vy) for s in range(1, LOOK_AHEAD_S + 1)]
+    return path
+
+
 def command_of(pid: int) -> str:
     """Command name of a process, empty where it cannot be read."""
     if pid <= 0:
@@ -204,5 +221,5 @@ class Sessions:
             session.pidfd = -1
 
     def poses(self) -> list[tuple[float, float]]:
-        """Where the clients are, metres, map frame."""
-        return [(s.intent.x, s.intent.y) for s in self if s.intent is not None]
+        """Where the clients are and are going to be, metres, map frame."""
+        return [pose for s in self if s.intent is not None for pose in predicted_path(s.intent)]

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.residency import Key, Resident
-from shmmap.daemon.sessions import Peer, Session, Sessions, command_of
+from shmmap.daemon.sessions import Peer, Session, Sessions, command_of, predicted_path
 from shmmap.errors import NoSession
 from shmmap.protocol.messages import Intent
 
@@ -150,3 +150,14 @@ def test_where_a_client_is() -> None:
     session.intent, session.says_where = Intent(7.0, 8.0), True
     session.asked_about(1.0, 1.0)
     assert sessions.poses() == [(7.0, 8.0)]
+
+
+def test_where_a_client_is_going_counts() -> None:
+    still = Intent(1.0, 2.0)
+    assert predicted_path(still) == [(1.0, 2.0)]
+    straight = predicted_path(Intent(1.0, 2.0, vx=10.0, vy=-1.0))
+    assert straight == [(1.0, 2.0), *((1.0 + 10.0 * s, 2.0 - s) for s in (1, 2, 3, 4, 5))]
+    route = tuple((float(i), 0.0) for i in range(100))
+    known = predicted_path(Intent(1.0, 2.0, vx=10.0, route=route))
+    assert known[0] == (1.0, 2.0)
+    assert known[1:] == list(route[: len(known) - 1])
