@@ -345,7 +345,9 @@ class Store:
             delay_s = min(2 * old.delay_s, LAST_RETRY_S) if old and old.code == code else FIRST_RETRY_S
             self._statistics.add("loads_failed")
             _log.warning("cannot load %s: %s: %s", load.key.cell_id, code, message)
-        self.books.failed(load, Failure(code, message, stamp, now_s + delay_s, delay_s))
+        failure = Failure(code, message, stamp, now_s + delay_s, delay_s)
+        # of a cell that left the map meanwhile nothing is remembered
+        self.books.failed(load, failure if self.index_of(load.key.cell_id) is not None else None)
         self._on_settled(load.key)
 
     def _abandon(self, load: Load) -> None:
