@@ -33,11 +33,11 @@ from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.writer import StatisticsWriter
 
 EPOCH = 77
-PATIENCE_S = 60.0
+PATIENCE_S = 30.0
 
 
 class InnerDaemon:
-    """Store, sessions and requests over one map; ``offset_s`` moves its clock ahead of the real one."""
+    """Store, sessions and requests over one map; ``offset_s`` moves its clock ahead."""
 
     def __init__(
         self,
@@ -79,6 +79,7 @@ class InnerDaemon:
             on_settled=self._on_settled,
         )  # fmt: skip
         self.offset_s = 0.0
+        self.stopped_at_s: float | None = None
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.store,
@@ -97,7 +98,12 @@ class InnerDaemon:
 
     def now_s(self) -> float:
         """Return the time of the daemon's clock."""
-        return time.monotonic() + self.offset_s
+        now_s = time.monotonic() if self.stopped_at_s is None else self.stopped_at_s
+        return now_s + self.offset_s
+
+    def stop_clock(self) -> None:
+        """From now on only ``offset_s`` moves the daemon's clock."""
+        self.stopped_at_s = time.monotonic()
 
     def session(self, name: str = "") -> Session:
         """Open a session of a process that nobody watches."""
