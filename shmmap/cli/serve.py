@@ -44,7 +44,9 @@ def add_parser(subparsers: Subparsers) -> None:
     limits.add_argument(
         "--session-quota", metavar="PART", help="part of the budget one client may fill (default: 0.9)"
     )
-    limits.add_argument("--workers", metavar="N", help="most loader processes (default: 4)")
+    limits.add_argument(
+        "--workers", metavar="N", help="most loader processes (default: processors less one, at most 4)"
+    )
     limits.add_argument(
         "--load-timeout", metavar="SECONDS", dest="load_timeout_s", help="deadline of one load (default: 60)"
     )

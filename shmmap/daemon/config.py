@@ -61,7 +61,8 @@ class DaemonConfig:
     session_quota
         What one client may keep for itself alone: a part of the budget (up to 1), or bytes (above 1).
     workers
-        Most loader processes at a time.
+        Most loader processes at a time; 0: one less than there are processors, from 1 to 4, so that
+        one is left for who is being served while cells load.
     load_timeout_s
         How long loading one cell may take.
     strict
@@ -81,7 +82,7 @@ class DaemonConfig:
     group: str = ""
     budget_bytes: int = 0
     session_quota: float = 0.9
-    workers: int = 4
+    workers: int = 0
     load_timeout_s: float = 60.0
     strict: bool = False
     cache_dir: str = ""
@@ -93,6 +94,10 @@ class DaemonConfig:
             return endpoint_path(self.endpoint)
         directory = self.runtime_dir or os.environ.get("RUNTIME_DIRECTORY", "") or _default_runtime_dir()
         return endpoint_path(socket_path(directory, self.instance))
+
+    def loaders(self) -> int:
+        """Most loader processes at a time."""
+        return self.workers or min(4, max(1, len(os.sched_getaffinity(0)) - 1))
 
 
 def _default_runtime_dir() -> str:
@@ -149,7 +154,7 @@ def _convert(name: str, value: Any, origin: str) -> Any:
         ) from None
     allowed: dict[str, Callable[[Any], bool]] = {
         "session_quota": lambda v: 0 < v <= LARGEST_BYTES,
-        "workers": lambda v: 1 <= v <= 64,
+        "workers": lambda v: 0 <= v <= 64,
         "load_timeout_s": lambda v: 0 < v <= 86400,
         "budget_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
         "eviction": lambda v: v in ("distance", "lru"),

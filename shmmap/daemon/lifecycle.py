@@ -76,7 +76,7 @@ def run(config: DaemonConfig) -> int:
     prepare_process()
     _raise_descriptor_limit()
     with contextlib.ExitStack() as stack:
-        _prepare_signals()
+        signals = _StartSignals()
         path = config.socket()
         gid, mode = _access(config)
         _make_runtime_dir(Path(path).parent, gid)
@@ -90,7 +90,7 @@ def run(config: DaemonConfig) -> int:
             cache_dir=config.cache_dir or None,
         )
         config = dataclasses.replace(config, map_path=origin.path)
-        with _signals_held():
+        with signals.held():
             lock = InstanceLock(_lock_path(path))
             stack.callback(lock.release)
             # a second one beside the segments: two runtime directories may share a directory of segments
@@ -101,37 +101,52 @@ def run(config: DaemonConfig) -> int:
         catalogue = origin.load()
         for problem in catalogue.problems:
             _log.warning("%s", problem)
-        with _signals_held():
+        with signals.held():
             life = _Life(config, catalogue, directory, path, mode, gid)
             stack.callback(life.close)
-        life.serve(Reloader(origin), started_s)
+        life.serve(Reloader(origin), started_s, signals)
     return 0
 
 
 _STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 
 
-def _prepare_signals() -> None:
-    """While the daemon starts: stop means unwinding at once, a reload waits until it serves."""
-    for number in _STOP_SIGNALS:
-        signal.signal(number, _stop_starting)
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
+class _StartSignals:
+    """Signals while the daemon starts: stop means unwinding at once, a reload waits until it serves.
 
+    Masks would not do: they are a thread's, and libraries have threads of their own.
+    """
 
-def _stop_starting(number: int, frame: object) -> None:
-    del frame
-    _log.info("stopping on %s, before serving", signal.Signals(number).name)
-    raise SystemExit(0)
+    def __init__(self) -> None:
+        self.reload_wanted = False
+        self._held = False
+        self._stop = False
+        for number in _STOP_SIGNALS:
+            signal.signal(number, self._on_stop)
+        signal.signal(signal.SIGHUP, self._on_reload)
 
+    def _on_reload(self, number: int, frame: object) -> None:
+        del number, frame
+        self.reload_wanted = True
 
-@contextlib.contextmanager
-def _signals_held() -> Iterator[None]:
-    """Keep stop signals for later while something takes a name and has nobody yet to take it away."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOP_SIGNALS)
+    def _on_stop(self, number: int, frame: object) -> None:
+        del frame
+        if not self._stop:
+            _log.info("stopping on %s, before serving", signal.Signals(number).name)
+        self._stop = True
+        if not self._held:
+            raise SystemExit(0)
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep a stop for later while something takes a name and has nobody yet to take it away."""
+        self._held = True
+        try:
+            yield
+        finally:
+            self._held = False
+        if self._stop:
+            raise SystemExit(0)
 
 
 def _ignore_signals() -> None:
@@ -237,7 +252,7 @@ class _Life:
         reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction])
         retire_leftovers(directory, config.instance, reclaimer, time.monotonic())
         pool = WorkerPool(
-            config.workers,
+            config.loaders(),
             directory.path,
             config.load_timeout_s,
             watch=lambda fd: self._running.watch_worker(fd),
@@ -265,7 +280,7 @@ class _Life:
             raise InternalError("the server does not run yet")
         return self._server
 
-    def serve(self, reloader: Reloader, started_s: float) -> None:
+    def serve(self, reloader: Reloader, started_s: float, signals: _StartSignals) -> None:
         """Bind, say READY, answer requests until told to stop."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
@@ -298,6 +313,8 @@ class _Life:
                 )  # fmt: skip
                 notify("READY=1", f"STATUS=serving {len(self._catalogue)} cells", f"MAINPID={os.getpid()}")
                 _settle_memory()
+                if signals.reload_wanted:
+                    server.reload()
                 server.run()
         finally:
             notify("STOPPING=1", "STATUS=freeing memory")
@@ -339,7 +356,6 @@ class _Life:
         for number in (*_STOP_SIGNALS, signal.SIGHUP):
             signal.signal(number, lambda *_: None)
         before = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGHUP])
         try:
             self._wakeup = ours
             yield ours.fileno()

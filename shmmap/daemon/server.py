@@ -144,7 +144,7 @@ class Server:
             self._beat_at_s = now_s + BEAT_S
             self._beat()
 
-    def _beat(self) -> None:
+    def _measure(self) -> None:
         books, set_value = self._store.books, self._statistics.set
         set_value("sessions", len(self._sessions))
         set_value("waiting_requests", len(self.cells))
@@ -160,6 +160,10 @@ class Server:
         set_value("budget_bytes", books.budget_bytes)
         set_value("evictions", self._store.reclaimer.evicted_count)
         set_value("map_cells", len(self._store.catalogue))
+
+    def _beat(self) -> None:
+        self._measure()
+        books = self._store.books
         books.overhead_bytes = self._statistics.size_bytes
         self._store.show_used(USED_ROWS_A_BEAT)
         self._statistics.beat()
@@ -225,6 +229,8 @@ class Server:
             if isinstance(message, messages.Reload):
                 self._reload_for(session, message)
             else:
+                if isinstance(message, messages.Stats):
+                    self._measure()
                 self._send(session, encode(self._admin.answer(message, now_s)))
 
     def _hello(

@@ -319,6 +319,9 @@ class Store:
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load took too long; only the cell they worked on fails."""
         for worker in self.pool.overdue(now_s):
+            if not worker.ready:
+                self._on_worker_end(worker, now_s)
+                continue
             number, job = next(iter(worker.queue.items()))
             load = self._jobs.pop(number, None)
             worker.queue.pop(number)

@@ -25,6 +25,9 @@ _log = logging.getLogger(__name__)
 JOBS_AHEAD = 4
 """Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
 
+START_DEADLINE_S = 60.0
+"""How long a worker may take from its first job until it is ready: an interpreter and its imports."""
+
 
 @dataclass(eq=False, slots=True)
 class Worker:
@@ -202,15 +205,15 @@ class WorkerPool:
         return list(worker.queue.values()), how
 
     def overdue(self, now_s: float) -> list[Worker]:
-        """Workers whose current load is past its deadline."""
-        return [w for w in self._workers.values() if w.queue and now_s - w.head_since_s >= self._deadline_s]
+        """Workers whose current load, or whose start, is past its deadline."""
+        return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
+
+    def _due_s(self, worker: Worker) -> float:
+        return worker.head_since_s + (self._deadline_s if worker.ready else START_DEADLINE_S)
 
     def next_deadline_s(self) -> float:
         """When the next load becomes overdue; infinity when nothing loads."""
-        return min(
-            (w.head_since_s + self._deadline_s for w in self._workers.values() if w.queue),
-            default=float("inf"),
-        )
+        return min((self._due_s(w) for w in self._workers.values() if w.queue), default=float("inf"))
 
     def close(self) -> None:
         """End every worker."""

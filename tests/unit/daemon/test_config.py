@@ -69,7 +69,7 @@ def test_any_text_is_a_size_or_refused(text: str) -> None:
 
 
 BAD: list[tuple[str, Any]] = [
-    ("workers", 0), ("workers", 65), ("workers", "many"), ("workers", 1.5), ("workers", True),
+    ("workers", -1), ("workers", 65), ("workers", "many"), ("workers", 1.5), ("workers", True),
     ("workers", "1e9"), ("load_timeout_s", float("nan")),
     ("load_timeout_s", 0), ("load_timeout_s", -1.0), ("load_timeout_s", "soon"),
     ("load_timeout_s", 86401), ("load_timeout_s", True), ("load_timeout_s", 10**400),
