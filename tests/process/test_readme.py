@@ -48,10 +48,21 @@ def test_links_lead_somewhere() -> None:
 
 def test_every_block_is_tested() -> None:
     assert set(re.findall(r"^<!-- (.+) -->$", README, re.MULTILINE)) == {
-        "server", "user", "points", "window", "client-only",
+        "server", "user", "points", "window", "client-only", "benchmarks",
     }  # fmt: skip
     # the two lines have no name
-    assert README.count("\n```sh\n") + README.count("\n```python\n") == 5 + 2
+    assert README.count("\n```sh\n") + README.count("\n```python\n") == 6 + 2
+
+
+def test_benchmarks_start() -> None:
+    install, *runs = block("benchmarks")
+    assert install.endswith("'.[bench]'")
+    assert {f"`{line.rsplit('.', 1)[1]}`" for line in runs} == set(
+        re.findall(r"\| (`\w+`) \|$", README, re.M)
+    )
+    for line in runs:
+        words = line.removeprefix(".venv/bin/python ").split()
+        subprocess.run([sys.executable, *words, "--help"], cwd=ROOT, check=True, capture_output=True)
 
 
 class Reader:
