@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from shmmap.cli.parser import build_parser, join_negative_values
+from shmmap.cli.parser import build_parser, join_negative_values, verb_first
 from shmmap.errors import InternalError, ShmmapError
 
 __all__ = ["main", "serve_main"]
@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv
         Words after the program's name; those of this process by default.
     """
-    words = join_negative_values(sys.argv[1:] if argv is None else argv)
+    words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv))
     try:
         args = build_parser().parse_args(words)
         code: int = args.run(args)

@@ -25,7 +25,7 @@ from shmmap.cli import (
     version,
 )
 
-__all__ = ["VERBS", "build_parser", "join_negative_values"]
+__all__ = ["VERBS", "build_parser", "join_negative_values", "verb_first"]
 
 VERBS: Final = (
     demo,
@@ -43,6 +43,8 @@ VERBS: Final = (
     version,
 )
 
+_OWN_OPTIONS: Final = frozenset({"--help", "--version"})
+_FLAGS: Final = frozenset({"--json"})  # common options without a value
 _NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z"})
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
@@ -71,6 +73,17 @@ def join_negative_values(words: Sequence[str]) -> list[str]:
         else:
             joined.append(word)
     return joined
+
+
+def verb_first(words: Sequence[str]) -> list[str]:
+    """Write ``--endpoint PATH status`` as ``status --endpoint PATH``: the verbs own all options."""
+    end = 0
+    while end < len(words) and words[end].startswith("--") and words[end] not in _OWN_OPTIONS:
+        takes_value = words[end] not in _FLAGS and "=" not in words[end]
+        end += 2 if takes_value else 1
+    if 0 < end < len(words):
+        return [words[end], *words[:end], *words[end + 1 :]]
+    return list(words)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -9,7 +9,7 @@ import pytest
 
 from shmmap.cli.entry import main
 from shmmap.cli.options import area_from, numbers, seconds
-from shmmap.cli.parser import build_parser, join_negative_values
+from shmmap.cli.parser import build_parser, join_negative_values, verb_first
 from shmmap.errors import BadRequest
 from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
 
@@ -113,3 +113,10 @@ def test_numbers_and_seconds() -> None:
     for text in ("-1", "inf", "nan", "x", ""):
         with pytest.raises(argparse.ArgumentTypeError):
             seconds(text)
+
+
+def test_common_options_may_stand_before_the_verb() -> None:
+    assert verb_first(["--endpoint", "/x", "--json", "status"]) == ["status", "--endpoint", "/x", "--json"]
+    assert verb_first(["--timeout=3", "query", "--id", "a"]) == ["query", "--timeout=3", "--id", "a"]
+    for words in (["status", "--json"], ["--help"], ["--version"], ["--json"], ["--endpoint"], []):
+        assert verb_first(words) == words
