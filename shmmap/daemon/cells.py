@@ -15,10 +15,11 @@ from typing import Final
 import numpy as np
 
 from shmmap.daemon.difference import difference, warm_difference
+from shmmap.daemon.loading import SPACE_CODES
 from shmmap.daemon.reclaim import HAND_OUT_GRACE_S
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.sessions import Session
-from shmmap.daemon.store import SPACE_CODES, Store
+from shmmap.daemon.store import Store
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, ZRange, distance_to_boxes
 from shmmap.layers.spec import canonical_layers

@@ -305,7 +305,7 @@ class _Life:
             with self._signal_descriptor() as fd:
                 server.watch(fd, self._on_signals)
                 self._bind(socket)
-                self._store.pool.start_one()
+                self._store.loads.pool.start_one()
                 _log.info(
                     "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
                     self._socket_path, self._config.instance, self._config.map_path,

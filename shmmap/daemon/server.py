@@ -101,9 +101,9 @@ class Server:
         self.watch(fd, lambda: self._on_worker(fd))
 
     def _on_worker(self, fd: int) -> None:
-        worker = self._store.pool.by_fd(fd)
+        worker = self._store.loads.pool.by_fd(fd)
         if worker is not None:
-            self._store.on_worker(worker, time.monotonic())
+            self._store.loads.on_worker(worker, time.monotonic())
 
     def stop(self) -> None:
         """Leave the loop after this turn."""
@@ -115,7 +115,7 @@ class Server:
         """Serve until `stop`; then answer those who still wait."""
         while not self._stopping:
             now_s = time.monotonic()
-            until_s = min(self._store.next_event_s(), self.cells.next_deadline_s(), self._beat_at_s)
+            until_s = min(self._store.loads.next_event_s(), self.cells.next_deadline_s(), self._beat_at_s)
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
             ready = self._poller.poll(min(timeout_ms, int(BEAT_S * 1000)))
             self._turn(ready)
@@ -137,8 +137,8 @@ class Server:
                     if callback is not None:
                         callback()
         now_s = time.monotonic()
-        self._store.end_overdue(now_s)
-        self._store.pump(now_s)
+        self._store.loads.end_overdue(now_s)
+        self._store.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
         if now_s >= self._beat_at_s:
             self._beat_at_s = now_s + BEAT_S
@@ -148,7 +148,7 @@ class Server:
         books, set_value = self._store.books, self._statistics.set
         set_value("sessions", len(self._sessions))
         set_value("waiting_requests", len(self.cells))
-        set_value("workers", len(self._store.pool))
+        set_value("workers", len(self._store.loads.pool))
         set_value("load_queue", books.queued)
         set_value("cells_resident", books.resident_count)
         set_value("stale_cells", books.resident_count - sum(map(len, self._store.warm.values())))

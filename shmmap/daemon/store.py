@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map in memory: finds cells, loads what is wanted, publishes, supersedes, evicts.
+"""The map in memory: finds cells, has loaded what is wanted, publishes, supersedes, evicts.
 
-The store joins the pure books (`residency`) with what does the work: the catalogue, the loader
-workers and the shared-memory directory.  It never blocks and knows nothing of sockets: whoever
+The store joins the pure books (`residency`) with what does the work: the catalogue, the loads
+(`loading`) and the shared-memory directory.  It never blocks and knows nothing of sockets: whoever
 waits for a key is told through ``on_settled``.
 """
 
@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon import jobs
-from shmmap.daemon.reclaim import Outcome, Reclaimer
-from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident, Slot
-from shmmap.daemon.workers import Worker, WorkerPool
+from shmmap.daemon.loading import Loading
+from shmmap.daemon.reclaim import Reclaimer
+from shmmap.daemon.residency import Key, Load, Residency, Resident, Slot
+from shmmap.daemon.workers import WorkerPool
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
 from shmmap.origin.stamp import Stamp
 from shmmap.protocol.codec import encode_handle
@@ -36,12 +37,6 @@ __all__ = ["Store"]
 
 _log = logging.getLogger(__name__)
 
-FIRST_RETRY_S: Final = 1.0
-LAST_RETRY_S: Final = 30.0
-BUDGET_RETRY_S: Final = 0.1
-START_ATTEMPTS: Final = 3
-"""After this many loaders in a row that could not start, loads fail instead of waiting."""
-SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
 
@@ -60,6 +55,8 @@ class Store:
 
     Attributes
     ----------
+    loads
+        What is being loaded.
     history : deque
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
     used : set
@@ -91,7 +88,7 @@ class Store:
         self.catalogue = catalogue
         self.books = residency
         self.reclaimer = reclaimer
-        self.pool = pool
+        self.loads = Loading(self, residency, reclaimer, pool, statistics, on_settled)
         self.warm: dict[str, dict[int, Resident]] = {}
         self.versions: dict[str, NDArray[np.uint64]] = {}
         self.id_prefix = id_prefix
@@ -105,9 +102,6 @@ class Store:
         self._gid = gid
         self._on_settled = on_settled
         self._indices: dict[str, int] = {}
-        self._jobs: dict[int, Load] = {}
-        self._job_numbers = 0
-        self._hungry: dict[int, tuple[Worker, int]] = {}
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
         self.history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=64)
@@ -150,7 +144,7 @@ class Store:
         if (
             slot.load is None
             and slot.failure is not None
-            and not self._worth_retrying(key, slot.failure, now_s)
+            and not self.loads.may_retry(key, slot.failure, now_s)
         ):
             return slot
         self.books.want(key, self.estimate(index), priority)
@@ -164,207 +158,29 @@ class Store:
         size = self.catalogue.stamp(index).size + _HEADER_ALLOWANCE_BYTES
         return -(-size // _PAGE_BYTES) * _PAGE_BYTES
 
-    def _worth_retrying(self, key: Key, failure: Failure, now_s: float) -> bool:
-        if now_s >= failure.retry_at_s:
-            return True
-        if failure.code in SPACE_CODES:
-            return False
-        try:
-            state = os.stat(key.cell_id)
-        except OSError:
-            return False
-        return (state.st_size, state.st_mtime_ns, state.st_ctime_ns) != failure.stamp
-
-    def pump(self, now_s: float) -> None:
-        """Free what is due, hand queued loads to workers as far as memory and workers allow."""
-        if self.books.zombies and self.reclaimer.sweep(now_s):
-            self.books.clear_failures(SPACE_CODES)
-        self._feed_hungry(now_s)
-        while self.pool.has_room:
-            load = self.books.next_queued()
-            if load is None:
-                return
-            index = self.index_of(load.key.cell_id)
-            if index is None:
-                self._abandon(load)
-                continue
-            shortage = self.books.shortage(load.estimate)
-            if shortage > 0:
-                if self._make_room(load, shortage, now_s):
-                    continue
-                return
-            self.books.start(load, now_s)
-            self._job_numbers += 1
-            job = jobs.Job(
-                self._job_numbers,
-                load.key.cell_id,
-                self.catalogue.path(index),
-                load.key.layer,
-                self.catalogue.box(index),
-                self.catalogue.frame_id,
-                load.estimate,
-            )
-            if not self.pool.submit(job, now_s):
-                self.books.requeue(load)
-                return
-            self._jobs[job.number] = load
-            self._statistics.add("loads_started")
-
-    def _make_room(self, load: Load, shortage: int, now_s: float) -> bool:
-        """Whether the load was given up (True) or room is on its way (False)."""
-        if load.estimate + self.books.overhead_bytes > self.books.budget_bytes:
-            message = f"the cell needs {load.estimate} bytes, the whole budget is {self.books.budget_bytes}"
-            self._fail(load, "over_budget", message, None, now_s)
-            return True
-        if self.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_give_back():
-            return False
-        message = f"{load.estimate} bytes do not fit: the budget of {self.books.budget_bytes} bytes is in use"
-        self._fail(load, "over_budget", message, None, now_s)
-        return True
-
-    def _may_give_back(self) -> bool:
-        """Whether a load runs that will end by itself: it may need less than is reserved for it.
-
-        Loads that wait for room do not end by themselves, nor do those that come after them in the
-        same loader's queue.
-        """
-        return any(worker.queue and next(iter(worker.queue)) not in self._hungry for worker in self.pool)
-
-    def next_event_s(self) -> float:
-        """When `pump` has something to do although nothing arrives; infinity for never."""
-        return min(self.reclaimer.next_sweep_s(), self.reclaimer.wake_s, self.pool.next_deadline_s())
-
-    # --- what workers say -----------------------------------------------------------------------
-
-    def on_worker(self, worker: Worker, now_s: float) -> bool:
-        """Handle one message of a worker; False when there is none left now."""
-        try:
-            received = self.pool.receive(worker)
-        except EOFError:
-            self._on_worker_end(worker, now_s)
-            return False
-        if received is None:
-            return False
-        message, fd = received
-        if fd >= 0 and not isinstance(message, jobs.Segment):
-            os.close(fd)
-        if isinstance(message, jobs.Ready):
-            worker.ready = True
-            worker.head_since_s = now_s
-            self.pool.failed_starts = 0
-            return True
-        if isinstance(message, jobs.Segment):
-            if worker.segment_fd >= 0:
-                os.close(worker.segment_fd)
-            worker.segment_fd = fd
-            return True
-        if isinstance(message, jobs.Need):
-            self._hungry[message.number] = (worker, message.bytes)
-            self._feed_hungry(now_s)
-            return True
-        self.pool.finished(worker, message.number, now_s)
-        self._hungry.pop(message.number, None)
-        load = self._jobs.pop(message.number, None)
-        fd, worker.segment_fd = worker.segment_fd, -1
-        if isinstance(message, jobs.Failed):
-            if fd >= 0:
-                os.close(fd)
-            if load is not None:
-                self._fail(load, message.code, message.message, message.stamp, now_s)
-        elif fd >= 0:
-            try:
-                if load is not None:
-                    self._publish(load, message, fd, now_s)
-            finally:
-                os.close(fd)
-        elif load is not None:  # this process had no descriptor left to receive it
-            self._fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
-        return True
-
-    def _feed_hungry(self, now_s: float) -> None:
-        """Grant, hold or refuse the extra bytes that workers asked for."""
-        for number, (worker, nbytes) in list(self._hungry.items()):
-            load = self._jobs.get(number)
-            if load is None:
-                del self._hungry[number]
-            elif self.books.grow(load, nbytes):
-                del self._hungry[number]
-                self.pool.answer(worker, jobs.Grant(number))
-            else:
-                shortage = self.books.shortage(nbytes - load.reserved)
-                hopeless = nbytes + self.books.overhead_bytes > self.books.budget_bytes
-                outcome = Outcome.IMPOSSIBLE if hopeless else self.reclaimer.free(shortage, now_s)
-                if hopeless or (outcome is Outcome.IMPOSSIBLE and not self._may_give_back()):
-                    del self._hungry[number]
-                    self.pool.answer(worker, jobs.Refuse(number))
-
-    def _on_worker_end(self, worker: Worker, now_s: float) -> None:
-        unfinished, how = self.pool.remove(worker)
-        self._statistics.add("worker_crashes")
-        if not worker.ready:
-            self.pool.failed_starts += 1
-            _log.error("a loader could not start: %s", how)
-        at_fault = worker.ready or self.pool.failed_starts >= START_ATTEMPTS
-        for position, job in enumerate(unfinished):
-            self._hungry.pop(job.number, None)
-            load = self._jobs.pop(job.number, None)
-            if load is None:
-                continue
-            if position == 0 and at_fault:
-                _log.error("loader died while it read %s: %s", job.path, how)
-                self._fail(load, "load_failed", f"{job.path}: the loader died of it ({how})", None, now_s)
-            else:
-                self.books.requeue(load)
-
-    def end_overdue(self, now_s: float) -> None:
-        """Kill workers whose load took too long; only the cell they worked on fails."""
-        for worker in self.pool.overdue(now_s):
-            if not worker.ready:
-                self._on_worker_end(worker, now_s)
-                continue
-            number, job = next(iter(worker.queue.items()))
-            load = self._jobs.pop(number, None)
-            worker.queue.pop(number)
-            unfinished, _how = self.pool.remove(worker)
-            self._hungry.pop(number, None)
-            self._statistics.add("loads_timed_out")
-            _log.error("loading %s took too long, its loader was ended", job.path)
-            if load is not None:
-                self._fail(load, "load_timeout", f"{job.path}: loading took longer than allowed", None, now_s)
-            for other in unfinished:
-                self._hungry.pop(other.number, None)
-                waiting = self._jobs.pop(other.number, None)
-                if waiting is not None:
-                    self.books.requeue(waiting)
-
-    def _fail(
-        self, load: Load, code: str, message: str, stamp: tuple[int, int, int] | None, now_s: float
-    ) -> None:
-        old = self.books.slot(load.key).failure
-        if code in SPACE_CODES:
-            delay_s = BUDGET_RETRY_S
-            self._statistics.add("refused_over_budget")
-        else:
-            delay_s = min(2 * old.delay_s, LAST_RETRY_S) if old and old.code == code else FIRST_RETRY_S
-            self._statistics.add("loads_failed")
-            _log.warning("cannot load %s: %s: %s", load.key.cell_id, code, message)
-        failure = Failure(code, message, stamp, now_s + delay_s, delay_s)
-        # of a cell that left the map meanwhile nothing is remembered
-        self.books.failed(load, failure if self.index_of(load.key.cell_id) is not None else None)
-        self._on_settled(load.key)
-
-    def _abandon(self, load: Load) -> None:
-        """The cell left the map: nobody asks for this any more, so no failure is remembered."""
-        self.books.failed(load, None)
-        self._on_settled(load.key)
-
     # --- publishing -----------------------------------------------------------------------------
 
-    def _publish(self, load: Load, done: jobs.Done, fd: int, now_s: float) -> None:
+    def job(self, load: Load, number: int) -> jobs.Job | None:
+        """What a worker has to do for a load; None if its cell left the map."""
+        index = self.index_of(load.key.cell_id)
+        if index is None:
+            return None
+        return jobs.Job(
+            number,
+            load.key.cell_id,
+            self.catalogue.path(index),
+            load.key.layer,
+            self.catalogue.box(index),
+            self.catalogue.frame_id,
+            load.estimate,
+        )
+
+    def publish(self, load: Load, done: jobs.Done, fd: int, now_s: float) -> None:
+        """Name a finished segment and hand it out from now on."""
         index = self.index_of(load.key.cell_id)
         if index is None:
             self._statistics.add("loads_failed")
-            self._abandon(load)
+            self.loads.abandon(load)
             return
         stamp, known = Stamp(*done.stamp), self.catalogue.stamp(index)
         if stamp != known:
@@ -387,7 +203,7 @@ class Store:
             )
         except OSError as error:
             code = "no_space" if is_full(error) else "load_failed"
-            self._fail(load, code, f"cannot publish: {error.strerror}", None, now_s)
+            self.loads.fail(load, code, f"cannot publish: {error.strerror}", None, now_s)
             return
         resident = Resident(
             name=name,
@@ -546,5 +362,5 @@ class Store:
 
     def close(self) -> None:
         """End the workers and take every segment's name away."""
-        self.pool.close()
+        self.loads.pool.close()
         self.reclaimer.remove_all()

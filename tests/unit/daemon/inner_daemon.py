@@ -114,10 +114,10 @@ class InnerDaemon:
         for fd, _ in self._poll.poll(timeout_s):
             worker = self.pool.by_fd(fd)
             if worker is not None:
-                self.store.on_worker(worker, self.now_s())
+                self.store.loads.on_worker(worker, self.now_s())
         now_s = self.now_s()
-        self.store.end_overdue(now_s)
-        self.store.pump(now_s)
+        self.store.loads.end_overdue(now_s)
+        self.store.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
 
     def run_until(self, done: Callable[[], object]) -> None:

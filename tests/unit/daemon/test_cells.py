@@ -341,7 +341,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 4
     one.cells.selected(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0), one.now_s())
-    one.run_until(lambda: one.store._hungry)
+    one.run_until(lambda: one.store.loads.hungry)
     (worker,) = one.pool
     worker.process.kill()
     one.run_until(lambda: worker not in list(one.pool))
@@ -350,7 +350,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert "SIGKILL" in reply.failed[0].message
     one.run_until(lambda: not one.books.reserved_bytes)
-    assert one.store._hungry == {}
+    assert one.store.loads.hungry == {}
 
 
 def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
@@ -363,10 +363,10 @@ def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map:
     one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 4
     one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=30.0), one.now_s())
-    one.run_until(lambda: one.store._hungry)
+    one.run_until(lambda: one.store.loads.hungry)
     one.offset_s += 0.6
     assert [failure.code for failure in one.cells_of(2).failed] == ["load_timeout"]
-    assert (one.books.reserved_bytes, one.store._hungry, len(one.pool)) == (0, {}, 0)
+    assert (one.books.reserved_bytes, one.store.loads.hungry, len(one.pool)) == (0, {}, 0)
 
 
 def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:

@@ -160,7 +160,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
         next(d for d in iter(lambda: puppet.channel.recv(65536), b"") if b"grant" in d)
     )
     assert granted == jobs.Grant(queue[0].number)
-    assert (one.books.reserved_bytes, one.store._hungry) == (0, {})
+    assert (one.books.reserved_bytes, one.store.loads.hungry) == (0, {})
     puppet.channel.close()
 
 
