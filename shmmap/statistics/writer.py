@@ -138,6 +138,11 @@ class StatisticsWriter:
         if slot is not None:
             self._removed.append(slot)
 
+    @property
+    def outdated(self) -> bool:
+        """Whether cells came, went or changed since the last beat."""
+        return bool(self._changed or self._removed)
+
     def update_identity(self, identity: DaemonIdentity) -> None:
         """Replace what the segment says of its writer, as after a reload.
 

@@ -91,7 +91,7 @@ def test_no_map(daemon: DaemonFactory, tmp_path: Path, make: Callable[[Path], No
 
 
 @pytest.mark.parametrize(
-    "flags", [("--budget", "much"), ("--budget", "1000T"), ("--workers", "0"), ("--group", "no such group")]
+    "flags", [("--budget", "much"), ("--budget", "1000T"), ("--workers", "65"), ("--group", "no such group")]
 )
 def test_bad_settings(daemon: DaemonFactory, divided_map: DividedMap, flags: tuple[str, ...]) -> None:
     one: DaemonProcess = daemon(divided_map.root, *flags, start=False)
