@@ -12,10 +12,8 @@ import contextlib
 import ctypes
 import dataclasses
 import gc
-import grp
 import logging
 import os
-import resource
 import secrets
 import signal
 import socket as sockets
@@ -35,11 +33,18 @@ from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import retire_leftovers
 from shmmap.daemon.logs import set_up_logging
 from shmmap.daemon.notify import notify
+from shmmap.daemon.prerequisites import (
+    access_of_segments,
+    check_leases,
+    make_runtime_dir,
+    raise_descriptor_limit,
+)
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.residency import Residency
 from shmmap.daemon.server import Server
 from shmmap.daemon.sessions import Sessions
+from shmmap.daemon.start_signals import STOP_SIGNALS, StartSignals, ignore_signals
 from shmmap.daemon.store import Store
 from shmmap.daemon.workers import WorkerPool
 from shmmap.errors import ConfigError, InternalError
@@ -48,7 +53,7 @@ from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import segment_prefix
-from shmmap.segment.pins import leases_work, prepare_process
+from shmmap.segment.pins import prepare_process
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -74,15 +79,15 @@ def run(config: DaemonConfig) -> int:
     """
     set_up_logging()
     prepare_process()
-    _raise_descriptor_limit()
+    raise_descriptor_limit()
     with contextlib.ExitStack() as stack:
-        signals = _StartSignals()
+        signals = StartSignals()
         path = config.socket()
-        gid, mode = _access(config)
-        _make_runtime_dir(Path(path).parent, gid)
+        gid, mode = access_of_segments(config)
+        make_runtime_dir(Path(path).parent, gid)
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
-        _check_leases(directory)
+        check_leases(directory)
         origin = open_map(
             config.map_path,
             metadata=config.metadata or None,
@@ -96,7 +101,7 @@ def run(config: DaemonConfig) -> int:
             # a second one beside the segments: two runtime directories may share a directory of segments
             shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
             stack.callback(shm_lock.release)
-            stack.callback(_ignore_signals)  # without the locks no name is ours to take away
+            stack.callback(ignore_signals)  # without the locks no name is ours to take away
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
@@ -108,100 +113,8 @@ def run(config: DaemonConfig) -> int:
     return 0
 
 
-_STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
-
-
-class _StartSignals:
-    """Signals while the daemon starts: stop means unwinding at once, a reload waits until it serves.
-
-    Masks would not do: they are a thread's, and libraries have threads of their own.
-    """
-
-    def __init__(self) -> None:
-        self.reload_wanted = False
-        self._held = False
-        self._stop = False
-        for number in _STOP_SIGNALS:
-            signal.signal(number, self._on_stop)
-        signal.signal(signal.SIGHUP, self._on_reload)
-
-    def _on_reload(self, number: int, frame: object) -> None:
-        del number, frame
-        self.reload_wanted = True
-
-    def _on_stop(self, number: int, frame: object) -> None:
-        del frame
-        if not self._stop:
-            _log.info("stopping on %s, before serving", signal.Signals(number).name)
-        self._stop = True
-        if not self._held:
-            raise SystemExit(0)
-
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep a stop for later while something takes a name and has nobody yet to take it away."""
-        self._held = True
-        try:
-            yield
-        finally:
-            self._held = False
-        if self._stop:
-            raise SystemExit(0)
-
-
-def _ignore_signals() -> None:
-    for number in _STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-
-
-def _raise_descriptor_limit() -> None:
-    """A session takes two descriptors; the customary limit of 1024 would end at 500 clients."""
-    _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-
-
 def _lock_path(socket_path: str) -> str:
     return socket_path.removesuffix(".sock") + ".lock"
-
-
-def _access(config: DaemonConfig) -> tuple[int, int]:
-    """Group id and mode of what readers open; -1 and owner-only without a group."""
-    if not config.group:
-        return -1, 0o400
-    try:
-        return grp.getgrnam(config.group).gr_gid, 0o440
-    except KeyError:
-        if config.group.isdigit():
-            return int(config.group), 0o440
-        raise ConfigError(
-            f"there is no group {config.group!r}", key="group", hint=f"groupadd --system {config.group}"
-        ) from None
-
-
-def _make_runtime_dir(path: Path, gid: int) -> None:
-    if path.is_dir():
-        return
-    try:
-        path.mkdir(mode=0o750 if gid >= 0 else 0o700, parents=True, exist_ok=True)
-        if gid >= 0:
-            os.chown(path, -1, gid)
-    except OSError as error:
-        raise ConfigError(
-            f"runtime directory {path}: {error.strerror}", key="runtime_dir", hint="give --runtime-dir DIR"
-        ) from error
-
-
-def _check_leases(directory: ShmDirectory) -> None:
-    fd = directory.create()
-    try:
-        if not leases_work(fd):
-            raise ConfigError(
-                f"{directory.path}: its file system grants no leases, so nobody could tell what is in use",
-                key="shm_dir",
-                hint="name a directory on a tmpfs",
-            )
-    finally:
-        os.close(fd)
 
 
 class _Life:
@@ -280,7 +193,7 @@ class _Life:
             raise InternalError("the server does not run yet")
         return self._server
 
-    def serve(self, reloader: Reloader, started_s: float, signals: _StartSignals) -> None:
+    def serve(self, reloader: Reloader, started_s: float, signals: StartSignals) -> None:
         """Bind, say READY, answer requests until told to stop."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
@@ -353,7 +266,7 @@ class _Life:
         ours, theirs = sockets.socketpair()
         ours.setblocking(False)
         theirs.setblocking(False)
-        for number in (*_STOP_SIGNALS, signal.SIGHUP):
+        for number in (*STOP_SIGNALS, signal.SIGHUP):
             signal.signal(number, lambda *_: None)
         before = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         try:
@@ -369,9 +282,9 @@ class _Life:
             for number in self._wakeup.recv(64):
                 if number == signal.SIGHUP:
                     self._running.reload()
-                elif number in _STOP_SIGNALS:
+                elif number in STOP_SIGNALS:
                     _log.info("stopping on %s", signal.Signals(number).name)
-                    for again in _STOP_SIGNALS:
+                    for again in STOP_SIGNALS:
                         signal.signal(again, self._quick_exit)
                     self._running.stop()
 

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has to be in place before the daemon can serve."""
+
+from __future__ import annotations
+
+import grp
+import os
+import resource
+from pathlib import Path
+
+from shmmap.daemon.config import DaemonConfig
+from shmmap.errors import ConfigError
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import leases_work
+
+__all__ = ["access_of_segments", "check_leases", "make_runtime_dir", "raise_descriptor_limit"]
+
+
+def raise_descriptor_limit() -> None:
+    """A session takes two descriptors; the customary limit of 1024 would end at 500 clients."""
+    _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def access_of_segments(config: DaemonConfig) -> tuple[int, int]:
+    """Group id and mode of what readers open; -1 and owner-only without a group."""
+    if not config.group:
+        return -1, 0o400
+    try:
+        return grp.getgrnam(config.group).gr_gid, 0o440
+    except KeyError:
+        if config.group.isdigit():
+            return int(config.group), 0o440
+        raise ConfigError(
+            f"there is no group {config.group!r}", key="group", hint=f"groupadd --system {config.group}"
+        ) from None
+
+
+def make_runtime_dir(path: Path, gid: int) -> None:
+    """Make the directory of the socket, for the owner and, where there is one, the group."""
+    if path.is_dir():
+        return
+    try:
+        path.mkdir(mode=0o750 if gid >= 0 else 0o700, parents=True, exist_ok=True)
+        if gid >= 0:
+            os.chown(path, -1, gid)
+    except OSError as error:
+        raise ConfigError(
+            f"runtime directory {path}: {error.strerror}", key="runtime_dir", hint="give --runtime-dir DIR"
+        ) from error
+
+
+def check_leases(directory: ShmDirectory) -> None:
+    """Refuse a file system that cannot tell who uses a file."""
+    fd = directory.create()
+    try:
+        if not leases_work(fd):
+            raise ConfigError(
+                f"{directory.path}: its file system grants no leases, so nobody could tell what is in use",
+                key="shm_dir",
+                hint="name a directory on a tmpfs",
+            )
+    finally:
+        os.close(fd)
