@@ -236,7 +236,7 @@ ODD = ["\x00", "\x85", "\u2028", "é"]
 pieces = st.sampled_from([*WORDS.split(" "), *SPACED, *ODD])
 
 
-@example(['#\x00'])
+@example(["#\x00"])
 @given(st.lists(st.lists(pieces, max_size=8).map("".join), max_size=6))
 @settings(max_examples=400, deadline=None)
 def test_what_the_quick_way_accepts_means_the_same_to_the_parser(lines: list[str]) -> None:
