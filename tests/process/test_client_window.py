@@ -343,7 +343,7 @@ print(threading.get_native_id(), flush=True)
 os.write(2, b"BEGIN\\n")
 most = drive(4)
 os.write(2, b"END\\n")
-print(most)
+print(most, flush=True)
 os._exit(0)
 """
 
