@@ -96,8 +96,11 @@ def test_a_loader_that_is_killed_costs_one_cell(
     client = connect(one)
     client.area(circle(0, 0, 5))
     (loader,) = stop_loaders(one)
+    started = client.ask("stats")[4]["loads_started"]
     request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
-    client.ask("stats")
+    waiting = Patience()
+    while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
+        pass  # the stopped loader has its jobs now
     os.kill(loader, signal.SIGKILL)
     reply = client.cells_reply(client.wait_for(request))
     assert len(reply.cells) == 3
