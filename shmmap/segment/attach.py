@@ -199,7 +199,7 @@ def attach(
     except (PermissionError, posix_ipc.PermissionsError) as error:
         raise SegmentError(
             f"segment {name}: this user may not read it",
-            hint="join the daemon's group (`shmmap doctor` names it)",
+            hint="join the group that the daemon was started with (--group)",
         ) from error
     except OSError as error:
         raise SegmentError(f"segment {name}: {error.strerror}") from error
