@@ -138,7 +138,7 @@ def _refusal(path: str, error: OSError) -> DaemonUnreachable | ProtocolMismatch:
     if error.errno in (errno.EACCES, errno.EPERM):
         return SocketPermission(
             f"{path}: this user may not connect",
-            hint="join the daemon's group (`shmmap doctor` names it), then log in again",
+            hint="join the group that the daemon was started with (--group), then log in again",
         )
     if error.errno == errno.EPROTOTYPE:
         return ProtocolMismatch(f"{path} is a socket of another kind: no shmmap daemon made it")
