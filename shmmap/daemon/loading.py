@@ -16,6 +16,7 @@ from shmmap.daemon import jobs
 from shmmap.daemon.reclaim import Outcome, Reclaimer
 from shmmap.daemon.residency import Failure, Key, Load, Residency
 from shmmap.daemon.workers import Worker, WorkerPool
+from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["SPACE_CODES", "Loading", "Shelf"]
@@ -82,10 +83,9 @@ class Loading:
         if failure.code in SPACE_CODES:
             return False
         try:
-            state = os.stat(key.cell_id)
+            return SourceStamp.of(os.stat(key.cell_id)) != failure.stamp
         except OSError:
             return False
-        return (state.st_size, state.st_mtime_ns, state.st_ctime_ns) != failure.stamp
 
     def pump(self, now_s: float) -> None:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""

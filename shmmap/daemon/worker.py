@@ -22,6 +22,7 @@ from shmmap.daemon import jobs
 from shmmap.errors import MapDataError
 from shmmap.layers.points import build_points
 from shmmap.segment.directory import ShmDirectory, is_full
+from shmmap.segment.layout import SourceStamp
 
 __all__ = ["main"]
 
@@ -123,8 +124,7 @@ class _Worker:
     def _fail(self, job: jobs.Job, code: str, message: str) -> None:
         stamp = None
         with contextlib.suppress(OSError):
-            state = os.stat(job.path)
-            stamp = (state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+            stamp = SourceStamp.of(os.stat(job.path))
         self._send(jobs.Failed(job.number, code, message[:4000], stamp))
 
 

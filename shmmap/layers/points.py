@@ -65,7 +65,7 @@ def build_points(
         ENOSPC if the file system is full.
     """
     with PcdReader(source, path=path, keep_non_finite=keep_non_finite) as reader:
-        stamp = _stamp(reader.fileno())
+        stamp = SourceStamp.of(os.fstat(reader.fileno()))
         rows = reader.header.points
         writer = _started(reader, rows, segment_fd, reserve, cell_id, box, frame_id)
         for block in reader.blocks():
@@ -78,7 +78,7 @@ def build_points(
             for block in reader.blocks():
                 if reader.kept <= rows:
                     _append(writer, block)
-        if reader.kept != rows or _stamp(reader.fileno()) != stamp:
+        if reader.kept != rows or SourceStamp.of(os.fstat(reader.fileno())) != stamp:
             raise refusal("changed", "the file changed while it was being read", path=reader.path)
         if warn is not None:
             for warning in reader.warnings:
@@ -114,8 +114,3 @@ def _started(
 def _append(writer: SegmentWriter, block: Block) -> None:
     for index, column in enumerate(block):
         writer.append(index, column)
-
-
-def _stamp(fd: int) -> SourceStamp:
-    status = os.fstat(fd)
-    return SourceStamp(status.st_size, status.st_mtime_ns, status.st_ctime_ns)

@@ -5,28 +5,12 @@ from __future__ import annotations
 
 import os
 import struct
-from typing import NamedTuple
 
 from xxhash import xxh3_64_intdigest
 
+from shmmap.segment.layout import SourceStamp as Stamp
+
 __all__ = ["Stamp", "cell_version"]
-
-
-class Stamp(NamedTuple):
-    """What ``stat`` says about a file's content without reading it.
-
-    ``ctime_ns`` is what makes it sound: no program can set it back, so a rewrite that restores size
-    and mtime (``cp -p``, ``rsync -t``) still shows.
-    """
-
-    size: int
-    mtime_ns: int
-    ctime_ns: int
-
-    @classmethod
-    def of(cls, status: os.stat_result) -> Stamp:
-        """Stamp of a file from its `os.stat` or `os.fstat` result."""
-        return cls(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 
 def cell_version(cell_id: str, stamp: Stamp) -> int:

@@ -9,6 +9,7 @@ block* at its end, which the daemon fills in when it gives the segment a name.
 from __future__ import annotations
 
 import math
+import os
 import struct
 import zlib
 from collections.abc import Sequence
@@ -56,11 +57,20 @@ CRC: Final = struct.Struct("<II")
 
 
 class SourceStamp(NamedTuple):
-    """What identifies one state of a source file: size in bytes, mtime and ctime in nanoseconds."""
+    """What ``stat`` says about one state of a source file without reading it: bytes and nanoseconds.
+
+    ``ctime_ns`` is what makes it sound: no program can set it back, so a rewrite that restores size
+    and mtime (``cp -p``, ``rsync -t``) still shows.
+    """
 
     size: int
     mtime_ns: int
     ctime_ns: int
+
+    @classmethod
+    def of(cls, status: os.stat_result) -> SourceStamp:
+        """Stamp of a file from its `os.stat` or `os.fstat` result."""
+        return cls(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 
 NO_SOURCE: Final = SourceStamp(0, 0, 0)

@@ -117,7 +117,7 @@ def while_loading(
         loader.release()
         loader.ask("evict", heavy)
         while any(name.endswith(".zombie") for name in one.segments()):
-            loader.ask("stats")  # not freed yet: asked for now, it would only be put back
+            loader.ask("stats")  # a cell asked for again before it is freed is only put back in service
     return times
 
 
