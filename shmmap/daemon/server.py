@@ -19,6 +19,7 @@ import zmq
 
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.cells import CellRequests
+from shmmap.daemon.heartbeat import BEAT_S, Heartbeat
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Peer, Session, Sessions
@@ -33,11 +34,7 @@ __all__ = ["Server"]
 
 _log = logging.getLogger(__name__)
 
-BEAT_S: Final = 0.25
-CHANGE_BEAT_S: Final = 0.02
 REQUESTS_AT_ONCE: Final = 64
-USED_ROWS_A_BEAT: Final = 64
-"""Rows of the statistics whose hits are brought up to date at a beat: about half a millisecond."""
 
 
 class Server:
@@ -72,15 +69,13 @@ class Server:
         self._statistics = statistics
         self._admin = admin
         self._reloader = reloader
-        self._on_beat = on_beat
         self._epoll = select.epoll()
         self._events: dict[int, Callable[[], None]] = {}
         self._stopping = False
-        self._beat_at_s = 0.0
-        self._last_beat_s = 0.0
         self.cells = CellRequests(
             store, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
         )
+        self._heartbeat = Heartbeat(store, statistics, sessions=sessions, waiting=self.cells, on_beat=on_beat)
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map))
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
@@ -117,7 +112,9 @@ class Server:
         """Serve until `stop`; then answer those who still wait."""
         while not self._stopping:
             now_s = time.monotonic()
-            until_s = min(self._store.loads.next_event_s(), self.cells.next_deadline_s(), self._beat_at_s)
+            until_s = min(
+                self._store.loads.next_event_s(), self.cells.next_deadline_s(), self._heartbeat.next_s
+            )
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
             ready = self._poller.poll(min(timeout_ms, int(BEAT_S * 1000)))
             self._turn(ready)
@@ -142,37 +139,7 @@ class Server:
         self._store.loads.end_overdue(now_s)
         self._store.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
-        if self._statistics.outdated:
-            # whoever asks right after a change sees it, yet a stream of changes costs little
-            self._beat_at_s = min(self._beat_at_s, self._last_beat_s + CHANGE_BEAT_S)
-        if now_s >= self._beat_at_s:
-            self._last_beat_s, self._beat_at_s = now_s, now_s + BEAT_S
-            self._beat()
-
-    def _measure(self) -> None:
-        books, set_value = self._store.books, self._statistics.set
-        set_value("sessions", len(self._sessions))
-        set_value("waiting_requests", len(self.cells))
-        set_value("workers", len(self._store.loads.pool))
-        set_value("load_queue", books.queued)
-        set_value("cells_resident", books.resident_count)
-        set_value("stale_cells", books.resident_count - sum(map(len, self._store.warm.values())))
-        set_value("bytes_resident", books.resident_bytes)
-        set_value("zombies", len(books.zombies))
-        set_value("bytes_zombie", books.zombie_bytes)
-        set_value("bytes_reserved", books.reserved_bytes)
-        set_value("bytes_statistics", self._statistics.size_bytes)
-        set_value("budget_bytes", books.budget_bytes)
-        set_value("evictions", self._store.reclaimer.evicted_count)
-        set_value("map_cells", len(self._store.catalogue))
-
-    def _beat(self) -> None:
-        self._measure()
-        books = self._store.books
-        books.overhead_bytes = self._statistics.size_bytes
-        self._store.show_used(USED_ROWS_A_BEAT)
-        self._statistics.beat()
-        self._on_beat()
+        self._heartbeat.turn(now_s)
 
     # --- requests -----------------------------------------------------------------------------------
 
@@ -235,7 +202,7 @@ class Server:
                 self._reload_for(session, message)
             else:
                 if isinstance(message, messages.Stats):
-                    self._measure()
+                    self._heartbeat.measure()
                 self._send(session, encode(self._admin.answer(message, now_s)))
 
     def _hello(
