@@ -128,7 +128,7 @@ def check_socket(path: str, deadline_s: float) -> None:
 def _no_answer(path: str) -> NoAnswer:
     return NoAnswer(
         f"{path}: the daemon accepts connections but does not answer",
-        hint="it is stopped, hung or overloaded: see `shmmap health`",
+        hint="it is starting, stopped, hung or overloaded: see `shmmap health`",
     )
 
 

@@ -92,7 +92,8 @@ class DaemonConfig:
         """Path of the request socket."""
         if self.endpoint:
             return endpoint_path(self.endpoint)
-        directory = self.runtime_dir or os.environ.get("RUNTIME_DIRECTORY", "") or _default_runtime_dir()
+        given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]  # systemd lists all there are
+        directory = self.runtime_dir or given or _default_runtime_dir()
         return endpoint_path(socket_path(directory, self.instance))
 
     def loaders(self) -> int:

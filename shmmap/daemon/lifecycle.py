@@ -25,6 +25,7 @@ from typing import Final
 import zmq
 
 from shmmap import __version__
+from shmmap.daemon.activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.budget import choose_budget
 from shmmap.daemon.config import DaemonConfig
@@ -32,7 +33,6 @@ from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import retire_leftovers
 from shmmap.daemon.logs import set_up_logging
-from shmmap.daemon.notify import notify
 from shmmap.daemon.prerequisites import (
     access_of_segments,
     check_leases,
@@ -43,11 +43,12 @@ from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.residency import Residency
 from shmmap.daemon.server import Server
+from shmmap.daemon.service_manager import ServiceManager, status_line
 from shmmap.daemon.sessions import Sessions
 from shmmap.daemon.start_signals import STOP_SIGNALS, StartSignals, ignore_signals
 from shmmap.daemon.store import Store
 from shmmap.daemon.workers import WorkerPool
-from shmmap.errors import ConfigError, InternalError
+from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
@@ -78,11 +79,21 @@ def run(config: DaemonConfig) -> int:
         Another daemon has this instance.
     """
     set_up_logging()
+    manager = ServiceManager()
+    try:
+        return _run(config, manager)
+    except ShmmapError as error:
+        manager.failed(str(error))
+        raise
+
+
+def _run(config: DaemonConfig, manager: ServiceManager) -> int:
     prepare_process()
     raise_descriptor_limit()
+    activated = take_activated_socket()
     with contextlib.ExitStack() as stack:
         signals = StartSignals()
-        path = config.socket()
+        path = _socket_path(config, activated)
         gid, mode = access_of_segments(config)
         make_runtime_dir(Path(path).parent, gid)
         directory = ShmDirectory(config.shm_dir)
@@ -109,8 +120,21 @@ def run(config: DaemonConfig) -> int:
         with signals.held():
             life = _Life(config, catalogue, directory, path, mode, gid)
             stack.callback(life.close)
-        life.serve(Reloader(origin), started_s, signals)
+        life.serve(Reloader(origin), started_s, signals, manager, activated)
     return 0
+
+
+def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:
+    """Where this daemon listens: a socket that was passed to it decides."""
+    if activated is None:
+        return config.socket()
+    if config.endpoint and config.socket() != activated.path:
+        raise ConfigError(
+            f"endpoint is {config.socket()}, but the service manager listens at {activated.path}",
+            key="endpoint",
+            hint="remove the setting, or change ListenStream= of the .socket unit",
+        )
+    return activated.path
 
 
 def _lock_path(socket_path: str) -> str:
@@ -193,13 +217,22 @@ class _Life:
             raise InternalError("the server does not run yet")
         return self._server
 
-    def serve(self, reloader: Reloader, started_s: float, signals: StartSignals) -> None:
+    def serve(
+        self,
+        reloader: Reloader,
+        started_s: float,
+        signals: StartSignals,
+        manager: ServiceManager,
+        activated: ActivatedSocket | None,
+    ) -> None:
         """Bind, say READY, answer requests until told to stop."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
         socket.setsockopt(zmq.LINGER, 200)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
         socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
+        self._manager = manager
+        self._owns_socket = activated is None
         quota = self._config.session_quota
         budget = self._store.books.budget_bytes
         admin = Admin(self._config, self._store, self._sessions, self._statistics, epoch=self._epoch)
@@ -217,6 +250,8 @@ class _Life:
         try:
             with self._signal_descriptor() as fd:
                 server.watch(fd, self._on_signals)
+                if activated is not None:
+                    socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
                 self._bind(socket)
                 self._store.loads.pool.start_one()
                 _log.info(
@@ -224,17 +259,18 @@ class _Life:
                     self._socket_path, self._config.instance, self._config.map_path,
                     len(self._catalogue), budget, time.monotonic() - started_s,
                 )  # fmt: skip
-                notify("READY=1", f"STATUS=serving {len(self._catalogue)} cells", f"MAINPID={os.getpid()}")
+                manager.ready(f"serving {len(self._catalogue)} cells")
                 _settle_memory()
                 if signals.reload_wanted:
-                    server.reload()
+                    self._reload()
                 server.run()
         finally:
-            notify("STOPPING=1", "STATUS=freeing memory")
+            manager.stopping("freeing memory")
             socket.close()
             context.term()
             reloader.close()
-            Path(self._socket_path).unlink(missing_ok=True)
+            if self._owns_socket:
+                Path(self._socket_path).unlink(missing_ok=True)
 
     def _bind(self, socket: zmq.Socket[bytes]) -> None:
         # libzmq makes the socket file with the umask's mode; nobody may connect before it is right
@@ -249,14 +285,37 @@ class _Life:
             ) from error
         finally:
             os.umask(mask)
-        if self._gid >= 0:
+        if self._gid >= 0 and self._owns_socket:
             os.chown(self._socket_path, -1, self._gid)
 
     def _beat(self) -> None:
+        self._manager.beat(time.monotonic(), self._status)
         version = self._store.catalogue.map_version
         if version != self._identity.map_version:
             self._identity = _with_map_version(self._identity, version)
             self._statistics.update_identity(self._identity)
+
+    def _status(self) -> str:
+        books = self._store.books
+        return status_line(
+            resident=books.resident_count,
+            cells=len(self._store.catalogue),
+            used_bytes=books.used_bytes,
+            budget_bytes=books.budget_bytes,
+            clients=len(self._sessions),
+            failed=self._statistics.values["loads_failed"],
+        )
+
+    def _reload(self) -> None:
+        """Read the map again because of a signal; the service manager waits for the end."""
+        self._manager.reloading()
+        self._running.reload(self._reloaded)
+
+    def _reloaded(self, result: Catalogue | ShmmapError) -> None:
+        if isinstance(result, ShmmapError):
+            self._manager.reloaded(f"reload failed, the old map stays: {result.message}")
+        else:
+            self._manager.reloaded(f"map read again: {len(result)} cells")
 
     # --- signals ----------------------------------------------------------------------------------
 
@@ -281,7 +340,7 @@ class _Life:
         with contextlib.suppress(BlockingIOError):
             for number in self._wakeup.recv(64):
                 if number == signal.SIGHUP:
-                    self._running.reload()
+                    self._reload()
                 elif number in STOP_SIGNALS:
                     _log.info("stopping on %s", signal.Signals(number).name)
                     for again in STOP_SIGNALS:
@@ -296,7 +355,8 @@ class _Life:
         del number, frame
         directory = self._directory
         names = [directory.path + name for name in directory.names(segment_prefix(self._config.instance))]
-        for path in (*names, self._socket_path, _lock_path(self._socket_path)):
+        own_socket = [self._socket_path] if self._owns_socket else []
+        for path in (*names, *own_socket, _lock_path(self._socket_path)):
             with contextlib.suppress(OSError):
                 os.unlink(path)
         os._exit(0)  # the loaders die with this process

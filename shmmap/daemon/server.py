@@ -267,9 +267,9 @@ class Server:
 
         self._reloader.ask(answer)
 
-    def reload(self) -> None:
-        """Read the map's catalogue again (SIGHUP)."""
-        self._reloader.ask(_nobody_waits)
+    def reload(self, answer: Callable[[Catalogue | ShmmapError], None]) -> None:
+        """Read the map's catalogue again (SIGHUP), and say what came of it."""
+        self._reloader.ask(answer)
 
     def _change_map(self, catalogue: Catalogue) -> None:
         old, now_s = self._store.catalogue, time.monotonic()
@@ -308,10 +308,6 @@ def _check_intent(intent: messages.Intent) -> None:
     numbers = (intent.x, intent.y, intent.vx, intent.vy, intent.heading or 0.0, *chain(*intent.route))
     if not all(map(math.isfinite, numbers)):
         raise BadRequest("intent: every number in it must be finite")
-
-
-def _nobody_waits(result: Catalogue | ShmmapError) -> None:
-    del result
 
 
 def _peer(frame: zmq.Frame) -> Peer:

@@ -81,6 +81,8 @@ class DaemonProcess:
         Directory of the segments; default a private one inside /dev/shm.
     command
         In front of the daemon's own command, for example ``["setpriv", ...]``.
+    pass_fds
+        Descriptors that it inherits.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class DaemonProcess:
         environment: Mapping[str, str] | None = None,
         shm_dir: str | None = None,
         command: Sequence[str] = (),
+        pass_fds: Sequence[int] = (),
     ) -> None:
         self.map_path = str(map_path)
         self.instance = f"test-{secrets.token_hex(4)}"
@@ -100,6 +103,7 @@ class DaemonProcess:
         self.log_path = Path(self.runtime_dir) / "log.txt"
         self.arguments = list(arguments)
         self.command = list(command)
+        self.pass_fds = tuple(pass_fds)
         self.process: subprocess.Popen[bytes] | None = None
         self.killed = False
         self._private = tempfile.mkdtemp(prefix="shmmap-home-", dir="/tmp")
@@ -146,7 +150,13 @@ class DaemonProcess:
         ]  # fmt: skip
         with self.log_path.open("ab") as log:
             return subprocess.Popen(
-                command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd="/"
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd="/",
+                pass_fds=self.pass_fds,
             )
 
     def start(self, timeout: float = READY_S) -> DaemonProcess:
