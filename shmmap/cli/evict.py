@@ -12,6 +12,7 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"freed": segments whose memory is free, "pinned": segments retired, but still mapped by somebody,
+   "kept": segments left alone because they are pinned (`shmmap pin`),
    "unknown": [ids the map does not have]}
 Exit code: 0, or 1 when an id is unknown."""
 
@@ -41,9 +42,18 @@ def run(args: argparse.Namespace) -> int:
     with connect(args) as client:
         answer = client.evict(None if args.all else args.cells)
     if args.json:
-        print_json({"freed": answer.freed, "pinned": answer.pinned, "unknown": list(answer.unknown)})
+        print_json(
+            {
+                "freed": answer.freed,
+                "pinned": answer.pinned,
+                "kept": answer.kept,
+                "unknown": list(answer.unknown),
+            }
+        )
     else:
         print(f"{answer.freed:,} segments freed, {answer.pinned:,} retired but still mapped")
+        if answer.kept:
+            print(f"{answer.kept:,} left alone: pinned by an operator (shmmap unpin)")
         for name in answer.unknown:
             print(f"unknown cell: {name}")
     return 1 if answer.unknown else 0

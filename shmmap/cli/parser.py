@@ -17,11 +17,14 @@ from shmmap.cli import (
     health,
     inspect,
     ls,
+    pin,
     query,
     reload,
     serve,
     show,
     status,
+    stop,
+    unpin,
     version,
 )
 
@@ -39,6 +42,9 @@ VERBS: Final = (
     inspect,
     reload,
     evict,
+    pin,
+    unpin,
+    stop,
     health,
     version,
 )

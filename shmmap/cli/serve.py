@@ -39,6 +39,9 @@ def add_parser(subparsers: Subparsers) -> None:
     place.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
     place.add_argument("--group", metavar="GROUP", help="group whose members may connect and read")
+    place.add_argument(
+        "--admin-group", metavar="GROUP", help="group whose members may reload, evict, pin and stop it"
+    )
     limits = parser.add_argument_group("limits")
     limits.add_argument("--budget", metavar="BYTES", help="most memory for cells, such as 512M or 2G")
     limits.add_argument(

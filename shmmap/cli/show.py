@@ -16,7 +16,8 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"id", "version": hex, "box": [minx, miny, maxx, maxy], "z": [min, max] or null before the first load,
-   "source_bytes", "loading": [layer], "failure": text of the last failure that still stands, or "",
+   "source_bytes", "loading": [layer], "pinned": [layer an operator keeps],
+   "failure": text of the last failure that still stands, or "",
    "segments": [{"layer", "version": hex, "segment", "state": "resident" | "stale" | "zombie", "bytes",
                  "points", "holders": [{"session": hex, "pid", "uid", "client", "bytes"}]}]}
 A holder of session 0 is unknown: it did not open the segment through the library.
@@ -62,6 +63,7 @@ def _as_json(cell: ShownCell) -> dict[str, object]:
         "z": _heights(cell),
         "source_bytes": cell.source_bytes,
         "loading": list(cell.loading),
+        "pinned": list(cell.pinned),
         "failure": cell.failure,
         "segments": [
             {
@@ -98,6 +100,7 @@ def _lines(cell: ShownCell) -> list[tuple[str, str]]:
         ("source", format_bytes(cell.source_bytes)),
     ]
     lines += [("loading", layer) for layer in cell.loading]
+    lines += [("pinned", layer) for layer in cell.pinned]
     if cell.failure:
         lines.append(("failure", cell.failure))
     if not cell.segments:

@@ -272,7 +272,7 @@ class Client:
         Raises
         ------
         NotPermitted
-            The daemon lets only its own user and root do this.
+            The daemon lets only administrators do this.
         """
         return self._session.ask(messages.Reload, messages.Reloaded)
 
@@ -282,10 +282,44 @@ class Client:
         Raises
         ------
         NotPermitted
-            The daemon lets only its own user and root do this.
+            The daemon lets only administrators do this.
         """
         wanted = tuple(ids) if ids is not None else None
         return self._session.ask(lambda n: messages.Evict(n, wanted), messages.Evicted)
+
+    def pin(self, ids: Iterable[str] = (), layers: str | Sequence[str] = ("points",)) -> messages.Pinned:
+        """Have the daemon keep cells resident, until `unpin` or its end; without ids, list its pins.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        OverBudget
+            All pins together would exceed the budget.
+        """
+        wanted, specs = tuple(ids), _layers(layers)
+        return self._session.ask(lambda n: messages.Pin(n, wanted, specs), messages.Pinned)
+
+    def unpin(self, ids: Iterable[str] | None = None) -> messages.Pinned:
+        """Have the daemon keep cells, all by default, no longer; returns what stays pinned.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        """
+        wanted = tuple(ids) if ids is not None else None
+        return self._session.ask(lambda n: messages.Unpin(n, wanted), messages.Pinned)
+
+    def shutdown(self) -> None:
+        """End the daemon, as SIGTERM would; what is mapped stays readable.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        """
+        self._session.ask(messages.Shutdown, messages.Stopping)
 
 
 def _layers(layers: str | Sequence[str]) -> tuple[str, ...]:

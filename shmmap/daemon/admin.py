@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that are not for cells: hello, metadata, stats, show, evict."""
+"""Requests that are not for cells: hello, metadata, stats, show, evict, pin."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Final
 
 from shmmap import __version__
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.operator_pins import OperatorPins
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
@@ -41,6 +42,7 @@ class Admin:
         self._sessions = sessions
         self._statistics = statistics
         self._epoch = epoch
+        self.pins = OperatorPins(store)
         self._bounds_of: Catalogue | None = None
         self._known_bounds: tuple[float, float, float, float] | None = None
 
@@ -89,6 +91,10 @@ class Admin:
             return self._show(message)
         if isinstance(message, messages.Evict):
             return self._evict(message, now_s)
+        if isinstance(message, messages.Pin):
+            return self.pins.pin(message, now_s)
+        if isinstance(message, messages.Unpin):
+            return self.pins.unpin(message)
         raise BadRequest(f"a {type(message).__name__} cannot be answered here")
 
     def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
@@ -207,7 +213,7 @@ class Admin:
                     else "resident" if resident.version == version else "stale"
                 )  # fmt: skip
                 shown.append(self._segment(resident, state))
-        heights = store.heights.get(index, (None, None))
+        z_min, z_max = store.heights.get(index, (None, None))
         return messages.ShownCell(
             message.request,
             cell_id,
@@ -219,7 +225,9 @@ class Admin:
             "; ".join(
                 f"{s.failure.code}: {s.failure.message}" for s in slots.values() if s.failure is not None
             ),
-            *heights,
+            z_min=z_min,
+            z_max=z_max,
+            pinned=self.pins.layers_of(cell_id),
         )
 
     def _segment(self, resident: Resident, state: str) -> messages.ShownSegment:
@@ -248,5 +256,7 @@ class Admin:
                 else:
                     asked.add(store.catalogue.id(index))
             chosen = [r for r in store.books.residents() if r.key.cell_id in asked]
-        freed = sum(store.evict(resident, now_s) for resident in chosen)
-        return messages.Evicted(message.request, freed, len(chosen) - freed, tuple(unknown))
+        loose = [resident for resident in chosen if resident.key not in self.pins]
+        freed = sum(store.evict(resident, now_s) for resident in loose)
+        kept = len(chosen) - len(loose)
+        return messages.Evicted(message.request, freed, len(loose) - freed, tuple(unknown), kept)

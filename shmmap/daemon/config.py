@@ -56,6 +56,9 @@ class DaemonConfig:
         Where segments live.
     group
         Group that may connect and read; empty: only the daemon's own user.
+    admin_group
+        Group whose members may reload, evict, pin and shut down, besides root and the daemon's own
+        user; they must be able to connect, too.
     budget_bytes
         Most shared memory the daemon uses; 0: a quarter of what is available, at most 4 GiB.
     session_quota
@@ -80,6 +83,7 @@ class DaemonConfig:
     endpoint: str = ""
     shm_dir: str = DEFAULT_SHM_DIR
     group: str = ""
+    admin_group: str = ""
     budget_bytes: int = 0
     session_quota: float = 0.9
     workers: int = 0

@@ -39,6 +39,7 @@ from shmmap.daemon.prerequisites import (
     make_runtime_dir,
     raise_descriptor_limit,
 )
+from shmmap.daemon.privileges import Privileges
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.residency import Residency
@@ -156,6 +157,7 @@ class _Life:
         self._config = config
         self._socket_path = socket_path
         self._gid = gid
+        self._privileges = Privileges(config.admin_group)
         self._epoch = secrets.randbits(63) | 1
         self._directory = directory
         self._catalogue = catalogue
@@ -236,6 +238,7 @@ class _Life:
         quota = self._config.session_quota
         budget = self._store.books.budget_bytes
         admin = Admin(self._config, self._store, self._sessions, self._statistics, epoch=self._epoch)
+        self._pins = admin.pins
         server = self._server = Server(
             socket,
             self._store,
@@ -243,6 +246,7 @@ class _Life:
             self._statistics,
             admin,
             reloader,
+            self._privileges,
             epoch=self._epoch,
             quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
             on_beat=self._beat,
@@ -290,6 +294,7 @@ class _Life:
 
     def _beat(self) -> None:
         self._manager.beat(time.monotonic(), self._status)
+        self._pins.keep(time.monotonic())
         version = self._store.catalogue.map_version
         if version != self._identity.map_version:
             self._identity = _with_map_version(self._identity, version)

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import grp
 import os
 import resource
 from pathlib import Path
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.privileges import group_id
 from shmmap.errors import ConfigError
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import leases_work
@@ -26,14 +26,7 @@ def access_of_segments(config: DaemonConfig) -> tuple[int, int]:
     """Group id and mode of what readers open; -1 and owner-only without a group."""
     if not config.group:
         return -1, 0o400
-    try:
-        return grp.getgrnam(config.group).gr_gid, 0o440
-    except KeyError:
-        if config.group.isdigit():
-            return int(config.group), 0o440
-        raise ConfigError(
-            f"there is no group {config.group!r}", key="group", hint=f"groupadd --system {config.group}"
-        ) from None
+    return group_id(config.group, "group"), 0o440
 
 
 def make_runtime_dir(path: Path, gid: int) -> None:

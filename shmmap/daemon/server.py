@@ -20,11 +20,12 @@ import zmq
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.cells import CellRequests
 from shmmap.daemon.heartbeat import BEAT_S, Heartbeat
+from shmmap.daemon.privileges import Privileges
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Peer, Session, Sessions
 from shmmap.daemon.store import Store
-from shmmap.errors import BadRequest, InternalError, NoSession, NotPermitted, ProtocolMismatch, ShmmapError
+from shmmap.errors import BadRequest, InternalError, NoSession, ProtocolMismatch, ShmmapError
 from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
@@ -35,6 +36,13 @@ __all__ = ["Server"]
 _log = logging.getLogger(__name__)
 
 REQUESTS_AT_ONCE: Final = 64
+_PRIVILEGED: Final = (
+    messages.Reload,
+    messages.Evict,
+    messages.Pin,
+    messages.Unpin,
+    messages.Shutdown,
+)
 
 
 class Server:
@@ -58,6 +66,7 @@ class Server:
         statistics: StatisticsWriter,
         admin: Admin,
         reloader: Reloader,
+        privileges: Privileges,
         *,
         epoch: int,
         quota_bytes: int,
@@ -69,6 +78,7 @@ class Server:
         self._statistics = statistics
         self._admin = admin
         self._reloader = reloader
+        self._privileges = privileges
         self._epoll = select.epoll()
         self._events: dict[int, Callable[[], None]] = {}
         self._stopping = False
@@ -196,9 +206,13 @@ class Server:
         elif isinstance(message, messages.Bye):
             self.end_session(session)
         else:
-            if isinstance(message, messages.Reload | messages.Evict) and not _peer(frame).privileged:
-                raise NotPermitted("only root and the daemon's own user may do this", hint="run it with sudo")
-            if isinstance(message, messages.Reload):
+            if isinstance(message, _PRIVILEGED):
+                self._privileges.require(_peer(frame), now_s)
+            if isinstance(message, messages.Shutdown):
+                _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
+                self._send(session, encode(messages.Stopping(message.request)))
+                self.stop()
+            elif isinstance(message, messages.Reload):
                 self._reload_for(session, message)
             else:
                 if isinstance(message, messages.Stats):

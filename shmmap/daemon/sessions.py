@@ -39,11 +39,6 @@ class Peer:
             return cls()
         return cls(uid, gid, pid)
 
-    @property
-    def privileged(self) -> bool:
-        """Whether it may change what the daemon serves: root, or the daemon's own user."""
-        return self.uid in (0, os.geteuid())
-
 
 @dataclass(eq=False, slots=True)
 class Session:

@@ -34,6 +34,9 @@ __all__ = [
     "MetadataPage",
     "MetadataRow",
     "PendingCell",
+    "Pin",
+    "Pinned",
+    "PinnedCell",
     "Release",
     "Released",
     "Reload",
@@ -45,14 +48,17 @@ __all__ = [
     "Show",
     "ShownCell",
     "ShownSegment",
+    "Shutdown",
     "Stats",
     "StatsReply",
+    "Stopping",
+    "Unpin",
     "Welcome",
     "area_from_message",
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (1, 0)
+PROTOCOL_VERSION: Final = (1, 1)
 
 
 class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
@@ -232,6 +238,27 @@ class Evict(msgspec.Struct, array_like=True, tag="evict"):
     ids: tuple[str, ...] | None = None
 
 
+class Pin(msgspec.Struct, array_like=True, tag="pin"):
+    """Keep cells resident until `Unpin` or the daemon's end (privileged); no ids: only list the pins."""
+
+    request: int
+    ids: tuple[str, ...] = ()
+    layers: tuple[str, ...] = ("points",)
+
+
+class Unpin(msgspec.Struct, array_like=True, tag="unpin"):
+    """Keep cells, all when ``ids`` is nil, no longer than others (privileged)."""
+
+    request: int
+    ids: tuple[str, ...] | None = None
+
+
+class Shutdown(msgspec.Struct, array_like=True, tag="shutdown"):
+    """End the daemon and free its memory, as SIGTERM does (privileged)."""
+
+    request: int
+
+
 class Bye(msgspec.Struct, array_like=True, tag="bye"):
     """The session ends; there is no reply.  What it still maps stays pinned by the kernel's word."""
 
@@ -239,7 +266,20 @@ class Bye(msgspec.Struct, array_like=True, tag="bye"):
 
 
 Request: TypeAlias = (
-    Hello | Metadata | Area | Differential | Selected | Release | Stats | Show | Reload | Evict | Bye
+    Hello
+    | Metadata
+    | Area
+    | Differential
+    | Selected
+    | Release
+    | Stats
+    | Show
+    | Reload
+    | Evict
+    | Pin
+    | Unpin
+    | Shutdown
+    | Bye
 )
 
 
@@ -417,7 +457,10 @@ class ShownSegment(msgspec.Struct, array_like=True, frozen=True):
 
 
 class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
-    """Answer to `Show`; ``id`` is whole, ``failure`` the last one that still stands."""
+    """Answer to `Show`; ``id`` is whole, ``failure`` the last one that still stands.
+
+    ``pinned`` names the layers that an operator keeps resident.
+    """
 
     request: int
     id: str
@@ -432,6 +475,7 @@ class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
     failure: str = ""
     z_min: float | None = None
     z_max: float | None = None
+    pinned: tuple[str, ...] = ()
 
 
 class Reloaded(msgspec.Struct, array_like=True, tag="reloaded"):
@@ -446,12 +490,39 @@ class Reloaded(msgspec.Struct, array_like=True, tag="reloaded"):
 
 
 class Evicted(msgspec.Struct, array_like=True, tag="evicted"):
-    """Answer to `Evict`: segments freed at once, segments still mapped by somebody, unknown ids."""
+    """Answer to `Evict`: segments freed at once, segments still mapped by somebody, unknown ids.
+
+    ``kept`` counts the segments left alone because an operator pinned them.
+    """
 
     request: int
     freed: int
     pinned: int
     unknown: tuple[str, ...] = ()
+    kept: int = 0
+
+
+class PinnedCell(msgspec.Struct, array_like=True, frozen=True):
+    """A cell an operator keeps: ``state`` resident, stale, loading, absent, or why it cannot be loaded."""
+
+    id: str
+    layer: str
+    state: str
+    bytes: int
+
+
+class Pinned(msgspec.Struct, array_like=True, tag="pinned"):
+    """Answer to `Pin` and `Unpin`: the cells asked for, else all that are pinned; ids the map lacks."""
+
+    request: int
+    cells: tuple[PinnedCell, ...]
+    unknown: tuple[str, ...] = ()
+
+
+class Stopping(msgspec.Struct, array_like=True, tag="stopping"):
+    """Answer to `Shutdown`: the daemon ends now."""
+
+    request: int
 
 
 class ErrorReply(msgspec.Struct, array_like=True, tag="error"):
@@ -464,5 +535,15 @@ class ErrorReply(msgspec.Struct, array_like=True, tag="error"):
 
 
 Reply: TypeAlias = (
-    Welcome | Cells | MetadataPage | Released | StatsReply | ShownCell | Reloaded | Evicted | ErrorReply
+    Welcome
+    | Cells
+    | MetadataPage
+    | Released
+    | StatsReply
+    | ShownCell
+    | Reloaded
+    | Evicted
+    | Pinned
+    | Stopping
+    | ErrorReply
 )

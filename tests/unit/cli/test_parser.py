@@ -14,6 +14,7 @@ from shmmap.errors import BadRequest
 from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
 
 CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evict"]
+CONTRACT += ["pin", "unpin", "stop"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
 
 

@@ -80,13 +80,6 @@ def test_what_the_kernel_says_of_a_peer(address: str, peer: Peer) -> None:
     assert Peer.parse(address) == peer
 
 
-def test_who_may_change_things() -> None:
-    assert Peer(0, 0, 1).privileged
-    assert Peer(os.geteuid(), 0, 1).privileged
-    assert not Peer(12345, 0, 1).privileged
-    assert not Peer().privileged
-
-
 def test_a_watched_process() -> None:
     """The descriptor belongs to the process, and goes with the session."""
     sessions = Sessions()

@@ -77,6 +77,7 @@ def test_replies(kind: Any) -> None:
         ("Row", m.MetadataRow),
         ("Session", m.SessionRow),
         ("Segment", m.ShownSegment),
+        ("Pinned", m.PinnedCell),
         ("Intent", m.Intent),
     ],
 )

@@ -89,6 +89,9 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
     (m.Reload(9), ["reload", 9], "92a672656c6f616409"),
     (m.Evict(10, ("a",)), ["evict", 10, ["a"]], "93a565766963740a91a161"),
     (m.Bye(11), ["bye", 11], "92a36279650b"),
+    (m.Pin(12, ("a",), ("points",)), ["pin", 12, ["a"], ["points"]], "94a370696e0c91a16191a6706f696e7473"),
+    (m.Unpin(13, ("a",)), ["unpin", 13, ["a"]], "93a5756e70696e0d91a161"),
+    (m.Shutdown(14), ["shutdown", 14], "92a873687574646f776e0e"),
 ]
 REPLIES: list[tuple[Any, list[Any], str]] = [
     (
@@ -202,6 +205,7 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             "bad",
             -1.0,
             1.0,
+            ("points",),
         ),
         [
             "shown_cell",
@@ -218,11 +222,13 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             "bad",
             -1.0,
             1.0,
+            ["points"],
         ],
         (
-            "9eaa73686f776e5f63656c6c08a16101cb0000000000000000cb0000000000000000cb4034000000"
+            "9faa73686f776e5f63656c6c08a16101cb0000000000000000cb0000000000000000cb4034000000"
             "000000cb4034000000000000cd012c9197a6706f696e747301a23030a67a6f6d6269650102919604"
             "0506a163070891a6706f696e7473a3626164cbbff0000000000000cb3ff0000000000000"
+            "91a6706f696e7473"
         ),
     ),
     (
@@ -230,7 +236,17 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
         ["reloaded", 9, 5, 1, 2, 3, ["odd"]],
         "97a872656c6f61646564090501020391a36f6464",
     ),
-    (m.Evicted(10, 1, 2, ("x",)), ["evicted", 10, 1, 2, ["x"]], "95a7657669637465640a010291a178"),
+    (
+        m.Evicted(10, 1, 2, ("x",), 3),
+        ["evicted", 10, 1, 2, ["x"], 3],
+        "96a7657669637465640a010291a17803",
+    ),
+    (
+        m.Pinned(12, (m.PinnedCell("a", "points", "resident", 5),), ("x",)),
+        ["pinned", 12, [["a", "points", "resident", 5]], ["x"]],
+        "94a670696e6e65640c9194a161a6706f696e7473a87265736964656e740591a178",
+    ),
+    (m.Stopping(14), ["stopping", 14], "92a873746f7070696e670e"),
     (
         m.ErrorReply(11, "no_session", "m", "h"),
         ["error", 11, "no_session", "m", "h"],
@@ -286,6 +302,8 @@ def test_replies_of_a_later_minor_version_are_read(message: object, elements: li
         (["selected", 1, ["a"]], m.Selected(1, ("a",), ("points",), None, None)),
         (["release", 1], m.Release(1, None)),
         (["evict", 1], m.Evict(1, None)),
+        (["pin", 1], m.Pin(1, (), ("points",))),
+        (["unpin", 1], m.Unpin(1, None)),
         (
             ["area", 1, ["square", 0.5, 1, 2], [], 0, [1, 2]],
             m.Area(1, m.SquareMessage(0.5, 1.0, 2.0), (), 0.0, m.Intent(1.0, 2.0, 0.0, 0.0, None, ())),
