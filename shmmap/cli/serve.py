@@ -13,7 +13,9 @@ _EPILOG = """\
 Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.
 MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
 or inside the folder of the files), or one PCD file.
-Signals: SIGTERM and SIGINT stop it and free all memory, SIGHUP reads the map again.
+Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and leaves the memory to its
+next start, which goes on warm, as after a crash (a restart sends it first, then SIGTERM as usual; in
+a container: --stop-signal USR1); SIGHUP reads the map again.
 Exit code: 0 after a signal, 65 bad map, 66 no map there, 75 the instance runs already, 78 bad setting."""
 
 

@@ -23,19 +23,26 @@ def _available_bytes() -> int:
     return DEFAULT_CEILING_BYTES
 
 
-def choose_budget(asked_bytes: int, directory: ShmDirectory) -> int:
+def choose_budget(asked_bytes: int, directory: ShmDirectory, *, ours_bytes: int = 0) -> int:
     """Return the budget in bytes.
 
     An explicit one that does not fit the file system is refused.  The default is a quarter of the
     available memory, at most 4 GiB, less where the file system is smaller (a reserve of 5 %, at
     most 256 MiB, stays free).
 
+    Parameters
+    ----------
+    asked_bytes
+        The explicit budget; 0 for the default.
+    ours_bytes
+        What an earlier life of the daemon left in the directory: it is ours to keep or to free.
+
     Raises
     ------
     ConfigError
         The explicit budget is larger than what is free, or too small for anything.
     """
-    size, free = directory.size_bytes(), directory.free_bytes()
+    size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
     room = free - min(size // 20, RESERVE_BYTES)
     if asked_bytes:
         if asked_bytes > free:
@@ -49,7 +56,7 @@ def choose_budget(asked_bytes: int, directory: ShmDirectory) -> int:
                 f"a budget of {asked_bytes} bytes is too small", key="budget", hint="use at least 1M"
             )
         return asked_bytes
-    budget = min(_available_bytes() // 4, DEFAULT_CEILING_BYTES, room)
+    budget = min((_available_bytes() + ours_bytes) // 4, DEFAULT_CEILING_BYTES, room)
     if budget < SMALLEST_BYTES:
         raise ConfigError(
             f"{directory.path} has only {free} bytes free",

@@ -385,7 +385,7 @@ class CellRequests:
         wire_id = store.wire_id(key.cell_id)
         slot = store.books.slot(key)
         refusal = wanted.refused.get(key)
-        resident = slot.resident
+        resident = slot.resident if slot.resident is None or slot.resident.checked else None
         current = resident is not None and resident.version == store.catalogue.version(index)
         if resident is not None and refusal is None and (current or key.cell_id not in wanted.held_old):
             answer.handles.append(resident.handle if current else resident.stale_handle)

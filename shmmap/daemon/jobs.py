@@ -13,6 +13,8 @@ from typing import Final, TypeAlias
 import msgspec
 
 __all__ = [
+    "Check",
+    "Checked",
     "Done",
     "Failed",
     "FromWorker",
@@ -41,6 +43,15 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
     box: tuple[float, float, float, float]
     frame_id: str
     granted: int
+
+
+class Check(msgspec.Struct, array_like=True, tag="check"):
+    """Compare a segment of an earlier life with its checksums, and its source with ``stamp``."""
+
+    number: int
+    path: str
+    segment: str
+    stamp: tuple[int, int, int]
 
 
 class Grant(msgspec.Struct, array_like=True, tag="grant"):
@@ -87,6 +98,13 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     warnings: tuple[str, ...] = ()
 
 
+class Checked(msgspec.Struct, array_like=True, tag="checked"):
+    """A segment is what it should be, or ``wrong`` says why not; the worker has closed it again."""
+
+    number: int
+    wrong: str = ""
+
+
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
     """No segment; ``stamp`` is the source's, if it could be read."""
 
@@ -96,8 +114,8 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
     stamp: tuple[int, int, int] | None = None
 
 
-ToWorker: TypeAlias = Job | Grant | Refuse
-FromWorker: TypeAlias = Ready | Need | Segment | Done | Failed
+ToWorker: TypeAlias = Job | Check | Grant | Refuse
+FromWorker: TypeAlias = Ready | Need | Segment | Done | Checked | Failed
 
 encode: Final = msgspec.msgpack.Encoder().encode
 _to_worker: Final[msgspec.msgpack.Decoder[ToWorker]] = msgspec.msgpack.Decoder(ToWorker)

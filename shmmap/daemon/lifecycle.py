@@ -2,8 +2,21 @@
 """One life of the daemon: lock, open the map, serve, stop.
 
 The order matters.  The lock comes first, because binding would steal a live socket; leftovers are
-retired before anything is published; READY is said when requests are answered.  On the way out
+taken over before anything is published; READY is said when requests are answered.  On the way out
 every name is taken away before the lock is.
+
+**Stopping empties, restarting keeps warm.**  SIGTERM and SIGINT stop the daemon and free all
+memory.  SIGUSR1 stops it and leaves the segments to its next life, which adopts them
+(`shmmap.daemon.leftovers`), as it does after a crash; whoever waits for an answer gets it from the
+next life, too.  A SIGTERM that follows a SIGUSR1 changes nothing about that, so a service manager
+that sends SIGTERM anyway can announce a restart beforehand.  systemd ends a unit in the same way
+for ``restart`` and ``stop``, but while it does so its job list says which it is; ``+`` gives the
+line the right to ask and to send, in a unit for one user ``systemctl --user`` has it anyway::
+
+    ExecStop=-+/bin/sh -c 'systemctl list-jobs --plain --no-legend | \
+        grep -Eq "^ *[0-9]+ +%n +restart " && kill -USR1 $MAINPID'
+
+Elsewhere: ``kill -USR1`` before starting anew, ``docker run --stop-signal USR1``.
 """
 
 from __future__ import annotations
@@ -19,6 +32,7 @@ import signal
 import socket as sockets
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -31,7 +45,7 @@ from shmmap.daemon.budget import choose_budget
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
-from shmmap.daemon.leftovers import retire_leftovers
+from shmmap.daemon.leftovers import Leftovers
 from shmmap.daemon.logs import set_up_logging
 from shmmap.daemon.prerequisites import (
     access_of_segments,
@@ -46,7 +60,7 @@ from shmmap.daemon.residency import Residency
 from shmmap.daemon.server import Server
 from shmmap.daemon.service_manager import ServiceManager, status_line
 from shmmap.daemon.sessions import Sessions
-from shmmap.daemon.start_signals import STOP_SIGNALS, StartSignals, ignore_signals
+from shmmap.daemon.start_signals import KEEP_SIGNAL, STOP_SIGNALS, StartSignals, ignore_signals
 from shmmap.daemon.store import Store
 from shmmap.daemon.workers import WorkerPool
 from shmmap.errors import ConfigError, InternalError, ShmmapError
@@ -114,13 +128,14 @@ def _run(config: DaemonConfig, manager: ServiceManager) -> int:
             shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
             stack.callback(shm_lock.release)
             stack.callback(ignore_signals)  # without the locks no name is ours to take away
+            stack.push(partial(_stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
             _log.warning("%s", problem)
         with signals.held():
             life = _Life(config, catalogue, directory, path, mode, gid)
-            stack.callback(life.close)
+            stack.callback(lambda: life.close(keep=signals.keep))
         life.serve(Reloader(origin), started_s, signals, manager, activated)
     return 0
 
@@ -140,6 +155,26 @@ def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str
 
 def _lock_path(socket_path: str) -> str:
     return socket_path.removesuffix(".sock") + ".lock"
+
+
+def _names_of(directory: ShmDirectory, instance: str) -> list[str]:
+    """Names of this instance but the lock's, which goes last."""
+    prefix = segment_prefix(instance)
+    return [name for name in directory.names(prefix) if name != prefix + "lock"]
+
+
+def _stopped_early(
+    signals: StartSignals,
+    directory: ShmDirectory,
+    instance: str,
+    kind: type[BaseException] | None,
+    *_: object,
+) -> None:
+    """A stop empties, even one that came before there was anything but what an earlier life left."""
+    if kind is SystemExit and not signals.keep:
+        for name in _names_of(directory, instance):
+            with contextlib.suppress(OSError):
+                directory.unlink(name)
 
 
 class _Life:
@@ -176,7 +211,9 @@ class _Life:
             started_unix_ns=time.time_ns(),
             frame_id=catalogue.frame_id,
         )
-        budget = choose_budget(config.budget_bytes, directory)  # may refuse: before anything has a name
+        budget = choose_budget(  # may refuse: before anything has a name
+            config.budget_bytes, directory, ours_bytes=directory.used_bytes(segment_prefix(config.instance))
+        )
         self._statistics = StatisticsWriter(directory, config.instance, self._identity, mode=mode, gid=gid)
         self._sessions = Sessions()
         books = Residency(budget)
@@ -189,7 +226,6 @@ class _Life:
 
         self._statistics.reserve = grow_statistics
         reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction])
-        retire_leftovers(directory, config.instance, reclaimer, time.monotonic())
         pool = WorkerPool(
             config.loaders(),
             directory.path,
@@ -211,6 +247,8 @@ class _Life:
             gid=gid,
             on_settled=lambda key: self._running.cells.settled(key),
         )
+        leftovers = Leftovers(directory, config.instance, self._store, reclaimer, mode=mode, gid=gid)
+        leftovers.take_over(time.monotonic())
         self._server: Server | None = None
 
     @property
@@ -253,7 +291,7 @@ class _Life:
         )
         try:
             with self._signal_descriptor() as fd:
-                server.watch(fd, self._on_signals)
+                server.watch(fd, lambda: self._on_signals(signals))
                 if activated is not None:
                     socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
                 self._bind(socket)
@@ -269,7 +307,7 @@ class _Life:
                     self._reload()
                 server.run()
         finally:
-            manager.stopping("freeing memory")
+            manager.stopping("keeping memory for the next start" if signals.keep else "freeing memory")
             socket.close()
             context.term()
             reloader.close()
@@ -330,7 +368,7 @@ class _Life:
         ours, theirs = sockets.socketpair()
         ours.setblocking(False)
         theirs.setblocking(False)
-        for number in (*STOP_SIGNALS, signal.SIGHUP):
+        for number in (*STOP_SIGNALS, KEEP_SIGNAL, signal.SIGHUP):
             signal.signal(number, lambda *_: None)
         before = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         try:
@@ -341,16 +379,24 @@ class _Life:
             ours.close()
             theirs.close()
 
-    def _on_signals(self) -> None:
+    def _on_signals(self, signals: StartSignals) -> None:
         with contextlib.suppress(BlockingIOError):
-            for number in self._wakeup.recv(64):
+            # of signals that were pending together the kernel runs the last one's handler first: what came
+            # with the announcement of a restart came after it
+            for number in sorted(self._wakeup.recv(64), key=lambda number: number != KEEP_SIGNAL):
                 if number == signal.SIGHUP:
                     self._reload()
-                elif number in STOP_SIGNALS:
-                    _log.info("stopping on %s", signal.Signals(number).name)
-                    for again in STOP_SIGNALS:
-                        signal.signal(again, self._quick_exit)
-                    self._running.stop()
+                elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._running.stopping:
+                    signals.keep = number == KEEP_SIGNAL
+                    _log.info(
+                        "stopping on %s%s",
+                        signal.Signals(number).name,
+                        ", the segments stay for the next start" if signals.keep else "",
+                    )
+                    if not signals.keep:
+                        for again in STOP_SIGNALS:
+                            signal.signal(again, self._quick_exit)
+                    self._running.stop(answer=not signals.keep)
 
     def _quick_exit(self, number: int, frame: object) -> None:
         """A second signal: take the names away and go.
@@ -358,17 +404,18 @@ class _Life:
         It may come in the middle of the first one's work, so it trusts the disk alone.
         """
         del number, frame
-        directory = self._directory
-        names = [directory.path + name for name in directory.names(segment_prefix(self._config.instance))]
+        directory, instance = self._directory, self._config.instance
+        names = [directory.path + name for name in _names_of(directory, instance)]
         own_socket = [self._socket_path] if self._owns_socket else []
-        for path in (*names, *own_socket, _lock_path(self._socket_path)):
+        locks = (f"{directory.path}{segment_prefix(instance)}lock", _lock_path(self._socket_path))
+        for path in (*names, *own_socket, *locks):
             with contextlib.suppress(OSError):
                 os.unlink(path)
         os._exit(0)  # the loaders die with this process
 
-    def close(self) -> None:
-        """Take every name away."""
-        self._store.close()
+    def close(self, *, keep: bool) -> None:
+        """Take every name away, or leave those of the segments to the next life."""
+        self._store.close(keep=keep)
         self._statistics.close()
         if self._server is not None:
             self._server.close()

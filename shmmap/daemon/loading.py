@@ -3,6 +3,9 @@
 
 Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is
 replaced, and the jobs behind the one it died of go back into the queue.
+
+A segment of an earlier life of the daemon is checked by a worker before it is handed out, as a load
+that costs no memory; when it is not what it should be, the cell is loaded like any other.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from typing import Final, Protocol
 
 from shmmap.daemon import jobs
 from shmmap.daemon.reclaim import Outcome, Reclaimer
-from shmmap.daemon.residency import Failure, Key, Load, Residency
+from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident
 from shmmap.daemon.workers import Worker, WorkerPool
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
@@ -34,11 +37,20 @@ SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
 class Shelf(Protocol):
     """Where loads come from and go to: the store."""
 
-    def job(self, load: Load, number: int) -> jobs.Job | None:
+    def job(self, load: Load, number: int) -> jobs.Job | jobs.Check | None:
         """What a worker has to do for a load; None if its cell left the map."""
 
     def publish(self, load: Load, done: jobs.Done, fd: int, now_s: float) -> None:
         """Take a finished segment; the descriptor is closed afterwards."""
+
+    def accept(self, load: Load, resident: Resident) -> bool:
+        """Hand out a checked segment from now on; False if it has left service meanwhile."""
+
+    def reject(self, resident: Resident, why: str, now_s: float) -> None:
+        """Take a segment that is not what it should be out of service."""
+
+    def estimate_of(self, key: Key) -> int:
+        """Bytes to reserve before loading a key."""
 
 
 class Loading:
@@ -101,7 +113,7 @@ class Loading:
                 self.abandon(load)
                 continue
             shortage = self.books.shortage(load.estimate)
-            if shortage > 0:
+            if load.estimate and shortage > 0:
                 if self._make_room(load, shortage, now_s):
                     continue
                 return
@@ -111,7 +123,8 @@ class Loading:
                 self.books.requeue(load)
                 return
             self._jobs[job.number] = load
-            self._statistics.add("loads_started")
+            if isinstance(job, jobs.Job):
+                self._statistics.add("loads_started")
 
     def _make_room(self, load: Load, shortage: int, now_s: float) -> bool:
         """Whether the load was given up (True) or room is on its way (False)."""
@@ -169,7 +182,10 @@ class Loading:
         self.hungry.pop(message.number, None)
         load = self._jobs.pop(message.number, None)
         fd, worker.segment_fd = worker.segment_fd, -1
-        if isinstance(message, jobs.Failed):
+        if isinstance(message, jobs.Checked):
+            if load is not None:
+                self._checked(load, message.wrong, now_s)
+        elif isinstance(message, jobs.Failed):
             if fd >= 0:
                 os.close(fd)
             if load is not None:
@@ -183,6 +199,20 @@ class Loading:
         elif load is not None:  # this process had no descriptor left to receive it
             self.fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
         return True
+
+    def _checked(self, load: Load, wrong: str, now_s: float) -> None:
+        """An adopted segment was compared with its checksums, or could not be."""
+        resident, load.adopted = load.adopted, None
+        if resident is not None and not wrong and self._shelf.accept(load, resident):
+            self._on_settled(load.key)
+            return
+        if resident is not None and wrong:
+            self._shelf.reject(resident, wrong, now_s)
+        if load.wanted:
+            load.estimate = self._shelf.estimate_of(load.key)
+            self.books.requeue(load)
+        else:
+            self.abandon(load)
 
     def _feed_hungry(self, now_s: float) -> None:
         """Grant, hold or refuse the extra bytes that workers asked for."""
@@ -244,6 +274,9 @@ class Loading:
         self, load: Load, code: str, message: str, stamp: tuple[int, int, int] | None, now_s: float
     ) -> None:
         """The load ended without a segment; the back-off doubles when it failed the same way before."""
+        if load.adopted is not None:
+            self._checked(load, message, now_s)
+            return
         old = self.books.slot(load.key).failure
         if code in SPACE_CODES:
             delay_s = BUDGET_RETRY_S

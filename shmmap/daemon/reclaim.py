@@ -116,7 +116,8 @@ class Reclaimer:
             self._forget(zombie)
 
     def _watch(self, zombie: Zombie, now_s: float) -> bool:
-        self._by_key[zombie.resident.key] = zombie
+        if zombie.resident.checked:
+            self._by_key[zombie.resident.key] = zombie
         zombie.condemned = self.is_pinned(zombie.resident) is False
         zombie.probe_after_s = now_s + TICK_S
         return zombie.condemned

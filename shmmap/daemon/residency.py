@@ -27,7 +27,11 @@ class Key(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Resident:
-    """A published segment and what the daemon knows of its use."""
+    """A published segment and what the daemon knows of its use.
+
+    ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
+    their checksums: until then nobody is handed it.
+    """
 
     name: str
     key: Key
@@ -42,6 +46,7 @@ class Resident:
     last_use_s: float = 0.0
     load_ns: int = 0
     hits: int = 0
+    checked: bool = True
     sessions: set[int] = field(default_factory=set)
 
 
@@ -60,7 +65,11 @@ class Zombie:
 
 @dataclass(slots=True, eq=False)
 class Load:
-    """A load that is queued or running; ``reserved`` bytes are promised to it while it runs."""
+    """A load that is queued or running; ``reserved`` bytes are promised to it while it runs.
+
+    ``adopted`` is the segment of an earlier life that only has to be checked; ``wanted`` that somebody
+    asked for it.
+    """
 
     key: Key
     estimate: int
@@ -69,6 +78,8 @@ class Load:
     running: bool = False
     reserved: int = 0
     started_s: float = 0.0
+    adopted: Resident | None = None
+    wanted: bool = True
 
 
 @dataclass(slots=True)
@@ -104,6 +115,8 @@ class Residency:
     ----------
     overhead_bytes
         What the daemon itself keeps in shared memory (its statistics); counts as used.
+    unchecked_count
+        How many residents are of an earlier life and not yet checked.
     """
 
     def __init__(self, budget_bytes: int) -> None:
@@ -114,6 +127,7 @@ class Residency:
         self.zombie_bytes = 0
         self.reserved_bytes = 0
         self.overhead_bytes = 0
+        self.unchecked_count = 0
         self._by_name: dict[str, Resident] = {}
         self._failed: set[Key] = set()
         self._queue: list[tuple[float, int, Load]] = []
@@ -179,7 +193,10 @@ class Residency:
         if load is None:
             self._numbers += 1
             load = slot.load = Load(key, estimate, priority, self._numbers)
-        elif load.running or priority >= load.priority:
+            heapq.heappush(self._queue, (priority, load.number, load))
+            return load
+        load.wanted = True
+        if load.running or priority >= load.priority:
             return load
         load.priority = priority
         heapq.heappush(self._queue, (priority, load.number, load))
@@ -202,7 +219,7 @@ class Residency:
         ValueError
             If they do not fit; callers ask `shortage` first.
         """
-        if self.shortage(load.estimate) > 0:
+        if load.estimate and self.shortage(load.estimate) > 0:
             raise ValueError("the reservation exceeds the budget")
         if self._queue and self._queue[0][2] is load:
             heapq.heappop(self._queue)
@@ -246,6 +263,25 @@ class Residency:
             self._move_to_zombies(old)
         return old
 
+    def adopt(self, resident: Resident) -> None:
+        """Take a segment of an earlier life into service once it is checked; queues that check, last."""
+        load = self.want(resident.key, 0, float("inf"))
+        load.adopted, load.wanted = resident, False
+        self.slots[resident.key].resident = resident
+        resident.checked = False
+        self.unchecked_count += 1
+        self._by_name[resident.name] = resident
+        self.resident_bytes += resident.nbytes
+
+    def checked(self, load: Load, resident: Resident) -> None:
+        """An adopted segment is what it should be: it can be handed out."""
+        self._unreserve(load)
+        slot = self.slot(load.key)
+        if slot.load is load:
+            slot.load = None
+        resident.checked = True
+        self.unchecked_count -= 1
+
     def failed(self, load: Load, failure: Failure | None) -> None:
         """The load ended without a segment; ``failure`` stands until it succeeds or is cleared."""
         self._unreserve(load)
@@ -282,6 +318,7 @@ class Residency:
 
     def _move_to_zombies(self, resident: Resident) -> Zombie:
         del self._by_name[resident.name]
+        self.unchecked_count -= not resident.checked
         self.resident_bytes -= resident.nbytes
         self.zombie_bytes += resident.nbytes
         zombie = self.zombies[resident.name] = Zombie(resident)

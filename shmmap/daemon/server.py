@@ -82,6 +82,7 @@ class Server:
         self._epoll = select.epoll()
         self._events: dict[int, Callable[[], None]] = {}
         self._stopping = False
+        self._answer_at_end = True
         self.cells = CellRequests(
             store, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
         )
@@ -112,9 +113,15 @@ class Server:
         if worker is not None:
             self._store.loads.on_worker(worker, time.monotonic())
 
-    def stop(self) -> None:
-        """Leave the loop after this turn."""
+    @property
+    def stopping(self) -> bool:
+        """Whether the loop ends after this turn."""
+        return self._stopping
+
+    def stop(self, *, answer: bool = True) -> None:
+        """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
         self._stopping = True
+        self._answer_at_end = answer
 
     # --- the loop ---------------------------------------------------------------------------------
 
@@ -128,7 +135,8 @@ class Server:
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
             ready = self._poller.poll(min(timeout_ms, int(BEAT_S * 1000)))
             self._turn(ready)
-        self.cells.answer_all(time.monotonic())
+        if self._answer_at_end:
+            self.cells.answer_all(time.monotonic())
 
     def close(self) -> None:
         """Stop watching; after everything watched is gone."""

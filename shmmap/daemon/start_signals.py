@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that arrive while the daemon starts."""
+"""Signals that arrive while the daemon starts, and what each signal means."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import signal
 from collections.abc import Iterator
 from typing import Final
 
-__all__ = ["STOP_SIGNALS", "StartSignals", "ignore_signals"]
+__all__ = ["KEEP_SIGNAL", "STOP_SIGNALS", "StartSignals", "ignore_signals"]
 
 _log = logging.getLogger(__name__)
 
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
+KEEP_SIGNAL: Final = signal.SIGUSR1
+"""Ends the daemon and leaves the segments to its next life: see `shmmap.daemon.lifecycle`."""
 
 
 class StartSignals:
@@ -24,15 +26,21 @@ class StartSignals:
 
     def __init__(self) -> None:
         self.reload_wanted = False
+        self.keep = False
         self._held = False
         self._stop = False
         for number in STOP_SIGNALS:
             signal.signal(number, self._on_stop)
+        signal.signal(KEEP_SIGNAL, self._on_keep)
         signal.signal(signal.SIGHUP, self._on_reload)
 
     def _on_reload(self, number: int, frame: object) -> None:
         del number, frame
         self.reload_wanted = True
+
+    def _on_keep(self, number: int, frame: object) -> None:
+        self.keep = True
+        self._on_stop(number, frame)
 
     def _on_stop(self, number: int, frame: object) -> None:
         del frame
@@ -56,5 +64,5 @@ class StartSignals:
 
 def ignore_signals() -> None:
     """From here on nothing stops the process but its own end."""
-    for number in STOP_SIGNALS:
+    for number in (*STOP_SIGNALS, KEEP_SIGNAL):
         signal.signal(number, signal.SIG_IGN)

@@ -160,11 +160,19 @@ class Store:
 
     # --- publishing -----------------------------------------------------------------------------
 
-    def job(self, load: Load, number: int) -> jobs.Job | None:
-        """What a worker has to do for a load; None if its cell left the map."""
+    def job(self, load: Load, number: int) -> jobs.Job | jobs.Check | None:
+        """What a worker has to do for a load; None if its cell left the map, or nobody wants it any more."""
         index = self.index_of(load.key.cell_id)
         if index is None:
             return None
+        if load.adopted is not None:
+            if self.books.resident_named(load.adopted.name) is load.adopted:
+                stamp = self.catalogue.stamp(index)
+                return jobs.Check(number, self.catalogue.path(index), load.adopted.name, stamp)
+            load.adopted = None  # it was retired before its turn came
+            if not load.wanted:
+                return None
+            load.estimate = self.estimate(index)
         return jobs.Job(
             number,
             load.key.cell_id,
@@ -229,6 +237,33 @@ class Store:
             _log.info("%s: %d points left out, not finite", load.key.cell_id, done.dropped)
         self._on_settled(load.key)
 
+    def adopt(self, resident: Resident, index: int) -> None:
+        """Take a segment of an earlier life; it is handed out once a worker has checked it."""
+        self.books.adopt(resident)
+        self._enter(resident, index)
+        self._statistics.add("adopted")
+
+    def accept(self, load: Load, resident: Resident) -> bool:
+        """Hand out an adopted segment from now on; False if it has left service meanwhile."""
+        index = self.index_of(load.key.cell_id)
+        if index is None or self.books.resident_named(resident.name) is not resident:
+            return False
+        self.books.checked(load, resident)
+        self._enter(resident, index)
+        return True
+
+    def reject(self, resident: Resident, why: str, now_s: float) -> None:
+        """Take an adopted segment that is not what it should be out of service."""
+        self._statistics.add("adoptions_failed")
+        _log.warning("%s of an earlier daemon is not used: %s", resident.name, why)
+        if self.books.resident_named(resident.name) is resident:
+            self.reclaimer.retire(resident, now_s)
+
+    def estimate_of(self, key: Key) -> int:
+        """Bytes to reserve before loading a key."""
+        index = self.index_of(key.cell_id)
+        return self.estimate(index) if index is not None else 0
+
     def _lies_on_disk(self, index: int, stamp: Stamp) -> bool:
         try:
             return Stamp.of(os.stat(self.catalogue.path(index))) == stamp
@@ -236,7 +271,14 @@ class Store:
             return False
 
     def _enter(self, resident: Resident, index: int) -> None:
-        """A resident can be handed out: encode its handle, find it by index if it is current."""
+        """A resident can be handed out: encode its handle, find it by index if it is current.
+
+        One that is not checked yet only shows: who holds its version need not be sent it again.
+        """
+        if not resident.checked:
+            self.index_of_version[resident.version] = index
+            self._show(resident)
+            return
         self._encode(resident)
         if resident.version == self.catalogue.version(index):
             self.warm.setdefault(resident.key.layer, {})[index] = resident
@@ -351,6 +393,9 @@ class Store:
                 self.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
             self._chill(index)
+            if not resident.checked and not self.is_current(resident):
+                self.evict(resident, now_s)
+                continue
             self._enter(resident, index)
         for key in [key for key in self.books.slots if key.cell_id in gone]:
             self.books.cancel(key)
@@ -360,7 +405,8 @@ class Store:
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:
         self.history.append((self.catalogue.map_version, frozenset(changed), removed))
 
-    def close(self) -> None:
-        """End the workers and take every segment's name away."""
+    def close(self, *, keep: bool = False) -> None:
+        """End the workers and take every segment's name away, or leave the names to the next life."""
         self.loads.pool.close()
-        self.reclaimer.remove_all()
+        if not keep:
+            self.reclaimer.remove_all()

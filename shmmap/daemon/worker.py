@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Final
 
 from shmmap.daemon import jobs
-from shmmap.errors import MapDataError
+from shmmap.errors import MapDataError, SegmentCorrupt
 from shmmap.layers.points import build_points
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import SourceStamp
+from shmmap.segment.verify import verify_file
 
 __all__ = ["main"]
 
@@ -40,7 +41,7 @@ class _Worker:
     def __init__(self, channel: socket.socket, directory: ShmDirectory) -> None:
         self._channel = channel
         self._directory = directory
-        self._waiting: list[jobs.Job] = []
+        self._waiting: list[jobs.Job | jobs.Check] = []
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
@@ -51,6 +52,8 @@ class _Worker:
                 return
             if isinstance(job, jobs.Job):
                 self._load(job)
+            elif isinstance(job, jobs.Check):
+                self._check(job)
 
     def _receive(self) -> jobs.ToWorker | None:
         data = self._channel.recv(jobs.MAX_PACKET_BYTES)
@@ -72,7 +75,7 @@ class _Worker:
                 answer = self._receive()
                 if answer is None:
                     sys.exit(0)
-                if isinstance(answer, jobs.Job):
+                if isinstance(answer, jobs.Job | jobs.Check):
                     self._waiting.append(answer)
                 elif isinstance(answer, jobs.Grant):
                     job.granted = nbytes
@@ -120,6 +123,21 @@ class _Worker:
             self._fail(job, code, f"{job.path}: {error.strerror or error}")
         except MemoryError:
             self._fail(job, "load_failed", f"{job.path}: loading it ran out of memory")
+
+    def _check(self, job: jobs.Check) -> None:
+        wrong = ""
+        try:
+            if SourceStamp.of(os.stat(job.path)) != job.stamp:
+                wrong = "its source has changed"
+            else:
+                fd = self._directory.open(job.segment)
+                try:
+                    verify_file(fd)
+                finally:
+                    os.close(fd)
+        except (OSError, SegmentCorrupt) as error:
+            wrong = str(error)
+        self._send(jobs.Checked(job.number, wrong[:500]))
 
     def _fail(self, job: jobs.Job, code: str, message: str) -> None:
         stamp = None

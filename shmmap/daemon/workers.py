@@ -38,7 +38,7 @@ class Worker:
 
     process: subprocess.Popen[bytes]
     channel: socket.socket
-    queue: OrderedDict[int, jobs.Job] = field(default_factory=OrderedDict)
+    queue: OrderedDict[int, jobs.Job | jobs.Check] = field(default_factory=OrderedDict)
     head_since_s: float = 0.0
     ready: bool = False
     segment_fd: int = -1
@@ -130,7 +130,7 @@ class WorkerPool:
         self._watch(worker.fd)
         return worker
 
-    def submit(self, job: jobs.Job, now_s: float) -> bool:
+    def submit(self, job: jobs.Job | jobs.Check, now_s: float) -> bool:
         """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
         worker = min(self._workers.values(), key=lambda w: len(w.queue), default=None)
         if worker is None or (worker.queue and len(self._workers) < self._limit):
@@ -192,7 +192,7 @@ class WorkerPool:
         worker.queue.pop(number, None)
         worker.head_since_s = now_s
 
-    def remove(self, worker: Worker) -> tuple[list[jobs.Job], str]:
+    def remove(self, worker: Worker) -> tuple[list[jobs.Job | jobs.Check], str]:
         """Forget a dead worker; returns its unfinished jobs, and how it ended, for people."""
         self._unwatch(worker.fd)
         self._workers.pop(worker.fd, None)

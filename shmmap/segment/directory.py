@@ -7,6 +7,7 @@ Nothing here maps a segment or keeps it open: the kernel's word on who still use
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 
@@ -91,7 +92,9 @@ class ShmDirectory:
 
     def open(self, name: str) -> int:
         """Open a segment for reading; close it at once, an open file looks like a pin."""
-        return os.open(name.lstrip("/"), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=self._fd)
+        # a pipe of that name would keep the opener waiting
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        return os.open(name.lstrip("/"), flags, dir_fd=self._fd)
 
     def rename(self, old: str, new: str) -> bool:
         """Rename a segment; False if it is gone."""
@@ -114,6 +117,14 @@ class ShmDirectory:
         bare = prefix.lstrip("/")
         with os.scandir(self.path) as entries:
             return sorted("/" + entry.name for entry in entries if entry.name.startswith(bare))
+
+    def used_bytes(self, prefix: str) -> int:
+        """Memory that files whose names start with ``prefix`` occupy, bytes."""
+        total = 0
+        for name in self.names(prefix):
+            with contextlib.suppress(FileNotFoundError):
+                total += os.stat(name.lstrip("/"), dir_fd=self._fd, follow_symlinks=False).st_blocks * 512
+        return total
 
     def free_bytes(self) -> int:
         """Bytes the file system has left for us; very large where it sets no limit."""

@@ -54,6 +54,8 @@ COUNTERS: Final = (
     Counter("hits", "counter", "", "Cells answered from memory"),
     Counter("misses", "counter", "", "Cells that had to be loaded first"),
     Counter("reloads", "counter", "", "Times the map's catalogue was read again"),
+    Counter("adopted", "counter", "", "Segments of an earlier life of the daemon taken over at its start"),
+    Counter("adoptions_failed", "counter", "", "Segments taken over that did not match their checksums"),
     Counter("map_cells", "gauge", "", "Cells in the map's catalogue"),
 )
 

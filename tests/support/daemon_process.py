@@ -202,6 +202,12 @@ class DaemonProcess:
         """End the daemon with SIGTERM; returns its exit code."""
         return self._end(signal.SIGTERM)
 
+    def leave(self) -> int:
+        """End the daemon with SIGUSR1, which leaves the segments to its next life; returns its exit code."""
+        code = self._end(signal.SIGUSR1)
+        self.killed = True
+        return code
+
     def kill(self) -> None:
         """End the daemon with SIGKILL: it can clean up nothing."""
         self._end(signal.SIGKILL)
@@ -243,7 +249,7 @@ class DaemonProcess:
         prefix = f"shmmap.{self.instance}."
         found = [f"process {pid}" for pid in self.children() if not wait_ended(pid, 10.0)]
         if self.killed:
-            return found  # SIGKILL leaves names behind for the next life to adopt
+            return found  # names are left behind for the next life to adopt
         found += [f"segment {name}" for name in os.listdir(self.shm_dir) if name.startswith(prefix)]
         if self._own_shm_dir:
             found += [

@@ -69,7 +69,7 @@ class Puppet:
     def queue(self, count: int) -> list[jobs.Job]:
         """Run the daemon until it has handed out this many jobs."""
         self.one.run_until(lambda: len(self.worker.queue) == count)
-        return list(self.worker.queue.values())
+        return [job for job in self.worker.queue.values() if isinstance(job, jobs.Job)]
 
     def say(self, message: object, fd: int | None = None) -> None:
         socket.send_fds(self.channel, [jobs.encode(message)], [] if fd is None else [fd])

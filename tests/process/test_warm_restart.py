@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What outlives the daemon serves again, once its bytes are proven; nothing else that is left ever does."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import struct
+import threading
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from tests.process.conftest import DaemonFactory
+from tests.process.test_faults import stop_loaders
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, random_points
+from tests.support.mapping_process import MappingProcess
+from tests.support.patience import Patience
+from tests.support.raw_client import RawCells, RawClient, circle
+from tests.support.segment_reader import read_segment
+
+Connect = Callable[..., RawClient]
+EVERYTHING = circle(0, 0, 500)
+
+
+def assert_right(client: RawClient, reply: RawCells, made: DividedMap) -> None:
+    """Every handle leads to exactly the bytes of its file."""
+    assert (reply.failed, reply.pending) == ([], [])
+    for handle in reply.cells:
+        segment = read_segment(client.path(handle))
+        assert (segment.fields["cell_id"], segment.version) == (handle.id, handle.version)
+        expected = made.points(handle.id.rsplit("/", 1)[1])
+        assert segment.columns["xyz"][:, 2].tobytes() == expected["z"].tobytes()
+        assert segment.columns["intensity"].tobytes() == expected["intensity"].tobytes()
+
+
+def segments_of(reply: RawCells) -> dict[str, str]:
+    return {handle.id: handle.segment for handle in reply.cells}
+
+
+@pytest.mark.parametrize("end", ["kill", "leave"])
+def test_what_was_loaded_serves_again(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, end: str
+) -> None:
+    """After a crash and after a restart alike: the same segments, no file read again, readers undisturbed."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    before = segments_of(client.area(EVERYTHING))
+    path = f"{one.shm_dir}{before[divided_map.id('0_0.pcd')]}"
+    checksum = zlib.crc32(Path(path).read_bytes())
+    with MappingProcess([path]) as reader:
+        if end == "kill":
+            one.kill()
+        else:
+            assert one.leave() == 0
+            left = [name for name in os.listdir(one.shm_dir) if name not in one.segments()]
+            assert (left, os.path.exists(one.endpoint)) == ([], False)
+        assert len(one.segments()) == len(before) == 36
+        one.start()
+        client.hello()
+        again = client.area(EVERYTHING)
+        assert_right(client, again, divided_map)
+        assert segments_of(again) == before
+        counters = client.ask("stats")[4]
+        assert (counters["adopted"], counters["loads_started"], counters["adoptions_failed"]) == (36, 0, 0)
+        assert counters["bytes_resident"] == one.segment_bytes()
+        assert reader.checksums() == [checksum]
+    assert one.stop() == 0  # a stop empties, adopted segments included
+    assert one.leftovers() == []
+
+
+def test_a_sigterm_after_the_announcement_of_a_restart_changes_nothing(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """As a service manager does it: announce, then SIGTERM."""
+    one = daemon(divided_map.root)
+    connect(one).area(EVERYTHING)
+    before = one.segments()
+    one.send(signal.SIGSTOP)  # so that both are there when it looks
+    one.send(signal.SIGUSR1)
+    one.send(signal.SIGTERM)
+    assert one.process is not None
+    process, one.process = one.process, None
+    process.send_signal(signal.SIGCONT)
+    assert process.wait(30) == 0
+    assert one.segments() == before
+    one.start()
+    assert one.segments() == before
+
+
+def test_a_stop_that_comes_first_stays_a_stop(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    connect(one).area(EVERYTHING)
+    one.kill()
+    one.start()
+    assert one.stop() == 0
+    assert one.leftovers() == []
+
+
+def test_a_waiting_request_is_answered_by_the_next_life(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, "--workers", "1")
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        held = list(client.around(0, 0, 5).raise_for_failures())
+        loads = client.stats().counters["loads_started"]
+        stop_loaders(one)
+        found: list[shmmap.CellSet] = []
+        thread = threading.Thread(target=lambda: found.append(client.around(40, 40, 15, wait=60.0)))
+        thread.start()
+        waiting = Patience()
+        with shmmap.connect(one.endpoint) as watcher:
+            while waiting(watcher.stats().counters["loads_started"] == loads):
+                pass
+        assert one.leave() == 0
+        one.start()
+        thread.join(60)
+        assert sorted(cell.id.rsplit("/", 1)[1] for cell in found[0]) == divided_map.in_circle(40, 40, 15)
+        again = list(client.around(0, 0, 5))
+        assert {id(cell) for cell in again} == {id(cell) for cell in held}  # nothing was mapped anew
+
+
+def damage_payload(path: str) -> None:
+    _poke(path, 4096 + 64 * 3 + 1)
+
+
+def damage_header(path: str) -> None:
+    _poke(path, 96)
+
+
+def other_layout(path: str) -> None:
+    """Another major layout version, checksum and all."""
+    os.chmod(path, 0o600)
+    with open(path, "r+b") as file:
+        page = bytearray(file.read(4096))
+        struct.pack_into("<H", page, 8, 2)
+        end = 4096 - 72
+        struct.pack_into("<I", page, end, zlib.crc32(page[:end]))
+        file.seek(0)
+        file.write(page)
+    os.chmod(path, 0o400)
+
+
+def damage_publish_block(path: str) -> None:
+    _poke(path, 4096 - 64 + 17)
+
+
+def shorten(path: str) -> None:
+    os.truncate(path, 4096)
+
+
+def punch(path: str) -> None:
+    os.chmod(path, 0o600)
+    with open(path, "r+b") as file:
+        file.seek(4096)
+        file.write(bytes(4096))
+    os.chmod(path, 0o400)
+
+
+def open_to_others(path: str) -> None:
+    os.chmod(path, 0o660)
+
+
+def _poke(path: str, at: int) -> None:
+    os.chmod(path, 0o600)
+    with open(path, "r+b") as file:
+        file.seek(at)
+        byte = file.read(1)
+        file.seek(at)
+        file.write(bytes([byte[0] ^ 0x10]))
+    os.chmod(path, 0o400)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [damage_payload, damage_header, other_layout, damage_publish_block, shorten, punch, open_to_others],
+)
+def test_a_damaged_leftover_is_never_served(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, damage: Callable[[str], None]
+) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    one.kill()
+    damage(client.path(handle))
+    one.start()
+    client.hello()
+    reply = client.selected(["0_0.pcd"])
+    assert reply.cells[0].segment != handle.segment
+    assert_right(client, reply, divided_map)
+    waiting = Patience()
+    while waiting(len(one.segments()) > 1):
+        client.ask("stats")
+
+
+def test_a_damaged_leftover_that_somebody_maps_is_known_until_it_is_let_go(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    with MappingProcess([client.path(handle)]) as reader:
+        one.kill()
+        damage_payload(client.path(handle))
+        one.start()
+        client.hello()
+        reply = client.selected(["0_0.pcd"])
+        assert_right(client, reply, divided_map)
+        shown = client.ask("show", "0_0.pcd")[9]
+        assert sorted((row[2], row[3]) for row in shown) == sorted(
+            [(reply.cells[0].segment, "resident"), (handle.segment, "zombie")]
+        )
+        assert reader.checksums()
+    waiting = Patience()
+    while waiting(len(one.segments()) > 1):
+        client.ask("stats")
+
+
+def test_what_changed_while_nobody_looked_is_loaded_anew(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Changed, removed and moved cells of the map; the old state of one is still mapped and shows."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    before = segments_of(client.area(EVERYTHING))
+    changed = divided_map.id("0_0.pcd")
+    path = f"{one.shm_dir}{before[changed]}"
+    checksum = zlib.crc32(Path(path).read_bytes())
+    with MappingProcess([path]) as reader:
+        one.kill()
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(5), (0, 0), 700))
+        divided_map.remove_cell("20_20.pcd")
+        divided_map.write_metadata()
+        one.start()
+        client.hello()
+        again = client.area(EVERYTHING)
+        assert_right(client, again, divided_map)
+        after = segments_of(again)
+        assert divided_map.id("20_20.pcd") not in after
+        assert [cell for cell in after if after[cell] != before[cell]] == [changed]
+        assert [(row[2], row[3]) for row in client.ask("show", changed)[9]] == [
+            (after[changed], "resident"), (before[changed], "zombie"),
+        ]  # fmt: skip
+        assert reader.checksums() == [checksum]
+    waiting = Patience()
+    while waiting(len(one.segments()) > 35):
+        client.ask("stats")
+
+
+def test_names_that_are_no_segments_hinder_nobody(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """A pipe, a link to another segment, a directory: not waited for, not followed, not served."""
+    one: DaemonProcess = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    one.kill()
+    base = Path(one.shm_dir, f"shmmap.{one.instance}.")
+    os.mkfifo(f"{base}{'0' * 16}")
+    os.symlink(client.path(handle), f"{base}{'1' * 16}")
+    os.mkdir(f"{base}{'2' * 16}")
+    one.start()
+    client.hello()
+    assert client.selected(["0_0.pcd"]).cells[0].segment == handle.segment
+    left = one.segments()
+    assert left == sorted([f"shmmap.{one.instance}.{'2' * 16}", handle.segment.lstrip("/")])
+    os.rmdir(f"{base}{'2' * 16}")
+
+
+@pytest.mark.root
+def test_a_stranger_s_file_under_our_name_is_refused(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """A perfect copy, but of another owner: whoever owns a file can change it under its readers."""
+    one: DaemonProcess = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    one.kill()
+    copy = f"{client.path(handle)[:-16]}{'3' * 16}"
+    shutil.copyfile(client.path(handle), copy)
+    os.chmod(copy, 0o444)
+    os.chown(copy, 65534, 65534)
+    os.unlink(client.path(handle))
+    one.start()
+    client.hello()
+    reply = client.selected(["0_0.pcd"])
+    assert reply.cells[0].segment not in (handle.segment, f"/{os.path.basename(copy)}")
+    assert_right(client, reply, divided_map)
+    assert not os.path.exists(copy)
+
+
+def test_a_smaller_budget_takes_over_what_fits(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    for name, corner in list(divided_map.corners.items()):
+        divided_map.write_cell(name, corner, random_points(np.random.default_rng(9), corner, 4200))
+    one = daemon(divided_map.root)
+    client = connect(one)
+    client.area(EVERYTHING)
+    assert one.segment_bytes() > 2 << 20
+    one.kill()
+    one.arguments += ["--budget", "1M"]
+    one.start()
+    client.hello()
+    assert 0 < one.segment_bytes() <= 1 << 20
+    assert_right(client, client.area(circle(0, 0, 5)), divided_map)
+    assert one.segment_bytes() <= 1 << 20
