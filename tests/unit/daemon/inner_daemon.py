@@ -48,9 +48,11 @@ class InnerDaemon:
         workers: int = 1,
         load_timeout_s: float = 30.0,
         cache_dir: str,
+        shm_dir: str = "",
+        name: str = "inner",
     ) -> None:
         prepare_process()
-        self.shm_dir = tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
+        self.shm_dir = shm_dir or tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
         self.directory = ShmDirectory(self.shm_dir)
         self.origin = open_map(map_path, cache_dir=cache_dir)
         catalogue = self.origin.load()
@@ -59,7 +61,7 @@ class InnerDaemon:
             endpoint="", map_path=map_path, map_version=catalogue.map_version, shm_dir=self.shm_dir,
             id_prefix=catalogue.id_prefix, library_version="0", started_unix_ns=0, frame_id="map",
         )  # fmt: skip
-        self.statistics = StatisticsWriter(self.directory, "inner", identity)
+        self.statistics = StatisticsWriter(self.directory, name, identity)
         self.sessions = Sessions()
         self.books = Residency(budget_bytes)
         self.books.overhead_bytes = self.statistics.size_bytes
@@ -152,12 +154,16 @@ class InnerDaemon:
         self.store.replace_catalogue(new, self.now_s())
         return new
 
-    def close(self) -> None:
-        """End everything and remove the directory."""
+    def leave(self) -> None:
+        """End everything but the segments, as before a restart."""
         for session in list(self.sessions):
             self.sessions.close(session)
-        self.store.close()
+        self.store.close(keep=True)
         self.statistics.close()
         self._poll.close()
         self.directory.close()
+
+    def close(self) -> None:
+        """End everything and remove the directory."""
+        self.leave()
         shutil.rmtree(self.shm_dir)

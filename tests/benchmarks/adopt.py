@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a warm start costs: taking over the segments of an earlier life, and proving their bytes.
+
+Bar: header and stamp check of 1000 segments under 40 ms.  Beside it, as the least that any check
+could cost, the same files opened, read up to their header's end and closed; and for the proof of the
+bytes, done later in a worker, reading the same bytes without looking at them.
+
+    python -m tests.benchmarks.adopt [--segments 1000] [--rounds 15] [--points 2000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from shmmap.daemon.leftovers import Leftovers
+from shmmap.layers.points import build_points
+from shmmap.segment.layout import PublishBlock
+from shmmap.segment.names import new_segment_name
+from shmmap.segment.verify import verify_file
+from tests.support.divided_map import make_map
+from tests.unit.daemon.inner_daemon import InnerDaemon
+
+__all__ = ["main"]
+
+
+def publish_all(one: InnerDaemon, count: int) -> list[str]:
+    """Publish the segments of the first ``count`` cells, as an earlier life would have."""
+    catalogue, names = one.store.catalogue, []
+    for index in range(count):
+        fd = one.directory.create()
+        cell = catalogue.id(index)
+        header = build_points(catalogue.path(index), fd, cell_id=cell, box=catalogue.box(index))
+        name = new_segment_name("inner")
+        block = PublishBlock(1, catalogue.version(index))
+        one.directory.publish(fd, name, block=block, header_bytes=header.header_bytes, mode=0o400, gid=-1)
+        os.close(fd)
+        names.append(name)
+    return names
+
+
+def milliseconds(action: Callable[[], object]) -> float:
+    """CPU time of one call."""
+    began = time.process_time()
+    action()
+    return (time.process_time() - began) * 1e3
+
+
+def main() -> None:
+    """Print one line of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--segments", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--points", type=int, default=2000)
+    options = parser.parse_args()
+    side = int(options.segments**0.5) + 1
+    with tempfile.TemporaryDirectory() as scratch:
+        made = make_map(Path(scratch, "map"), columns=side, rows=side, points=options.points)
+        first = InnerDaemon(str(made.root), budget_bytes=4 << 30, cache_dir=scratch)
+        names = publish_all(first, options.segments)
+
+        def floor() -> None:
+            for name in first.directory.names("/shmmap.inner."):
+                fd = first.directory.open(name)
+                os.fstat(fd)
+                os.pread(fd, 4096, 0)
+                os.close(fd)
+
+        def one_life() -> float:
+            life = InnerDaemon(
+                str(made.root), budget_bytes=4 << 30, cache_dir=scratch, shm_dir=first.shm_dir, name="next"
+            )
+            leftovers = Leftovers(life.directory, "inner", life.store, life.reclaimer, mode=0o400, gid=-1)
+            spent = milliseconds(lambda: leftovers.take_over(life.now_s()))
+            assert life.books.resident_count == options.segments
+            life.leave()
+            return spent
+
+        def each(look: Callable[[int], object]) -> None:
+            for name in names:
+                fd = first.directory.open(name)
+                look(fd)
+                os.close(fd)
+
+        nbytes = sum(os.stat(first.shm_dir + name).st_size for name in names)
+        buffer = bytearray(1 << 20)
+        ours = [one_life() for _ in range(options.rounds)]
+        bare = [milliseconds(floor) for _ in range(options.rounds)]
+        proof = [milliseconds(lambda: each(verify_file)) for _ in range(3)]
+        read = [milliseconds(lambda: each(lambda fd: os.preadv(fd, [buffer], 0))) for _ in range(3)]
+        first.close()
+    print(
+        json.dumps(
+            {
+                "segments": options.segments,
+                "take_over_ms": round(statistics.median(ours), 1),
+                "take_over_min_ms": round(min(ours), 1),
+                "bare_open_read_ms": round(statistics.median(bare), 1),
+                "ratio": round(statistics.median(ours) / statistics.median(bare), 2),
+                "prove_bytes_ms": round(statistics.median(proof), 1),
+                "bare_read_ms": round(statistics.median(read), 1),
+                "megabytes": round(nbytes / 1e6, 1),
+                "load_average": os.getloadavg()[0],
+            }
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
