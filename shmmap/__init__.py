@@ -59,6 +59,10 @@ if TYPE_CHECKING:
         UnknownCell,
     )
     from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
+    from shmmap.layers.build import build_layer
+    from shmmap.layers.contract import LayerKind, LayerTable
+    from shmmap.layers.covariance import voxel_covariances
+    from shmmap.layers.spec import canonical_layer
     from shmmap.protocol.messages import HeldCell, Intent
 
 __version__ = "0.1.0"
@@ -81,6 +85,8 @@ __all__ = [
     "InstanceBusy",
     "Intent",
     "InternalError",
+    "LayerKind",
+    "LayerTable",
     "LoadFailed",
     "LoadTimeout",
     "MapDataError",
@@ -108,11 +114,21 @@ __all__ = [
     "WindowUpdate",
     "ZRange",
     "__version__",
+    "build_layer",
+    "canonical_layer",
     "connect",
+    "voxel_covariances",
 ]
 
 _GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
 _MESSAGES: Final = frozenset({"HeldCell", "Intent"})
+_LAYERS: Final = {
+    "LayerKind": "contract",
+    "LayerTable": "contract",
+    "build_layer": "build",
+    "canonical_layer": "spec",
+    "voxel_covariances": "covariance",
+}
 _CLIENT: Final = frozenset(
     {
         "Cell",
@@ -139,6 +155,8 @@ def __getattr__(name: str) -> Any:
         module = "shmmap.geometry"
     elif name in _MESSAGES:
         module = "shmmap.protocol.messages"
+    elif name in _LAYERS:
+        module = f"shmmap.layers.{_LAYERS[name]}"
     elif name in __all__:
         module = "shmmap.errors"
     else:

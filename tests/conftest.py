@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,18 @@ from tests.support.skips import (  # noqa: F401  hooks
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile kernels once for all tests and the processes they start, whatever their home is."""
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        cache = getattr(config, "cache", None)
+        path = (
+            cache.mkdir("kernels") if cache is not None else Path(tempfile.mkdtemp(prefix="shmmap-kernels-"))
+        )
+        os.environ["NUMBA_CACHE_DIR"] = str(path)
+        if cache is None:
+            config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

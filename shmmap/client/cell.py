@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment
-from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
 
 if TYPE_CHECKING:
     import open3d
@@ -134,6 +134,11 @@ class Cell:
     def origin(self) -> tuple[float, float, float]:
         """What coordinates are relative to, metres, map frame; (0, 0, 0) for `points`."""
         return self.header.origin
+
+    @property
+    def lattice(self) -> Lattice | None:
+        """The lattice that a computed layer's rows lie on; None where it has none."""
+        return self.header.lattice
 
     @property
     def z_bounds(self) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
 from shmmap.errors import BadRequest, UnknownCell
-from shmmap.layers.spec import LAYERS
+from shmmap.layers.registry import kinds
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
 from shmmap.statistics.writer import StatisticsWriter
@@ -65,7 +65,7 @@ class Admin:
             segment_prefix=self._store.segment_prefix,
             cells=len(catalogue),
             bounds=self._bounds(),
-            layers=LAYERS,
+            layers=tuple(kind.describe() for kind in kinds()),
             budget_bytes=self._store.books.budget_bytes,
             pid=os.getpid(),
         )

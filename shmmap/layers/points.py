@@ -7,12 +7,15 @@ import os
 from collections.abc import Callable
 from typing import Final
 
+import numpy as np
+
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd_reader import Block, PcdReader
+from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.writer import SegmentWriter
 
-__all__ = ["BUILDER_VERSION", "LAYER", "build_points"]
+__all__ = ["BUILDER_VERSION", "KIND", "LAYER", "build_points"]
 
 LAYER: Final = "points"
 BUILDER_VERSION: Final = 1  # raise it when the same source would give other bytes
@@ -114,3 +117,36 @@ def _started(
 def _append(writer: SegmentWriter, block: Block) -> None:
     for index, column in enumerate(block):
         writer.append(index, column)
+
+
+def _from_arrays(points: PointTable, parameters: Parameters) -> LayerTable:
+    """The same from arrays: points that are finite, every column."""
+    del parameters
+    finite = np.isfinite(points.xyz).all(axis=1)
+    columns = points.columns if finite.all() else {n: c[finite] for n, c in points.columns.items()}
+    z = columns["xyz"][:, 2]
+    return LayerTable(
+        columns=dict(columns),
+        rows=len(z),
+        units={**points.units, "xyz": "m"},
+        z_min=float(z.min()) if len(z) else np.nan,
+        z_max=float(z.max()) if len(z) else np.nan,
+    )
+
+
+KIND: Final = LayerKind(
+    name=LAYER,
+    builder_version=BUILDER_VERSION,
+    summary="the source itself: every field a column, the bits unchanged",
+    borders="each point is in the cell whose file has it",
+    parameters=(),
+    columns=(
+        LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates, map frame"),
+        LayerColumn("*", None, "as in the source", "", "every other field"),
+    ),
+    build=_from_arrays,
+    gives_points=True,
+    takes_layers=False,
+    needs=None,
+    bytes_ratio=1.0,
+)

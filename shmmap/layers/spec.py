@@ -1,24 +1,212 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which layers a request may name."""
+"""Layer specs: a kind's name with its parameters, in one canonical form.
+
+::
+
+    spec     = name [ "(" argument { "," argument } ")" ]
+    argument = number | name "=" number | "of" "=" spec
+
+``ndt(2)``, ``ndt( leaf = 2.0, min_points=6 )`` and ``ndt(leaf=2.0)`` are one layer; the last is its
+canonical form: parameters by name in the kind's order, defaults left out, floats as Python prints
+them.  ``of`` names the layer it is built of: ``ndt(leaf=2.0,of=voxel(leaf=0.1))``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 from shmmap.errors import BadRequest
+from shmmap.layers.contract import LayerKind, Value
+from shmmap.layers.registry import find_kind, kinds
 
-__all__ = ["LAYERS", "canonical_layer", "canonical_layers"]
+__all__ = ["MAX_SPEC_CHARACTERS", "LayerSpec", "canonical_layer", "canonical_layers", "parse_layer"]
 
-LAYERS: Final = ("points",)
+MAX_SPEC_CHARACTERS: Final = 200
+MAX_CHAIN: Final = 4
+
+_TOKEN: Final = re.compile(
+    r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign>[(),=]))"
+)
 
 
+@dataclass(frozen=True, slots=True)
+class LayerSpec:
+    """One layer: its kind, every parameter that has a value, and what it is built of (None: the source)."""
+
+    kind: LayerKind
+    values: tuple[tuple[str, Value], ...]
+    of: LayerSpec | None = None
+
+    @property
+    def parameters(self) -> dict[str, Value]:
+        """The parameters by name."""
+        return dict(self.values)
+
+    @property
+    def halo_m(self) -> float:
+        """How far beyond the cell it looks, metres; that of what it is built of included."""
+        return self.kind.halo_m(self.parameters) + (self.of.halo_m if self.of is not None else 0.0)
+
+    @property
+    def builder_versions(self) -> tuple[int, ...]:
+        """Builder versions along the chain, this layer's first."""
+        return (self.kind.builder_version, *(self.of.builder_versions if self.of is not None else ()))
+
+    @property
+    def source_columns(self) -> tuple[str, ...] | None:
+        """The source's columns that the chain reads; None for all."""
+        return self.of.source_columns if self.of is not None else self.kind.needs
+
+    def __str__(self) -> str:
+        defaults = {p.name: p.default for p in self.kind.parameters}
+        words = [f"{name}={value!r}" for name, value in self.values if value != defaults[name]]
+        if self.of is not None:
+            words.append(f"of={self.of}")
+        return f"{self.kind.name}({','.join(words)})" if words else self.kind.name
+
+
+class _Words:
+    """The tokens of a spec, one ahead."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._tokens = list(self._split())
+        self._at = 0
+
+    def _split(self) -> Iterator[tuple[str, str]]:
+        at, end = 0, len(self._text.rstrip())
+        while at < end:
+            match = _TOKEN.match(self._text, at, end)
+            if match is None:
+                raise self.refusal(f"unexpected {self._text[at:].strip()[:1]!r}")
+            kind = match.lastgroup or "sign"
+            yield kind, match.group(kind)
+            at = match.end()
+        yield "end", ""
+
+    def refusal(self, why: str) -> BadRequest:
+        return BadRequest(
+            f"layer {self._text!r}: {why}", hint="a layer is written like voxel(leaf=0.5) or points"
+        )
+
+    def peek(self) -> tuple[str, str]:
+        return self._tokens[self._at]
+
+    def take(self, kind: str, value: str | None = None) -> str | None:
+        """The next token if it is this one, else None."""
+        found, text = self._tokens[self._at]
+        if found != kind or (value is not None and text != value):
+            return None
+        self._at += 1
+        return text
+
+    def need(self, kind: str, value: str | None = None) -> str:
+        text = self.take(kind, value)
+        if text is None:
+            found = self.peek()[1]
+            raise self.refusal(
+                f"expected {value or f'a {kind}'} before {found!r}" if found else "it is cut short"
+            )
+        return text
+
+
+def parse_layer(text: str) -> LayerSpec:
+    """Read a layer spec.
+
+    Raises
+    ------
+    BadRequest
+        If the kind or a parameter is unknown (the hint lists what exists), a value out of range,
+        or the text no spec.
+    """
+    if len(text) > MAX_SPEC_CHARACTERS:
+        raise BadRequest(f"a layer spec has at most {MAX_SPEC_CHARACTERS} characters")
+    words = _Words(text)
+    spec = _spec(words, 1)
+    if words.peek()[0] != "end":
+        raise words.refusal(f"unexpected {words.peek()[1]!r} after its end")
+    if len(str(spec)) > MAX_SPEC_CHARACTERS:
+        raise BadRequest(f"a layer spec has at most {MAX_SPEC_CHARACTERS} characters")
+    return spec
+
+
+def _spec(words: _Words, depth: int) -> LayerSpec:
+    if depth > MAX_CHAIN:
+        raise words.refusal(f"more than {MAX_CHAIN} layers of one another")
+    name = words.need("name")
+    kind = find_kind(name)
+    if kind is None:
+        known = ", ".join(known.describe() for known in kinds())
+        raise BadRequest(f"unknown layer {name!r}", hint=f"layers are: {known}")
+    given: dict[str, Value] = {}
+    of: LayerSpec | None = None
+    if words.take("sign", "("):
+        while not words.take("sign", ")"):
+            if given or of is not None:
+                words.need("sign", ",")
+            number = words.take("number")
+            if number is not None:
+                if len(given) >= len(kind.parameters) or of is not None:
+                    raise BadRequest(f"{name}: too many parameters", hint=_hint(kind))
+                key, value = kind.parameters[len(given)].name, _number(number)
+            else:
+                key = words.need("name")
+                words.need("sign", "=")
+                if key == "of":
+                    if of is not None:
+                        raise BadRequest(f"{name}: of is given twice", hint=_hint(kind))
+                    of = _source(words, kind, depth)
+                    continue
+                value = _number(words.need("number"))
+            if key in given:
+                raise BadRequest(f"{name}: {key} is given twice", hint=_hint(kind))
+            given[key] = value
+    return _checked(kind, given, of if of is not None and of.kind.name != "points" else None)
+
+
+def _source(words: _Words, kind: LayerKind, depth: int) -> LayerSpec:
+    of = _spec(words, depth + 1)
+    if not kind.takes_layers:
+        raise BadRequest(f"{kind.name} is built of the source, not of another layer")
+    if not of.kind.gives_points:
+        raise BadRequest(f"{kind.name} cannot be built of {of.kind.name}, which has no points")
+    return of
+
+
+def _number(text: str) -> Value:
+    return int(text) if text.lstrip("+-").isdigit() else float(text)
+
+
+def _hint(kind: LayerKind) -> str:
+    return "; ".join(p.describe() for p in kind.parameters) or f"{kind.name} takes no parameters"
+
+
+def _checked(kind: LayerKind, given: dict[str, Value], of: LayerSpec | None) -> LayerSpec:
+    known = {p.name: p for p in kind.parameters}
+    for key in given:
+        if key not in known:
+            raise BadRequest(f"{kind.name} has no parameter {key!r}", hint=_hint(kind))
+    values: dict[str, Value] = {}
+    for parameter in kind.parameters:
+        if parameter.name in given:
+            values[parameter.name] = parameter.checked(given[parameter.name], kind.name)
+        elif parameter.required:
+            raise BadRequest(f"{kind.name} needs {parameter.name}", hint=_hint(kind))
+        elif parameter.default is not None:
+            values[parameter.name] = parameter.default
+    resolved = kind.resolve(values)
+    ordered = tuple((name, resolved[name]) for name in known if name in resolved)
+    return LayerSpec(kind, ordered, of)
+
+
+@lru_cache(maxsize=1024)  # a request's specs are a few texts, read again and again
 def canonical_layer(spec: str) -> str:
-    """Return the canonical form of a layer spec; `BadRequest` lists what exists for an unknown one."""
-    name = spec.strip()
-    if name not in LAYERS:
-        raise BadRequest(f"unknown layer {spec!r}", hint=f"layers are: {', '.join(LAYERS)}")
-    return name
+    """Return the canonical form of a layer spec; errors are those of `parse_layer`."""
+    return str(parse_layer(spec))
 
 
 def canonical_layers(specs: Sequence[str]) -> tuple[str, ...]:

@@ -12,12 +12,13 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.errors import SegmentCorrupt
@@ -26,11 +27,13 @@ __all__ = [
     "LAYOUT_VERSION",
     "Column",
     "ColumnRow",
+    "Lattice",
     "PublishBlock",
     "SegmentHeader",
     "SourceStamp",
     "pack_header",
     "pack_publish_block",
+    "plan_arrays",
     "plan_columns",
     "read_columns",
     "unpack_header",
@@ -38,7 +41,7 @@ __all__ = [
 ]
 
 MAGIC: Final = b"SHMMAP\x00\x01"
-LAYOUT_VERSION: Final = (1, 0)
+LAYOUT_VERSION: Final = (1, 1)
 BYTE_ORDER: Final = 0x01020304
 PAGE_BYTES: Final = 4096
 ALIGNMENT_BYTES: Final = 64
@@ -48,6 +51,7 @@ PUBLISH_BYTES: Final = 64
 MAX_DIMENSIONS: Final = 4
 
 FIXED: Final = struct.Struct("<8sHHIQQQQQQqq16s4d2d3dIIIIIIIIIIII")
+LATTICE: Final = struct.Struct("<3d3q3Q")  # after the fixed part; all zero: no lattice
 COLUMN: Final = struct.Struct("<40s8s16sII4QQQQ")
 TABLE: Final = struct.Struct("<III")  # column count, offset of the table, bytes of a row
 TABLE_AT: Final = FIXED.size - 11 * 4
@@ -105,6 +109,28 @@ class Column:
     checksum: int = 0
 
 
+class Lattice(NamedTuple):
+    """A global lattice and the box of it that a layer occupies.
+
+    A point lies in voxel ``floor(coordinate / leaf)`` along each axis, the same in every cell of a
+    map.  An axis that the lattice does not divide (z of a height grid) has an infinite ``leaf``,
+    ``first`` 0 and ``shape`` 1.
+
+    Attributes
+    ----------
+    leaf
+        Edge lengths along x, y, z; metres.
+    first
+        Index of the first voxel of the box along x, y, z.
+    shape
+        Voxels of the box along x, y, z; 0 where nothing is occupied.
+    """
+
+    leaf: tuple[float, float, float]
+    first: tuple[int, int, int]
+    shape: tuple[int, int, int]
+
+
 ColumnRow: TypeAlias = tuple[str, "np.dtype[np.generic]", tuple[int, ...], int, int, str, int]
 """The fields of a `Column`, in order."""
 
@@ -117,6 +143,7 @@ class SegmentHeader:
     NaN for an empty cell.  Coordinates in columns are relative to ``origin`` ((0, 0, 0) for
     `points`, which keeps the source's bits).  ``rows`` counts the points kept,
     ``source_points`` those in the file, ``dropped_points`` those left out as not finite.
+    For a computed layer ``rows`` are its own (points, voxels), and ``lattice`` is what they lie on.
     """
 
     cell_id: str
@@ -135,6 +162,7 @@ class SegmentHeader:
     source_digest: bytes = bytes(16)
     builder_version: int = 0
     frame_id: str = "map"
+    lattice: Lattice | None = None
 
 
 class PublishBlock(NamedTuple):
@@ -163,6 +191,18 @@ def plan_columns(specs: Sequence[ColumnSpec], rows: int, header_bytes: int) -> t
         nbytes = rows * spec.row_bytes
         columns.append(Column(spec.name, spec.dtype, shape, offset, nbytes, spec.unit))
         offset = _up(offset + nbytes, ALIGNMENT_BYTES)
+    return tuple(columns), offset
+
+
+def plan_arrays(
+    arrays: Mapping[str, NDArray[np.generic]], units: Mapping[str, str], header_bytes: int
+) -> tuple[tuple[Column, ...], int]:
+    """Place arrays of any shapes, as `plan_columns` does; returns them and the total bytes."""
+    columns = []
+    offset = header_bytes
+    for name, array in arrays.items():
+        columns.append(Column(name, array.dtype, array.shape, offset, array.nbytes, units.get(name, "")))
+        offset = _up(offset + array.nbytes, ALIGNMENT_BYTES)
     return tuple(columns), offset
 
 
@@ -209,6 +249,9 @@ def pack_header(header: SegmentHeader) -> bytes:
         header.source_digest, *header.box, header.z_min, header.z_max, *header.origin,
         header.builder_version, len(header.columns), COLUMNS_OFFSET, COLUMN.size, *places, 0, 0,
     )  # fmt: skip
+    if header.lattice is not None:
+        leaf, first, shape_xyz = header.lattice
+        LATTICE.pack_into(page, FIXED.size, *leaf, *first, *shape_xyz)
     end = header.header_bytes - TAIL_BYTES
     CRC.pack_into(page, end, zlib.crc32(memoryview(page)[:end]), 0)
     return bytes(page)
@@ -361,4 +404,12 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
         source_digest=digest,
         builder_version=builder_version,
         frame_id=str(page[frame_at : frame_at + frame_bytes], "utf-8"),
+        lattice=_unpack_lattice(page),
     )
+
+
+def _unpack_lattice(page: memoryview) -> Lattice | None:
+    leaf_x, leaf_y, leaf_z, i, j, k, columns, rows, levels = LATTICE.unpack_from(page, FIXED.size)
+    if leaf_x == 0.0:
+        return None
+    return Lattice((leaf_x, leaf_y, leaf_z), (i, j, k), (columns, rows, levels))

@@ -135,7 +135,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
 @pytest.mark.parametrize(
     ("document", "ends"),
     [
-        (LAYOUT, [layout.FIXED.size, layout.COLUMN.size, layout.PUBLISH.size]),
+        (LAYOUT, [layout.FIXED.size + layout.LATTICE.size, layout.COLUMN.size, layout.PUBLISH.size]),
         (
             STATISTICS,
             [statistics_layout.START.size, statistics_layout.STATE.size, statistics_layout.ROW_BYTES],

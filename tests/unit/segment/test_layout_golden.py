@@ -14,6 +14,7 @@ import pytest
 from shmmap.columns import ColumnSpec
 from shmmap.errors import SegmentCorrupt
 from shmmap.segment.layout import (
+    Lattice,
     PublishBlock,
     SegmentHeader,
     SourceStamp,
@@ -28,7 +29,7 @@ from tests.support.segment_reader import parse
 
 # offset and bytes of everything that is not zero in the header below
 GOLDEN = {
-    0: "53484d4d415000010100000004030201",  # magic, 1.0, byte order
+    0: "53484d4d415000010100010004030201",  # magic, 1.1, byte order
     16: "00100000000000008010000000000000",  # 4096 header bytes, 4224 total
     32: "02000000000000000300000000000000",  # 2 rows of 3 points
     48: "01000000000000002c01000000000000",  # 1 dropped, source of 300 bytes
@@ -54,7 +55,7 @@ GOLDEN = {
     752: "020000000000000000ffeeddccbbaa99",  # 2 bytes, checksum
     768: "2f6d2f612e706364706f696e74736d61",  # /m/a.pcd points ma
     784: "70000000000000000000000000000000",  # p
-    4016: "00000000000000009bfabd3800000000",  # CRC at 4024
+    4016: "0000000000000000b3aadf6d00000000",  # CRC at 4024
 }
 GOLDEN_PUBLISH = "5055424c49534800 0807060504030201 1817161514131211" + "00" * 32 + "aecf54c3 00000000"
 
@@ -137,7 +138,7 @@ def test_the_publish_block_is_no_part_of_the_header_s_checksum() -> None:
 
 
 def test_any_flipped_bit_of_the_header_is_noticed() -> None:
-    for at in [*range(216), *range(512, 792), *range(4024, 4028)]:
+    for at in [*range(288), *range(512, 792), *range(4024, 4028)]:
         page = bytearray(golden_page())
         page[at] ^= 0x40
         with pytest.raises(SegmentCorrupt):
@@ -239,3 +240,19 @@ def test_what_does_not_fit_is_refused(name: str, dtype: str, unit: str) -> None:
     header = SegmentHeader("a", "points", columns, 1, (0.0, 0.0, 1.0, 1.0), 4096, total)
     with pytest.raises(ValueError):
         pack_header(header)
+
+
+LATTICE_BYTES = (
+    "0000000000000040 000000000000e03f 000000000000f07f"  # leaf 2, 0.5, infinite
+    "fdffffffffffffff 0700000000000000 0000000000000000"  # first -3, 7, 0
+    "0500000000000000 0400000000000000 0100000000000000"  # 5 x 4 x 1
+)
+
+
+def test_the_lattice_s_golden_bytes() -> None:
+    header = replace(golden_header(), lattice=Lattice((2.0, 0.5, math.inf), (-3, 7, 0), (5, 4, 1)))
+    page = pack_header(header)
+    assert page[216:288] == bytes.fromhex(LATTICE_BYTES)
+    assert page[:216] == golden_page()[:216]
+    assert page[288:4024] == golden_page()[288:4024]
+    assert unpack_header(memoryview(page), 4224) == header

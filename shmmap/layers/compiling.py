@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels: compiled for given types when their module is imported, and kept on disk.
+
+Kernels live in modules of their own that only builders import, so that nothing pays for numba
+unless it builds a layer.  Every signature takes read-only arrays (writable ones fit it too; the
+reverse would compile once more, for seconds, on the first array out of shared memory).
+
+The cache is ``NUMBA_CACHE_DIR`` where that is set, else ``$XDG_CACHE_HOME/shmmap/kernels``; where it
+cannot be written, kernels are compiled in each process.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, TypeVar, cast
+
+import numba
+import numba.core.config
+
+__all__ = ["compiled", "inlined", "kernel_cache_directory", "read_only"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel_cache_directory() -> Path | None:
+    """Directory of compiled kernels, made if missing; None where none can be written."""
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        if named:
+            path = Path(named)
+        else:
+            path = (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "kernels"
+        path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        return path if os.access(path, os.W_OK | os.X_OK) else None
+    except (OSError, RuntimeError):  # RuntimeError: no home directory
+        return None
+
+
+_config: Any = numba.core.config
+_DIRECTORY: Final = kernel_cache_directory()
+
+
+def read_only(dtype: Any, dimensions: int) -> Any:
+    """Return the type of a C-contiguous array that is not written to."""
+    return numba.types.Array(dtype, dimensions, "C", readonly=True)
+
+
+def compiled(*signatures: Any) -> Callable[[F], F]:
+    """Compile a kernel for these signatures now; it runs without the interpreter lock."""
+
+    def compile_now(function: F) -> F:
+        before = _config.CACHE_DIR
+        try:
+            # numba chooses a function's cache when it is decorated, by this process-wide setting
+            _config.CACHE_DIR = str(_DIRECTORY) if _DIRECTORY is not None else before
+            dispatcher = numba.njit(
+                list(signatures), nogil=True, cache=_DIRECTORY is not None, error_model="numpy"
+            )(function)
+        finally:
+            _config.CACHE_DIR = before
+        return cast("F", dispatcher)
+
+    return compile_now
+
+
+def inlined(function: F) -> F:
+    """Make a function callable from kernels; compiled with whoever calls it."""
+    return cast("F", numba.njit(nogil=True, inline="always", error_model="numpy")(function))

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which kinds of layers exist: shmmap's own, and those that other packages offer.
+
+Another package offers a kind by an entry point of the group ``shmmap.layers`` whose object is a
+`LayerKind`::
+
+    [project.entry-points."shmmap.layers"]
+    roughness = "my_package.roughness:KIND"
+"""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+from importlib.metadata import entry_points
+from typing import Final
+
+from shmmap.layers import ndt, points, voxel
+from shmmap.layers.contract import LayerKind
+
+__all__ = ["find_kind", "kinds", "register"]
+
+_log = logging.getLogger(__name__)
+
+GROUP: Final = "shmmap.layers"
+
+_own: Final[dict[str, LayerKind]] = {kind.name: kind for kind in (points.KIND, voxel.KIND, ndt.KIND)}
+_registered: Final[dict[str, LayerKind]] = {}
+
+
+def register(kind: LayerKind) -> None:
+    """Make a kind known to this process; an entry point makes it known to all of them.
+
+    Raises
+    ------
+    ValueError
+        If another kind has its name.
+    """
+    if (find_kind(kind.name) or kind) is not kind or not kind.name.isidentifier() or not kind.name.isascii():
+        raise ValueError(f"a layer kind cannot be called {kind.name!r}")
+    _registered[kind.name] = kind
+
+
+@lru_cache(maxsize=1)
+def _offered() -> dict[str, LayerKind]:
+    """Kinds of other packages; one that cannot be loaded is left out and logged."""
+    found: dict[str, LayerKind] = {}
+    for entry in entry_points(group=GROUP):
+        try:
+            kind = entry.load()
+        except Exception as error:  # noqa: BLE001  somebody else's module: anything may happen in it
+            _log.error("layer kind %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
+            continue
+        if not isinstance(kind, LayerKind) or kind.name != entry.name or kind.name in _own:
+            _log.error("%s offers no layer kind called %s", entry.value, entry.name)
+            continue
+        found[kind.name] = kind
+    return found
+
+
+def find_kind(name: str) -> LayerKind | None:
+    """Return the kind of that name; other packages are looked at only for names that are not ours."""
+    return _own.get(name) or _registered.get(name) or _offered().get(name)
+
+
+def kinds() -> tuple[LayerKind, ...]:
+    """Return every kind there is: our own first."""
+    return (*_own.values(), *_registered.values(), *_offered().values())
