@@ -11,6 +11,7 @@ from typing import Any, Final, NoReturn
 
 from shmmap.cli import (
     clients,
+    config,
     demo,
     evict,
     export,
@@ -24,6 +25,7 @@ from shmmap.cli import (
     show,
     status,
     stop,
+    unit,
     unpin,
     version,
 )
@@ -45,6 +47,8 @@ VERBS: Final = (
     pin,
     unpin,
     stop,
+    config,
+    unit,
     health,
     version,
 )

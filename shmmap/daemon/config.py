@@ -7,12 +7,11 @@ import difflib
 import math
 import os
 import re
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from shmmap.daemon.settings_file import read_settings_file
 from shmmap.errors import ConfigError
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
@@ -24,12 +23,7 @@ from shmmap.protocol.endpoint import (
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import check_instance
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-__all__ = ["DaemonConfig", "load_config", "parse_bytes"]
+__all__ = ["DaemonConfig", "Setting", "load_config", "parse_bytes", "trace_settings"]
 
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 LARGEST_BYTES: Final = 1 << 62
@@ -180,16 +174,6 @@ def _unknown(name: str, origin: str) -> ConfigError:
     )
 
 
-def _from_file(path: str) -> dict[str, Any]:
-    try:
-        settings: dict[str, Any] = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}", origin=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}", origin=path) from error
-    return settings
-
-
 def load_config(
     flags: Mapping[str, Any], *, file: str = "", environ: Mapping[str, str] = os.environ
 ) -> DaemonConfig:
@@ -210,22 +194,34 @@ def load_config(
     ConfigError
         An unknown key (with a suggestion), a wrong type or an impossible value, and where it is set.
     """
-    known = {field.name for field in fields(DaemonConfig)}
-    variables = {
-        name: value
+    found = trace_settings(flags, file=file, environ=environ)
+    return DaemonConfig(**{name: setting.value for name, setting in found.items()})
+
+
+class Setting(NamedTuple):
+    """A setting's value and where it comes from: ``FILE:LINE``, a variable, the flags, the default."""
+
+    value: Any
+    origin: str
+
+
+def trace_settings(
+    flags: Mapping[str, Any], *, file: str = "", environ: Mapping[str, str] = os.environ
+) -> dict[str, Setting]:
+    """Return every setting with its origin; parameters and errors are those of `load_config`."""
+    given: list[tuple[str, Any, str]] = []  # later ones override earlier ones
+    if file:
+        given += [(name, value, origin) for name, (value, origin) in read_settings_file(file).items()]
+    given += [
+        (name.removeprefix(_ENVIRONMENT).lower(), value, name)
         for name, value in environ.items()
         if name.startswith(_ENVIRONMENT) and not name.startswith(_NOT_SETTINGS)
-    }
-    origins: list[tuple[str, dict[str, Any]]] = [
-        (file, _from_file(file) if file else {}),
-        *((name, {name.removeprefix(_ENVIRONMENT).lower(): value}) for name, value in variables.items()),
-        ("command line", {name: value for name, value in flags.items() if value is not None}),
     ]
-    settings: dict[str, Any] = {}
-    for origin, values in origins:
-        for given, value in values.items():
-            name = "budget_bytes" if given == "budget" else given
-            if name not in known:
-                raise _unknown(given, origin)
-            settings[name] = _convert(name, value, origin)
-    return DaemonConfig(**settings)
+    given += [(name, value, "command line") for name, value in flags.items() if value is not None]
+    settings = {field.name: Setting(field.default, "default") for field in fields(DaemonConfig)}
+    for word, value, origin in given:
+        name = "budget_bytes" if word == "budget" else word
+        if name not in settings:
+            raise _unknown(word, origin)
+        settings[name] = Setting(_convert(name, value, origin), origin)
+    return settings

@@ -105,7 +105,7 @@ def test_a_wrong_line_of_the_file_is_named(tmp_path: Path) -> None:
     file.write_text("workers = 'x'\n")
     with pytest.raises(ConfigError) as failure:
         load(file=str(file))
-    assert failure.value.origin == str(file)
+    assert failure.value.origin == f"{file}:1"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap unit``: run the daemon as a systemd service."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_verb
+from shmmap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from shmmap.service.installation import PlannedFile
+
+__all__ = ["add_parser", "run_install", "run_print"]
+
+_INSTALL = """\
+Writes units, the account `shmmap`, directories and /etc/shmmap/shmmap.toml, and starts nothing.  Units
+are replaced (changes belong in drop-ins: `systemctl edit shmmapd`), a configuration that exists is kept.
+Exit code: 0, 66 no map there, 78 a file cannot be written."""
+
+_PRINT = """\
+FILE is a unit as it would be installed, or another file that comes with this package, such as
+drop-ins/maps-in-home.conf, system/run-shmmap_huge.mount or README.md (the operator's guide)."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "unit",
+        run_print,
+        help="install or show the systemd units",
+        description="Run the daemon as a systemd service, of the machine or of a user.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    install = add_verb(
+        actions,
+        "install",
+        run_install,
+        help="install the service",
+        description="Install this daemon as a service.",
+        epilog=_INSTALL,
+    )
+    install.add_argument("--map", metavar="DIR", default="", help="the map to serve")
+    install.add_argument("--dry-run", action="store_true", help="only say what would be written")
+    install.add_argument("--root", metavar="DIR", default="/", help="install below DIR, for an image")
+    show = add_verb(
+        actions,
+        "print",
+        run_print,
+        help="show a unit",
+        description="Print a unit, or another file that belongs to the service.",
+        epilog=_PRINT,
+    )
+    show.add_argument("name", metavar="FILE", nargs="?", default="", help="default: shmmapd.service")
+    show.add_argument("--list", action="store_true", help="list what there is to print")
+    for one in (install, show):
+        one.add_argument("--user", action="store_true", help="the units of a user's own daemon")
+
+
+def run_print(args: argparse.Namespace) -> int:
+    """Print a unit."""
+    from shmmap.service.installation import unit_text
+    from shmmap.service.shipped_files import shipped_names
+
+    if args.list:
+        print("\n".join(shipped_names()))
+        return 0
+    name = args.name or "shmmapd.service"
+    if "/" not in name and name not in shipped_names():
+        name = f"{'user' if args.user else 'system'}/{name}"
+    print(unit_text(name), end="")
+    return 0
+
+
+def run_install(args: argparse.Namespace) -> int:
+    """Write what a service needs."""
+    from shmmap.service.installation import plan_system, plan_user, write
+
+    planned = plan_user(args.map) if args.user else plan_system(args.map, args.root)
+    width = max(len(one.action) for one in planned)
+    for one in planned:
+        print(f"{one.action.ljust(width)}  {one.path}")
+    if args.map and planned[-1].action == "kept":
+        print(f"note: {planned[-1].path} is kept: set map_path there")
+    if args.dry_run:
+        return 0
+    write(planned)
+    if (args.user or args.root == "/") and os.path.isdir("/run/systemd/system"):
+        _let_systemd_know(args.user, planned)
+    if args.user:
+        print("next: systemctl --user enable --now shmmapd && loginctl enable-linger")
+    else:
+        print("next: systemctl enable --now shmmapd; usermod -aG shmmap USER for who may connect")
+    return 0
+
+
+def _let_systemd_know(user: bool, planned: Sequence[PlannedFile]) -> None:
+    """Make the account and the directories, and let the manager read its units again."""
+    import subprocess
+
+    of_directory = {one.path.parent.name: str(one.path) for one in planned}
+    commands = [
+        ["systemd-sysusers", of_directory["sysusers.d"]],
+        ["systemd-tmpfiles", "--create", of_directory["tmpfiles.d"]],
+        ["systemctl", "daemon-reload"],
+    ]
+    if user:
+        commands = [["systemctl", "--user", "daemon-reload"]]
+    for command in commands:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise ConfigError(f"`{' '.join(command)}` failed: {done.stderr.strip()}")

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What installing the service writes: planned first, so that it can be shown, then done.
+
+Units are replaced (an operator's changes belong in drop-ins), a configuration that exists is kept.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from shmmap.errors import ConfigError, MapMissing
+from shmmap.service.program import daemon_command, hidden_directories, is_hidden, quoted
+from shmmap.service.shipped_files import shipped_names, shipped_text
+
+__all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_text", "write"]
+
+SHIPPED_PROGRAM = "/usr/bin/shmmapd"
+_GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFile:
+    """One file of an installation.
+
+    Attributes
+    ----------
+    path, text
+        Where it goes and what is in it.
+    keep
+        An existing one stays as it is.
+    """
+
+    path: Path
+    text: str
+    keep: bool = False
+
+    @property
+    def action(self) -> Literal["new", "changed", "same", "kept"]:
+        """What writing it means for the file that is there."""
+        try:
+            old = self.path.read_text(encoding="utf-8")
+        except (FileNotFoundError, NotADirectoryError):
+            return "new"
+        if self.keep:
+            return "kept"
+        return "same" if old == self.text else "changed"
+
+
+def unit_text(name: str) -> str:
+    """Return a shipped unit with the program of this installation in it."""
+    return shipped_text(name).replace(SHIPPED_PROGRAM, daemon_command())
+
+
+def configuration(map_path: str = "", *, group: bool = True) -> str:
+    """Return the example configuration, with this map and with or without the service's group."""
+    text = shipped_text("shmmap.toml")
+    if map_path:
+        # what JSON quotes is quoted the same way in TOML
+        text = re.sub(r"^map_path = .*$", lambda _: f"map_path = {json.dumps(map_path)}", text, flags=re.M)
+    return text if group else re.sub(r"^group = .*$", '#group = ""', text, flags=re.M)
+
+
+def _map_path(given: str) -> str:
+    path = os.path.abspath(given) if given else ""
+    if path and not os.path.exists(path):
+        raise MapMissing(f"there is no map at {path}")
+    return path
+
+
+def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFile]:
+    """A drop-in that shows directories to the daemon.
+
+    One that is needed no more is emptied of settings, for nothing is deleted here.
+    """
+    if not directories and not path.exists():
+        return []
+    lines = "".join(f"BindReadOnlyPaths={quoted(place)}\n" for place in directories)
+    return [PlannedFile(path, f"{_GENERATED}# {why}\n[Service]\n{lines}")]
+
+
+def plan_system(map_path: str = "", root: str = "/") -> list[PlannedFile]:
+    """Return what a service for the whole machine needs.
+
+    Parameters
+    ----------
+    map_path
+        The map of the plain service; empty: what the example says.
+    root
+        Where the machine's file system begins: another directory than ``/`` for a package or an image.
+
+    Raises
+    ------
+    MapMissing
+        There is nothing at ``map_path``.
+    """
+    map_path = _map_path(map_path)
+    etc = Path(root) / "etc"
+    units = etc / "systemd" / "system"
+    planned = [
+        PlannedFile(units / Path(name).name, unit_text(name))
+        for name in shipped_names()
+        if name.startswith("system/") and not name.endswith(".mount")
+    ]
+    why = "This Python lies where ProtectHome= or PrivateTmp= would hide it."
+    for service in ("shmmapd.service", "shmmapd@.service"):
+        planned += _drop_in(units / f"{service}.d" / "10-program.conf", hidden_directories(), why)
+    if map_path:
+        shown = [map_path] if is_hidden(map_path) else []
+        why = "The map lies where ProtectHome= or PrivateTmp= would hide it."
+        planned += _drop_in(units / "shmmapd.service.d" / "20-map.conf", shown, why)
+    for name in ("sysusers.d/shmmap.conf", "tmpfiles.d/shmmap.conf"):
+        planned.append(PlannedFile(etc / name, shipped_text(name)))
+    return [*planned, PlannedFile(etc / "shmmap" / "shmmap.toml", configuration(map_path), keep=True)]
+
+
+def plan_user(map_path: str = "", config_home: str = "") -> list[PlannedFile]:
+    """Return what a user's own service needs; parameters and errors as for `plan_system`."""
+    map_path = _map_path(map_path)
+    home = Path(config_home or os.environ.get("XDG_CONFIG_HOME", "") or Path.home() / ".config")
+    return [
+        *(
+            PlannedFile(home / "systemd" / name, unit_text(name))
+            for name in shipped_names()
+            if name.startswith("user/")
+        ),
+        PlannedFile(home / "shmmap" / "shmmap.toml", configuration(map_path, group=False), keep=True),
+    ]
+
+
+def write(planned: Sequence[PlannedFile]) -> None:
+    """Write the files that are new or changed, each in one step.
+
+    Raises
+    ------
+    ConfigError
+        A file cannot be written.
+    """
+    for one in planned:
+        if one.action not in ("new", "changed"):
+            continue
+        interim = one.path.with_name(f".{one.path.name}.new")
+        try:
+            one.path.parent.mkdir(parents=True, exist_ok=True)
+            interim.write_text(one.text, encoding="utf-8")
+            interim.chmod(0o644)
+            interim.replace(one.path)
+        except OSError as error:
+            raise ConfigError(
+                f"cannot write {one.path}: {error.strerror}", hint="run it with sudo, or with --user"
+            ) from error

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`shmmap config`: mistakes, origins, and a file to start with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from shmmap.cli.entry import main
+
+
+@pytest.fixture(autouse=True)
+def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    for name in ("SHMMAP_BUDGET", "SHMMAP_MAP_PATH"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "shmmap.toml"
+    assert main(["config", "init", str(file), "--map", str(tmp_path)]) == 0
+    assert main(["config", "check", str(file)]) == 0
+    assert capsys.readouterr().out.endswith(f"{file}: good\n")
+    assert main(["config", "check", "--json", str(file)]) == 0
+    assert json.loads(capsys.readouterr().out) == {"file": str(file), "good": True}
+    assert main(["config", "init", str(file)]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main(["config", "init", str(tmp_path / "none" / "x.toml")]) == 78
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "says"),
+    [
+        ("bugdet = 3\nmap_path = '/'", 78, "did you mean 'budget"),
+        ("map_path = '/'\nworkers = 'many'", 78, ":2: workers must be"),
+        ("map_path = '/no/map'", 66, "there is no map at /no/map"),
+        ("workers = 1", 78, "no map is named"),
+        ("map_path = '/'\ngroup = 'no such group'", 78, "there is no group"),
+        ("map_path = ", 78, "Invalid value"),
+    ],
+)
+def test_mistakes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, code: int, says: str
+) -> None:
+    file = tmp_path / "shmmap.toml"
+    file.write_text(text)
+    assert main(["config", "check", str(file)]) == code
+    assert says in capsys.readouterr().err
+
+
+def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "config" / "shmmap" / "shmmap.toml"
+    file.parent.mkdir(parents=True)
+    file.write_text("# mine\nmap_path = '/maps/\"new\"'\n")
+    monkeypatch.setenv("SHMMAP_BUDGET", "1M")
+    assert main(["config", "show"]) == 0  # the installed one
+    plain = capsys.readouterr().out.splitlines()
+    assert 'map_path = "/maps/\\"new\\""' in plain
+    assert "strict = false" in plain
+    assert main(["config", "show", "--origin", str(file)]) == 0
+    origins = dict(line.split("  # ") for line in capsys.readouterr().out.splitlines())
+    traced = {name.split(" = ")[0]: origin for name, origin in origins.items()}
+    assert (traced["map_path"], traced["budget_bytes"], traced["strict"]) == (
+        f"{file}:2",
+        "SHMMAP_BUDGET",
+        "default",
+    )
+    assert main(["config", "show", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["file"] == str(file)
+    assert found["settings"]["budget_bytes"] == {"value": 1 << 20, "origin": "SHMMAP_BUDGET"}
