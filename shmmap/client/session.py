@@ -21,6 +21,7 @@ from shmmap.client.connection import Connection
 from shmmap.errors import BadRequest, NoAnswer
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
+from shmmap.segment.crash_steps import step
 
 __all__ = ["Session"]
 
@@ -146,6 +147,7 @@ class Session:
             reply = connection.ask(message, messages.Cells, timeout_s=timeout_s, quiet_s=quiet_s)
             self.map_version = reply.map_version
             self.welcome = connection.welcome
+            step("client.answer")
             answer = Answer(lambda handle: self._attach(handle, connection, populate), self.whole_id)
             answer.take(reply, range(len(reply.cells)))
             for _ in range(_STALE_ROUNDS):

@@ -24,6 +24,7 @@ from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.store import Store
 from shmmap.errors import SegmentCorrupt
 from shmmap.layers.points import BUILDER_VERSION, LAYER
+from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import PublishBlock, SegmentHeader
 from shmmap.segment.names import is_zombie, segment_prefix, statistics_name, zombie_name
@@ -103,6 +104,7 @@ class Leftovers:
                     dropped += 1
             finally:
                 os.close(fd)
+        step("daemon.adopted")
         if adopted or zombies or dropped:
             _log.info(
                 "of an earlier daemon: %d segments taken over, %d still in use, %d dropped",
@@ -150,6 +152,7 @@ class Leftovers:
     # --- acting -------------------------------------------------------------------------------
 
     def _adopt(self, fd: int, name: str, found: _Found, now_s: float) -> None:
+        step("daemon.adopt")
         assert found.header is not None  # noqa: S101  _look gives a reason where there is none
         if self._gid >= 0:
             os.fchown(fd, -1, self._gid)

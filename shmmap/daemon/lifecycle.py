@@ -67,6 +67,7 @@ from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
+from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import segment_prefix
 from shmmap.segment.pins import prepare_process
@@ -128,6 +129,7 @@ def _run(config: DaemonConfig, manager: ServiceManager) -> int:
             shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
             stack.callback(shm_lock.release)
             stack.callback(ignore_signals)  # without the locks no name is ours to take away
+            step("daemon.lock")
             stack.push(partial(_stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()
         catalogue = origin.load()
@@ -295,6 +297,7 @@ class _Life:
                 if activated is not None:
                     socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
                 self._bind(socket)
+                step("daemon.bind")
                 self._store.loads.pool.start_one()
                 _log.info(
                     "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",

@@ -19,6 +19,7 @@ from shmmap.daemon import jobs
 from shmmap.daemon.reclaim import Outcome, Reclaimer
 from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident
 from shmmap.daemon.workers import Worker, WorkerPool
+from shmmap.segment.crash_steps import step
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -170,6 +171,7 @@ class Loading:
             self.pool.failed_starts = 0
             return True
         if isinstance(message, jobs.Segment):
+            step("daemon.received")
             if worker.segment_fd >= 0:
                 os.close(worker.segment_fd)
             worker.segment_fd = fd

@@ -29,6 +29,7 @@ from shmmap.errors import BadRequest, InternalError, NoSession, ProtocolMismatch
 from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
+from shmmap.segment.crash_steps import step
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Server"]
@@ -311,9 +312,11 @@ class Server:
         self._send_to(session.identity, reply)
 
     def _send_to(self, identity: bytes, reply: bytes) -> None:
+        step("daemon.reply")
         try:
             self._socket.send(identity, zmq.SNDMORE | zmq.NOBLOCK)
             self._socket.send(reply, zmq.NOBLOCK)
+            step("daemon.replied")
         except zmq.ZMQError as error:
             _log.warning("a reply was dropped: %s", error)
             return

@@ -27,6 +27,7 @@ from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
 from shmmap.origin.stamp import Stamp
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
+from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
@@ -228,6 +229,7 @@ class Store:
         old = self.books.loaded(load, resident)
         if old is not None:
             self.reclaimer.superseded(old, now_s)
+        step("daemon.catalogue")
         self._enter(resident, index)
         self._statistics.add("loads_finished")
         self._statistics.add("bytes_loaded", nbytes)
@@ -248,6 +250,7 @@ class Store:
         index = self.index_of(load.key.cell_id)
         if index is None or self.books.resident_named(resident.name) is not resident:
             return False
+        step("daemon.accept")
         self.books.checked(load, resident)
         self._enter(resident, index)
         return True

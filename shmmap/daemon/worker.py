@@ -21,6 +21,7 @@ from typing import Final
 from shmmap.daemon import jobs
 from shmmap.errors import MapDataError, SegmentCorrupt
 from shmmap.layers.points import build_points
+from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.verify import verify_file
@@ -90,6 +91,7 @@ class _Worker:
         try:
             fd = self._directory.create()
             try:
+                step("worker.alloc")
                 header = build_points(
                     job.path,
                     fd,
@@ -110,10 +112,13 @@ class _Worker:
                     time.monotonic_ns() - started_ns,
                     tuple(warning[:500] for warning in warnings[:20]),
                 )
+                step("worker.pass")
                 self._send(jobs.Segment(), fd)
+                step("worker.passed")
             finally:
                 os.close(fd)
             self._send(done)
+            step("worker.done")
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except MapDataError as error:
@@ -132,6 +137,7 @@ class _Worker:
             else:
                 fd = self._directory.open(job.segment)
                 try:
+                    step("worker.check")
                     verify_file(fd)
                 finally:
                     os.close(fd)

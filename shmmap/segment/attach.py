@@ -20,6 +20,7 @@ import posix_ipc
 from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.layout import (
     PAGE_BYTES,
@@ -204,8 +205,10 @@ def attach(
     except OSError as error:
         raise SegmentError(f"segment {name}: {error.strerror}") from error
     try:
+        step("client.open")
         if slot is not None:
             lock_slot(fd, slot)
+        step("client.lock")
         available = os.fstat(fd).st_size
         end = offset + nbytes if nbytes else available
         if end > available or end == 0:
@@ -218,6 +221,7 @@ def attach(
             page = os.pread(fd, header_bytes, offset)
         _, columns = read_columns(memoryview(page), size)
         mapping = _Mapping(fd, end, populate, on_unmap)
+        step("client.map")
     except OSError as error:
         raise SegmentError(f"segment {name} cannot be read: {error.strerror}") from error
     finally:

@@ -12,6 +12,7 @@ import errno
 import os
 
 from shmmap.errors import ConfigError
+from shmmap.segment.crash_steps import step
 from shmmap.segment.layout import PublishBlock, pack_publish_block
 
 __all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
@@ -70,13 +71,16 @@ class ShmDirectory:
         The name appears only when everything else is done, so whoever can open the segment sees
         it whole.
         """
+        step("daemon.stamp")
         os.pwrite(fd, pack_publish_block(block), header_bytes - 64)
         if gid >= 0:
             os.fchown(fd, -1, gid)
         os.fchmod(fd, mode)
         nbytes = measured_bytes(fd)
         os.ftruncate(fd, nbytes)  # whole pages: a handle's bytes are what can be mapped
+        step("daemon.link")
         self.link(fd, name)
+        step("daemon.linked")
         return nbytes
 
     def link(self, fd: int, name: str) -> None:
@@ -98,18 +102,22 @@ class ShmDirectory:
 
     def rename(self, old: str, new: str) -> bool:
         """Rename a segment; False if it is gone."""
+        step("daemon.rename")
         try:
             os.rename(old.lstrip("/"), new.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
         except FileNotFoundError:
             return False
+        step("daemon.renamed")
         return True
 
     def unlink(self, name: str) -> bool:
         """Remove a name; False if it is gone already."""
+        step("daemon.unlink")
         try:
             os.unlink(name.lstrip("/"), dir_fd=self._fd)
         except FileNotFoundError:
             return False
+        step("daemon.unlinked")
         return True
 
     def names(self, prefix: str) -> list[str]:

@@ -18,6 +18,8 @@ import signal
 import struct
 from typing import Final
 
+from shmmap.segment.crash_steps import step
+
 __all__ = ["MAX_SLOT", "holders", "is_pinned", "leases_work", "lock_slot", "prepare_process"]
 
 MAX_SLOT: Final = (1 << 62) - 1
@@ -46,6 +48,7 @@ def is_pinned(fd: int) -> bool:
         fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
     except BlockingIOError:
         return True
+    step("daemon.probe")
     fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     return False
 

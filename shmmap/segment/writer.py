@@ -17,6 +17,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
+from shmmap.segment.crash_steps import step
 from shmmap.segment.layout import Column, SegmentHeader, SourceStamp, header_size, pack_header, plan_columns
 
 __all__ = ["SegmentWriter", "write_all"]
@@ -85,6 +86,7 @@ class SegmentWriter:
 
     def append(self, column: int, rows: NDArray[np.generic]) -> None:
         """Append a C-contiguous block of rows to column number ``column``."""
+        step("worker.write")
         data = rows.data.cast("B") if rows.size else memoryview(b"")
         self._hashes[column].update(data)
         write_all(self._fd, data, self._at[column])
@@ -128,5 +130,6 @@ class SegmentWriter:
             dropped_points=dropped_points,
             builder_version=builder_version,
         )
+        step("worker.header")
         write_all(self._fd, memoryview(pack_header(header)), 0)
         return header

@@ -110,7 +110,7 @@ class DaemonProcess:
         for name in ("tmp", "cache"):
             os.mkdir(f"{self._private}/{name}")
         self._mark = secrets.token_hex(8)
-        self._environment = {
+        self.environment = {
             **{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")},
             "TMPDIR": f"{self._private}/tmp",
             "XDG_CACHE_HOME": f"{self._private}/cache",
@@ -139,7 +139,7 @@ class DaemonProcess:
 
     def spawn(self, *, arguments: Sequence[str] | None = None, notify: str = "") -> subprocess.Popen[bytes]:
         """Start the process without waiting for it to be ready."""
-        environment = dict(self._environment)
+        environment = dict(self.environment)
         environment.pop("NOTIFY_SOCKET", None)
         if notify:
             environment["NOTIFY_SOCKET"] = notify

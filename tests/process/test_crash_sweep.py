@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SIGKILL at every labelled step of daemon, worker and client: no leak, no wrong byte, no lost request."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.errors import LoadFailed
+from shmmap.segment.crash_steps import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.divided_map import DividedMap, random_points
+from tests.support.mapping_process import MappingProcess
+from tests.support.patience import Patience
+
+STEPS_AT_START = (
+    "daemon.lock",
+    "daemon.adopt",
+    "daemon.adopted",
+    "daemon.bind",
+    "daemon.accept",
+    "worker.check",
+)
+CRASH = "SHMMAP_TEST_CRASH"
+
+
+class Keeper:
+    """Starts the daemon again when it was killed, as a service manager does; it then lives on."""
+
+    def __init__(self, one: DaemonProcess) -> None:
+        self.one = one
+        self.restarts = 0
+        self._ours, self._theirs = os.pipe()
+        self._thread = threading.Thread(target=self._watch)
+
+    def __enter__(self) -> Keeper:
+        self.start()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._theirs)
+        self._thread.join()
+        os.close(self._ours)
+
+    def start(self) -> None:
+        """Start it, a second time if it did not come to serving."""
+        try:
+            self.one.start()
+        except AssertionError:
+            assert self.one.process is not None
+            assert self.one.process.returncode == -9, self.one.log
+            self._again()
+
+    def _again(self) -> None:
+        self.restarts += 1
+        self.one.environment.pop(CRASH)
+        self.one.start()
+
+    def _watch(self) -> None:
+        import select
+
+        pidfd = os.pidfd_open(self.one.pid)
+        try:
+            ready, _, _ = select.select([pidfd, self._ours], [], [])
+        finally:
+            os.close(pidfd)
+        if pidfd in ready:
+            assert self.one.process is not None
+            assert self.one.process.wait() == -9, self.one.log
+            self._again()
+
+
+@pytest.fixture
+def crashing(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, private_tmpfs: Callable[[str], str]
+) -> Iterator[Callable[[str], DaemonProcess]]:
+    """Make a daemon that is to die at a step, not started; at the end no memory may be without a name."""
+    made: list[DaemonProcess] = []
+
+    def make(label: str) -> DaemonProcess:
+        shm_dir = private_tmpfs("64m") if os.geteuid() == 0 else None
+        one: DaemonProcess = daemon(divided_map.root, "--workers", "1", start=False, shm_dir=shm_dir)
+        if label in STEPS_AT_START:
+            one.start()
+            with shmmap.connect(one.endpoint) as client:
+                client.around(0, 0, 60).raise_for_failures()
+            one.kill()
+        one.environment[CRASH] = f"{label}:1:{tmp_path}/reached"
+        made.append(one)
+        return one
+
+    yield make
+    assert (tmp_path / "reached").exists(), "the step was never reached"
+    if os.geteuid() == 0:
+        (one,) = made
+        state = os.statvfs(one.shm_dir)
+        named = sum(os.stat(f"{one.shm_dir}/{name}").st_blocks * 512 for name in os.listdir(one.shm_dir))
+        assert (state.f_blocks - state.f_bfree) * state.f_frsize == named
+
+
+def assert_right(cells: shmmap.CellSet, made: DividedMap, wanted: list[str]) -> None:
+    """All of them are there, each with exactly its file's bytes."""
+    assert sorted(cell.id.rsplit("/", 1)[1] for cell in cells) == wanted
+    for cell in cells:
+        expected = made.points(cell.id.rsplit("/", 1)[1])
+        assert cell.xyz[:, 0].tobytes() == expected["x"].tobytes()
+        assert cell["intensity"].tobytes() == expected["intensity"].tobytes()
+
+
+def whole(client: shmmap.Client, x: float, y: float, radius: float) -> shmmap.CellSet:
+    """Ask until every cell is there: one that a loader died of is retried."""
+    found = client.around(x, y, radius, wait=30.0)
+    waiting = Patience()
+    while waiting(not found.complete):
+        assert all(isinstance(failure, LoadFailed) for failure in found.failed), found
+        found = client.around(x, y, radius, wait=30.0)
+    return found
+
+
+def live(client: shmmap.Client, made: DividedMap) -> None:
+    """Come by every step: load, hand out, retire while held, revive, free, change, reload."""
+    near, far = made.in_circle(0, 0, 5), made.in_circle(40, 40, 5)
+    held = whole(client, 0, 0, 5)
+    assert_right(held, made, near)
+    client.evict()  # retired, but held
+    assert_right(whole(client, 0, 0, 5), made, near)
+    assert_right(whole(client, 40, 40, 5), made, far)
+    client.evict()  # retired, and the far ones freed
+    made.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(8), (0, 0), 321))
+    client.reload()
+    assert_right(whole(client, 0, 0, 5), made, near)
+
+
+@pytest.mark.parametrize("label", [*DAEMON_STEPS, *WORKER_STEPS])
+def test_daemon_and_worker(
+    crashing: Callable[[str], DaemonProcess], divided_map: DividedMap, label: str
+) -> None:
+    one = crashing(label)
+    paths = [f"{one.shm_dir}/{name}" for name in one.segments()[:3]]
+    with MappingProcess(paths) as reader:
+        before = reader.checksums()
+        with (
+            Keeper(one) as keeper,
+            shmmap.connect(one.endpoint, timeout=60.0, connect_timeout=30.0) as client,
+        ):
+            live(client, divided_map)
+            assert reader.checksums() == before
+        assert keeper.restarts == label.startswith("daemon.")
+    with shmmap.connect(one.endpoint) as client:
+        assert_right(whole(client, 0, 0, 500), divided_map, sorted(divided_map.corners))
+        waiting = Patience()
+        while waiting(not _books_agree(one, client)):
+            pass
+        client.evict()
+        waiting = Patience()
+        while waiting(bool(one.segments())):
+            client.stats()
+
+
+def _books_agree(one: DaemonProcess, client: shmmap.Client) -> bool:
+    counters = client.stats().counters
+    return counters["bytes_resident"] + counters["bytes_zombie"] == one.segment_bytes()
+
+
+CLIENT = """
+import sys
+import shmmap
+client = shmmap.connect(sys.argv[1])
+held = client.around(0, 0, 30, wait=30.0).raise_for_failures()
+"""
+
+
+@pytest.mark.parametrize("label", CLIENT_STEPS)
+@pytest.mark.parametrize("number", [1, 3])
+def test_client(daemon: DaemonFactory, divided_map: DividedMap, label: str, number: int) -> None:
+    """What it had is free as soon as it is dead; another client notices nothing."""
+    if label == "client.answer":
+        number = 1
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as other:
+        near = divided_map.in_circle(0, 0, 30)
+        held = whole(other, 0, 0, 5)
+        done = subprocess.run(
+            [sys.executable, "-c", CLIENT, one.endpoint],
+            env={**os.environ, CRASH: f"{label}:{number}"},
+            cwd=ROOT,
+        )
+        assert done.returncode == -9
+        assert other.evict().pinned == len(held)
+        waiting = Patience()
+        while waiting(len(one.segments()) > len(held)):
+            other.stats()
+        assert_right(whole(other, 0, 0, 30), divided_map, near)
+        waiting = Patience()
+        while waiting(len(other.stats().sessions) > 1):
+            pass
