@@ -58,6 +58,7 @@ if TYPE_CHECKING:
         StaleSocket,
         UnknownCell,
     )
+    from shmmap.formats.cloud import read_cloud
     from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
     from shmmap.layers.build import build_layer
     from shmmap.layers.contract import LayerKind, LayerTable
@@ -117,6 +118,7 @@ __all__ = [
     "build_layer",
     "canonical_layer",
     "connect",
+    "read_cloud",
     "voxel_covariances",
 ]
 
@@ -157,6 +159,8 @@ def __getattr__(name: str) -> Any:
         module = "shmmap.protocol.messages"
     elif name in _LAYERS:
         module = f"shmmap.layers.{_LAYERS[name]}"
+    elif name == "read_cloud":
+        module = "shmmap.formats.cloud"
     elif name in __all__:
         module = "shmmap.errors"
     else:

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the programs' command lines share: verbs, how errors are answered, numbers in lists."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NoReturn, Protocol
+
+from shmmap import InternalError, ShmmapError
+
+__all__ = ["Verb", "numbers", "print_json", "run_program"]
+
+_EXIT_INTERRUPTED: Final = 130
+_EXIT_BROKEN_PIPE: Final = 141
+_NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*")
+
+
+class Verb(Protocol):
+    """A module with one verb of a program."""
+
+    def add_parser(self, subparsers: Any) -> None:
+        """Add the verb's parser, with ``run`` as a default."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that complains as the rest of the program does: what is wrong, then a hint."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message}\nhint: {self.prog} --help", file=sys.stderr)
+        sys.exit(2)
+
+
+def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return an argparse type: ``count`` finite numbers with commas between them."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(word) for word in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count or not all(abs(value) < float("inf") for value in values):
+            raise argparse.ArgumentTypeError(f"{count} numbers with commas between them, not {text!r}")
+        return values
+
+    return parse
+
+
+def print_json(value: object) -> None:
+    """Print one JSON document; a number JSON cannot hold (NaN, infinity) is a defect."""
+    json.dump(value, sys.stdout, indent=2 if sys.stdout.isatty() else None, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequence[str] | None = None) -> int:
+    """Run a verb of a program; returns the exit code, as ``shmmap`` itself has them.
+
+    Parameters
+    ----------
+    name, description
+        For the help.
+    verbs
+        Modules as in `Verb`.
+    argv
+        Words after the program's name; those of this process by default.
+    """
+    parser = _Parser(prog=name, description=description)
+    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_Parser)
+    for verb in verbs:
+        verb.add_parser(subparsers)
+    try:
+        args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
+        code: int = args.run(args)
+        sys.stdout.flush()
+    except ShmmapError as error:
+        _complain(name, error.message, error.hint)
+        return error.exit_code
+    except BrokenPipeError:
+        # the interpreter flushes stdout once more at exit: let that go nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _EXIT_BROKEN_PIPE
+    except KeyboardInterrupt:
+        return _EXIT_INTERRUPTED
+    except Exception as error:  # noqa: BLE001
+        import traceback
+
+        traceback.print_exc()
+        _complain(name, f"internal error: {type(error).__name__}: {error}", "please report the lines above")
+        return InternalError.exit_code
+    return code
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """Write ``--guess -5,3,...`` as ``--guess=-5,3,...``: argparse takes it for an option else."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1].startswith("--") and _NEGATIVE_NUMBERS.fullmatch(word):
+            joined[-1] = f"{joined[-1]}={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def _complain(name: str, message: str, hint: str) -> None:
+    print(f"{name}: {message}", file=sys.stderr)
+    if hint:
+        print(f"hint: {hint}", file=sys.stderr)

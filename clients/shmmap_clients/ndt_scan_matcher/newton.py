@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Newton's method on the score: the alignment itself (algorithm 2 of Magnusson 2009)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ndt_scan_matcher.angles import matrix_from_pose, pose_from_matrix
+from shmmap_clients.ndt_scan_matcher.conventions import Convention
+from shmmap_clients.ndt_scan_matcher.evaluation import Evaluation
+from shmmap_clients.ndt_scan_matcher.more_thuente import search_step
+
+__all__ = ["Ascent", "StepRule", "ascend"]
+
+# what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
+_SINGULAR: Final = 6 * np.finfo(np.float64).eps
+
+Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
+
+
+@dataclass(frozen=True, slots=True)
+class StepRule:
+    """How far a step goes, and when to stop.
+
+    Attributes
+    ----------
+    convention
+    epsilon
+        Metres and radians (the 6-norm of a step), as ``transformation_epsilon``; a step is at least half.
+    max_step
+        Longest step, the same norm.
+    max_iterations
+    line_search
+        More-Thuente's instead of a clipped Newton step.
+    """
+
+    convention: Convention
+    epsilon: float
+    max_step: float
+    max_iterations: int
+    line_search: bool
+
+
+@dataclass(slots=True)
+class Ascent:
+    """The way from the guess to the peak."""
+
+    pose: NDArray[np.float64]
+    last: Evaluation
+    evaluations: list[Evaluation]
+    transforms: list[NDArray[np.float64]] = field(default_factory=list)
+    iterations: int = 0
+    converged: bool = False
+
+
+def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> Ascent:
+    """Climb from a guess.
+
+    Parameters
+    ----------
+    T_guess : (4, 4) float64
+    evaluate
+        Gives an evaluation for a pose vector and a pitch sign.
+    rule
+    """
+    sign = rule.convention.pitch_sign
+    pose = pose_from_matrix(T_guess)
+    at = evaluate(pose, sign)
+    ascent = Ascent(pose, at, [at], [T_guess])
+    while True:
+        step = _newton_step(at)
+        length = float(np.linalg.norm(step))
+        if length == 0.0 or length != length:
+            ascent.converged = length == 0.0 and at.found > 0
+            return ascent
+        direction = step / length
+        length, direction, at = _take_step(ascent, at, length, direction, evaluate, rule)
+        step = direction * length
+        ascent.pose = ascent.pose + step
+        ascent.last = at
+        ascent.transforms.append(matrix_from_pose(ascent.pose))
+        small = _is_small(ascent.iterations, length, step, rule)
+        ascent.iterations += 1
+        if small or _is_last(ascent.iterations, rule):
+            ascent.converged = small
+            return ascent
+
+
+def _newton_step(at: Evaluation) -> NDArray[np.float64]:
+    """Solve H step = -gradient in the least-squares sense, as JacobiSVD does."""
+    if not np.isfinite(at.hessian).all():
+        return np.full(6, np.nan)
+    u, s, vt = np.linalg.svd(at.hessian)
+    if not s[0] > 0:
+        return np.zeros(6)
+    usable = s > max(s[0] * _SINGULAR, np.finfo(np.float64).tiny)
+    coefficients = np.zeros(6)
+    coefficients[usable] = (u.T @ -at.gradient)[usable] / s[usable]
+    return np.asarray(vt.T @ coefficients, np.float64)
+
+
+def _take_step(
+    ascent: Ascent,
+    at: Evaluation,
+    length: float,
+    direction: NDArray[np.float64],
+    evaluate: Evaluate,
+    rule: StepRule,
+) -> tuple[float, NDArray[np.float64], Evaluation]:
+    """Return the step's length and direction, and the evaluation where it ends."""
+    sign = rule.convention.pitch_sign
+    slope = -float(at.gradient @ direction)
+    if slope == 0.0:
+        return 0.0, direction, at
+    if slope > 0.0:  # away from the peak: the Hessian is not negative definite here
+        slope, direction = -slope, -direction
+    shortest = rule.epsilon / 2.0
+    start, latest = ascent.pose, at
+
+    def phi(a: float) -> tuple[float, float]:
+        nonlocal latest
+        latest = evaluate(start + direction * a, sign)
+        ascent.evaluations.append(latest)
+        return -latest.score, -float(latest.gradient @ direction)
+
+    if not rule.line_search:
+        length = max(min(length, rule.max_step), shortest)
+        phi(length)
+        return length, direction, latest
+    length, trials = search_step(length, shortest, rule.max_step, -at.score, slope, phi)
+    if trials and sign > 0:
+        # ndt_omp computes the Hessian anew after a search, and there with the right sign
+        latest = evaluate(start + direction * length, -1.0)
+    return length, direction, latest
+
+
+def _is_small(iterations_before: int, length: float, step: NDArray[np.float64], rule: StepRule) -> bool:
+    if rule.convention.stop == "squared_translation":
+        return float(step[:3] @ step[:3]) <= rule.epsilon
+    if rule.convention.stop == "step_late" and not iterations_before:
+        return False
+    return abs(length) < rule.epsilon
+
+
+def _is_last(iterations: int, rule: StepRule) -> bool:
+    # ndt_omp compares before it counts, and with "greater than"
+    extra = 2 if rule.convention.stop == "step_late" else 0
+    return iterations >= rule.max_iterations + extra

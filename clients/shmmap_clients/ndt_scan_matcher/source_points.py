@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scan's buffer: of fixed size, filled without allocation, cut evenly where a scan is larger."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest
+
+__all__ = ["SourcePoints"]
+
+
+class SourcePoints:
+    """Room for a scan of at most ``most`` points."""
+
+    def __init__(self, most: int) -> None:
+        self._buffer = np.empty((most, 3))
+        self._count = 0
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """The scan, (N, 3) float64, metres."""
+        return self._buffer[: self._count]
+
+    def take(self, points: NDArray[np.floating]) -> int:
+        """Take a scan; returns how many points were left out.
+
+        Point i of the kept m is floor(i n / m) of the given n: the same ones each time, and evenly over
+        the whole scan, whatever its order.  Points that are not finite find no neighbour.
+        """
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise BadRequest(f"a scan must have shape (N, 3), this one has {points.shape}")
+        given, most = len(points), len(self._buffer)
+        self._count = min(given, most)
+        if given <= most:
+            self._buffer[:given] = points
+        else:
+            np.copyto(self._buffer, points[np.arange(most) * given // most])
+        return given - self._count

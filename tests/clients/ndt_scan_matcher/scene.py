@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A street of walls, ground and poles, cut into cells; and scans of it with known poses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import VoxelCell, VoxelMap, matrix_from_pose, voxel_cell
+
+Points = NDArray[np.float64]
+
+
+def street(seed: int = 1) -> Points:
+    """Points of a street of 60 m x 24 m about the origin, 1 cm of noise, (N, 3), metres."""
+    rng = np.random.default_rng(seed)
+    n = 12_000
+    ground = np.stack([rng.uniform(-30, 30, n), rng.uniform(-12, 12, n), np.zeros(n)], axis=1)
+    left = np.stack([rng.uniform(-30, 30, n), np.full(n, 9.0), rng.uniform(0, 6, n)], axis=1)
+    right = np.stack([rng.uniform(-30, 30, n), np.full(n, -8.0), rng.uniform(0, 5, n)], axis=1)
+    # fronts that stand out: without them nothing holds a scan along the street
+    parts = [ground, left, right]
+    for x in range(-28, 29, 7):
+        m = 900
+        face = [np.full(m, float(x)), rng.uniform(6.5, 9, m), rng.uniform(0, 6, m)]
+        back = [np.full(m, x + 2.5), rng.uniform(-8, -5.5, m), rng.uniform(0, 5, m)]
+        pole = [rng.normal(x + 1.0, 0.05, 300), rng.normal(4.0, 0.05, 300), rng.uniform(0, 4, 300)]
+        parts += [np.stack(face, axis=1), np.stack(back, axis=1), np.stack(pole, axis=1)]
+    points = np.concatenate(parts)
+    return points + rng.normal(0, 0.01, points.shape)
+
+
+def cells_of(points: NDArray[np.floating], leaf: float, edge: float = 20.0) -> dict[str, VoxelCell]:
+    """Cut a cloud into square cells and compute the Gaussians of each."""
+    index = np.floor(points[:, :2] / edge).astype(int)
+    return {
+        f"{i}_{j}": voxel_cell(points[(index == (i, j)).all(axis=1)], leaf)
+        for i, j in sorted({(int(i), int(j)) for i, j in index})
+    }
+
+
+def map_of(points: NDArray[np.floating], leaf: float, edge: float = 20.0) -> VoxelMap:
+    """The cells as a map."""
+    return VoxelMap(cells_of(points, leaf, edge))
+
+
+def scan_from(points: Points, pose: NDArray[np.float64], count: int, seed: int = 2) -> Points:
+    """Sample of the points within 25 m of a pose, in its own frame."""
+    rng = np.random.default_rng(seed)
+    near = points[np.linalg.norm(points - pose[:3], axis=1) < 25.0]
+    chosen = near[rng.choice(len(near), count, replace=False)]
+    T = np.linalg.inv(matrix_from_pose(pose))
+    return chosen @ T[:3, :3].T + T[:3, 3]

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Alignments of a generated street: they arrive, in any frame, by any backend, and say what they did."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import (
+    Caps,
+    NdtMatcher,
+    Regularization,
+    Result,
+    Settings,
+    VoxelMap,
+    matrix_from_pose,
+    pose_from_matrix,
+)
+from shmmap_clients.ndt_scan_matcher.result import covariance_of, oscillations
+from shmmap_clients.ndt_scan_matcher.worst_case import predict_worst_case
+
+import shmmap
+from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+
+TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
+GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
+
+
+@pytest.fixture(scope="module")
+def points() -> NDArray[np.float64]:
+    return street()
+
+
+@pytest.fixture(scope="module")
+def scan(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    # of another sampling of the same street: a scan never holds the map's own points
+    return scan_from(street(seed=7), TRUTH, 1500)
+
+
+def aligned(
+    voxel_map: VoxelMap,
+    scan: NDArray[np.floating],
+    guess: NDArray[np.float64] = GUESS,
+    settings: Settings | None = None,
+    *,
+    backend: str = "numba",
+    caps: Caps | None = None,
+    regularization: Regularization | None = None,
+) -> Result:
+    with NdtMatcher(settings, backend=backend, caps=caps) as matcher:
+        matcher.set_map(voxel_map)
+        return matcher.align(scan, guess, regularization=regularization)
+
+
+def error_m(result: Result) -> float:
+    return float(np.linalg.norm(result.T_map_base[:3, 3] - TRUTH[:3]))
+
+
+@pytest.mark.parametrize("convention", ["autoware", "pclomp", "pcl"])
+@pytest.mark.parametrize("neighbors", ["direct1", "direct7", "radius"])
+@pytest.mark.parametrize("line_search", [False, True])
+def test_backends_take_the_same_way(
+    points: NDArray[np.float64], scan: NDArray[np.float64], convention: str, neighbors: str, line_search: bool
+) -> None:
+    settings = Settings(convention, neighbors, line_search=line_search)  # type: ignore[arg-type]
+    voxel_map = map_of(points, 2.0)
+    a, b = (aligned(voxel_map, scan, settings=settings, backend=name) for name in ("numba", "numpy"))
+    assert (a.iterations, a.evaluations, a.converged) == (b.iterations, b.evaluations, b.converged)
+    np.testing.assert_allclose(a.transforms, b.transforms, atol=1e-8)
+    np.testing.assert_allclose(a.nvtls, b.nvtls, rtol=1e-8)
+    assert a.transform_probability == pytest.approx(b.transform_probability, rel=1e-8)
+
+
+def test_autoware_and_fine_arrive(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    voxel_map = map_of(points, 2.0)
+    plain = aligned(voxel_map, scan)
+    fine = aligned(voxel_map, scan, settings=Settings(mode="coarse_fine"))
+    assert plain.converged
+    assert fine.converged
+    assert error_m(plain) < 0.1
+    assert error_m(fine) < 0.02
+    assert error_m(fine) <= error_m(plain)
+    assert fine.iterations > plain.iterations
+    assert plain.trustworthy
+    assert plain.nvtl > 2.3
+    assert len(plain.transforms) == plain.iterations + 1 == len(plain.nvtls) == plain.evaluations
+    assert (plain.transforms[0] == GUESS).all()
+    assert not plain.cut
+    assert plain.covariance is not None
+    assert (np.linalg.eigvalsh(plain.covariance) > 0).all()
+
+
+def test_the_same_pose_at_large_coordinates(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    shift = np.array([89570.0, 42300.0, 0.0])
+    here = aligned(map_of(points, 2.0), scan)
+    guess = GUESS.copy()
+    guess[:3, 3] += shift
+    there = aligned(map_of(points + shift, 2.0), scan, guess)
+    assert there.iterations == here.iterations
+    np.testing.assert_allclose(there.T_map_base[:3, 3] - shift, here.T_map_base[:3, 3], atol=1e-6)
+
+
+def test_a_map_is_extended_without_computing_again(points: NDArray[np.float64]) -> None:
+    cells = cells_of(points, 2.0)
+    first = VoxelMap(dict(list(cells.items())[:-1]))
+    tables = {key: first.inverses(key, "pcl") for key in first.cells}
+    second = VoxelMap(cells, previous=first)
+    assert all(second.inverses(key, "pcl") is table for key, table in tables.items())
+    assert all(second.inverses(key, "autoware") is cell.inverse for key, cell in cells.items())
+
+
+def test_no_map_is_no_pose(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    for backend in ("numba", "numpy"):
+        far = GUESS.copy()
+        far[0, 3] += 5000.0
+        for voxel_map, guess in ((VoxelMap({}), GUESS), (map_of(points, 2.0), far)):
+            result = aligned(voxel_map, scan, guess, Settings(mode="coarse_fine"), backend=backend)
+            assert not result.converged
+            assert (result.T_map_base == guess).all()
+            assert (result.iterations, result.nvtl, result.transform_probability) == (0, 0.0, 0.0)
+            assert result.covariance is None
+
+
+def test_regularization_pulls_along_the_way(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    voxel_map = map_of(points, 2.0)
+    plain = aligned(voxel_map, scan)
+    heading = np.array([np.cos(TRUTH[5]), np.sin(TRUTH[5])])
+    ahead = plain.T_map_base[:2, 3] + heading
+    pulled = aligned(voxel_map, scan, regularization=Regularization(float(ahead[0]), float(ahead[1]), 0.05))
+    moved = pulled.T_map_base[:2, 3] - plain.T_map_base[:2, 3]
+    assert 0.005 < moved @ heading < 1.0
+    assert abs(moved @ np.array([-heading[1], heading[0]])) < 0.2 * moved @ heading
+
+
+def test_caps_are_reported(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    caps = Caps(source_points=1000, neighbors=2, voxels=400, iterations=3)
+    voxel_map = VoxelMap(cells_of(points, 2.0), max_voxels=caps.voxels, centre=(1.0, 0.0))
+    result = aligned(voxel_map, scan, caps=caps)
+    assert result.cut.points == 500
+    assert result.cut.neighbor_points > 0
+    assert result.cut.neighbors > 0
+    assert result.cut.voxels == voxel_map.voxels_left_out > 0
+    assert result.iterations == 3
+    assert not result.converged
+
+
+@pytest.mark.parametrize("convention", ["autoware", "pclomp"])
+def test_evaluations_never_exceed_what_the_caps_allow(
+    points: NDArray[np.float64], scan: NDArray[np.float64], convention: str
+) -> None:
+    settings = Settings(convention, epsilon=1e-9, mode="coarse_fine", fine_epsilon=1e-9)
+    with NdtMatcher(settings, caps=Caps(source_points=600, iterations=4)) as matcher:
+        matcher.set_map(map_of(points, 2.0))
+        result = matcher.align(scan, GUESS)
+        assert result.evaluations <= matcher.most_evaluations
+        worst = predict_worst_case(matcher, scan, result.T_map_base)
+        assert worst.points == 600
+        assert worst.total_ms > 0
+
+
+def test_an_oscillation_is_a_run_of_reversals() -> None:
+    transforms = np.tile(np.eye(4), (7, 1, 1))
+    transforms[:, 0, 3] = [0, 1, 2, 1, 2, 1, 0]
+    assert oscillations(transforms) == 3
+    assert oscillations(transforms[:3]) == 0
+    assert oscillations(transforms[:1]) == 0
+
+
+def test_covariance_wants_a_peak() -> None:
+    np.testing.assert_allclose(covariance_of(-4.0 * np.eye(6)), 0.25 * np.eye(6))
+    assert covariance_of(np.eye(6)) is None
+    assert covariance_of(np.zeros((6, 6))) is None
+
+
+def test_wrong_requests_are_refused(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    for settings in (
+        Settings("gicp"),
+        Settings(neighbors="direct26"),  # type: ignore[arg-type]
+        Settings(epsilon=0.0),
+        Settings(max_iterations=0),
+        Settings(mode="finest"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(shmmap.BadRequest):
+            NdtMatcher(settings)
+    with pytest.raises(shmmap.BadRequest):
+        NdtMatcher(backend="fortran")
+    with pytest.raises(shmmap.BadRequest):
+        Caps(neighbors=0)
+    with NdtMatcher() as matcher:
+        with pytest.raises(shmmap.BadRequest):
+            matcher.align(scan, np.full((4, 4), np.nan))
+        with pytest.raises(shmmap.BadRequest):
+            matcher.align(scan[:, :2], GUESS)
+    a, b = cells_of(points, 2.0), cells_of(points, 1.0)
+    with pytest.raises(shmmap.BadRequest, match="one leaf size"):
+        VoxelMap({"a": next(iter(a.values())), "b": next(iter(b.values()))})
+    with pytest.raises(shmmap.BadRequest, match="span"):
+        VoxelMap(cells_of(np.concatenate([points, points + 10_000.0]), 2.0))
+
+
+def test_pose_vectors_and_results_speak_of_the_same_pose(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
+    with NdtMatcher() as matcher:
+        matcher.set_map(map_of(points, 2.0))
+        result = matcher.align(scan, GUESS)
+        (again,) = matcher.evaluate(scan, pose_from_matrix(result.T_map_base)[None])
+        assert again.nvtl == pytest.approx(result.nvtl, rel=1e-9)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Alignments and voxel statistics that the C++ originals computed."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import (
+    NdtMatcher,
+    Result,
+    Settings,
+    VoxelMap,
+    matrix_from_pose,
+    voxel_cell,
+)
+
+from shmmap import read_cloud
+
+SEARCH = {"KDTREE": "radius", "DIRECT7": "direct7", "DIRECT1": "direct1"}
+
+
+@cache
+def clouds(folder: Path, dataset: str) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    if dataset == "synthetic":
+        return read_cloud(folder / "synthetic_map.pcd").xyz, read_cloud(folder / "synthetic_scan1500.pcd").xyz
+    with np.load(folder / "target_ds0.1_points.npz") as a, np.load(folder / "source_ds0.1_points.npz") as b:
+        return a["xyz"], b["xyz"]
+
+
+@cache
+def target(folder: Path, dataset: str, leaf: float) -> VoxelMap:
+    return VoxelMap({"map": voxel_cell(clouds(folder, dataset)[0], leaf)})
+
+
+def usable(row: dict[str, Any]) -> bool:
+    # DIRECT26 leaves out the centre; Autoware itself does not use its line search
+    return "DIRECT26" not in row["name"] and "ls=1" not in row["name"]
+
+
+def align(folder: Path, row: dict[str, Any], backend: str) -> Result:
+    search = next(ours for theirs, ours in SEARCH.items() if theirs in row["name"])
+    settings = Settings(
+        "autoware" if row["name"].startswith("autoware") else "pclomp",
+        search,  # type: ignore[arg-type]
+        epsilon=row["eps"],
+        max_iterations=row["max_iter"],
+        step_size=row["step_size"],
+    )
+    x, y, z, yaw = row["guess_xyz_yaw"]
+    with NdtMatcher(settings, backend=backend) as matcher:
+        matcher.set_map(target(folder, row["dataset"], row["leaf"]))
+        scan = clouds(folder, row["dataset"])[1]
+        return matcher.align(scan, matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw])))
+
+
+@pytest.mark.parametrize("backend", ["numba", "numpy"])
+def test_alignments_equal_the_originals(data_dir: Path, backend: str) -> None:
+    folder = data_dir / "ndt"
+    rows = json.loads((folder / "reference_results.json").read_text(encoding="utf-8"))["results"]
+    checked = 0
+    for row in filter(usable, rows):
+        result = align(folder, row, backend)
+        T = np.array(row["T"])
+        what = f"{row['dataset']} {row['name']} eps {row['eps']} guess {row['guess_xyz_yaw']}"
+        assert result.iterations == row["iters"], what
+        np.testing.assert_allclose(result.T_map_base[:3, 3], T[:3, 3], atol=1e-4, err_msg=what)
+        np.testing.assert_allclose(result.T_map_base[:3, :3], T[:3, :3], atol=1e-5, err_msg=what)
+        assert result.transform_probability == pytest.approx(row["tp"], abs=1e-4), what
+        if "nvtl" in row:
+            assert result.nvtl == pytest.approx(row["nvtl"], abs=1e-4), what
+        checked += 1
+    assert checked == 32
+
+
+@pytest.mark.parametrize("leaf", [1.0, 2.0])
+@pytest.mark.parametrize("covariance", ["autoware", "pclomp", "pcl"])
+def test_voxel_statistics_equal_the_originals(data_dir: Path, leaf: float, covariance: str) -> None:
+    voxel_map = target(data_dir / "ndt", "koide3 pair 0.1 m", leaf)
+    cell = voxel_map.cells["map"]
+    inverse = voxel_map.inverses("map", covariance)  # type: ignore[arg-type]
+    with np.load(data_dir / "ndt" / f"target_ds0.1_leaf{leaf}_{covariance}.npz") as dump:
+        ijk, count, mean, icov = dump["ijk"], dump["count"], dump["mean"], dump["icov"].reshape(-1, 3, 3)
+    kept = count >= 6
+    assert kept.sum() >= (inverse[:, 0] > 0).sum() - 1
+    rows = cell.lattice[tuple((ijk[kept] - cell.lattice_origin).T)]
+    assert (rows >= 0).all()
+    np.testing.assert_array_equal(cell.count[rows], count[kept])
+    np.testing.assert_allclose(cell.mean[rows] + cell.origin, mean[kept], atol=1e-9)
+    ours = inverse[rows][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    np.testing.assert_allclose(ours, icov[kept], atol=1e-8 * np.abs(icov[kept]).max())
