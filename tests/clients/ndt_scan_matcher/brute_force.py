@@ -63,7 +63,7 @@ def score(
         for index, mean, inverse in all_gaussians:
             step = tuple(int(v) for v in index - own)
             if neighbors == "radius":
-                near = np.linalg.norm(y - mean) <= leaf
+                near = float(np.linalg.norm(y - mean)) <= leaf
             else:
                 near = step in (FACES if neighbors == "direct7" else {(0, 0, 0)})
             if near:

@@ -49,4 +49,4 @@ def scan_from(points: Points, pose: NDArray[np.float64], count: int, seed: int =
     near = points[np.linalg.norm(points - pose[:3], axis=1) < 25.0]
     chosen = near[rng.choice(len(near), count, replace=False)]
     T = np.linalg.inv(matrix_from_pose(pose))
-    return chosen @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(chosen @ T[:3, :3].T + T[:3, 3], np.float64)

@@ -167,7 +167,9 @@ def test_an_oscillation_is_a_run_of_reversals() -> None:
 
 
 def test_covariance_wants_a_peak() -> None:
-    np.testing.assert_allclose(covariance_of(-4.0 * np.eye(6)), 0.25 * np.eye(6))
+    covariance = covariance_of(-4.0 * np.eye(6))
+    assert covariance is not None
+    np.testing.assert_allclose(covariance, 0.25 * np.eye(6))
     assert covariance_of(np.eye(6)) is None
     assert covariance_of(np.zeros((6, 6))) is None
 
