@@ -19,7 +19,7 @@ from shmmap_clients.ndt_scan_matcher.evaluation import Evaluation
 from shmmap_clients.ndt_scan_matcher.matcher import NdtMatcher, Settings
 from shmmap_clients.ndt_scan_matcher.regularization import Regularization
 from shmmap_clients.ndt_scan_matcher.result import Result
-from shmmap_clients.ndt_scan_matcher.voxel_cell import VoxelCell, voxel_cell
+from shmmap_clients.ndt_scan_matcher.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
 from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "Settings",
     "VoxelCell",
     "VoxelMap",
+    "cell_from_layer",
     "matrix_from_pose",
     "pose_from_matrix",
     "voxel_cell",

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.caps import Caps
-from shmmap_clients.ndt_scan_matcher.covariances import Covariance
 from shmmap_clients.ndt_scan_matcher.evaluation import Evaluation
-from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.voxel_map import Covariance, VoxelMap
 
 __all__ = ["BACKENDS", "Backend", "Neighbors", "backend_named"]
 

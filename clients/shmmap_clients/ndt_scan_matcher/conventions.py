@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.backend import Neighbors
-from shmmap_clients.ndt_scan_matcher.covariances import Covariance
+from shmmap_clients.ndt_scan_matcher.voxel_map import Covariance
 
 __all__ = ["CONVENTIONS", "Convention", "Stop", "convention_named"]
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher.angles import derivative_matrices, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.caps import Caps
-from shmmap_clients.ndt_scan_matcher.covariances import Covariance
 from shmmap_clients.ndt_scan_matcher.evaluation import (
     AX,
     BJ,
@@ -28,7 +27,7 @@ from shmmap_clients.ndt_scan_matcher.evaluation import (
     total,
 )
 from shmmap_clients.ndt_scan_matcher.source_points import SourcePoints
-from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.voxel_map import Covariance, VoxelMap
 
 __all__ = ["NumpyBackend"]
 

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.covariances import inverse_covariances
+from shmmap import BadRequest, Cell, LayerTable, build_layer
 
-__all__ = ["VoxelCell", "voxel_cell"]
+__all__ = ["VoxelCell", "cell_from_layer", "voxel_cell"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,11 +24,11 @@ class VoxelCell:
         Edge of a voxel, metres.
     origin : (3,) float64
         What ``mean`` is relative to, metres, map frame.
-    lattice : (ni, nj, nk) int32
+    lattice : (ni, nj, nk) int32, any strides
         Row of the voxel at each place of the cell's lattice box, -1 where there is none.
     lattice_origin : (3,) int64
         Lattice index of ``lattice[0, 0, 0]``; the lattice itself starts at the map frame's origin.
-    count : (V,) int32
+    count : (V,) uint32
         Points in each voxel.
     mean : (V, 3) float64
         Relative to ``origin``, metres.
@@ -35,20 +36,23 @@ class VoxelCell:
         xx xy xz yy yz zz of the sum of (x - mean)(x - mean)^T, square metres.
     inverse : (V, 6) float64
         Inverse covariance in Autoware's convention, xx xy xz yy yz zz, 1/m^2; zero where refused.
+    memory
+        What the arrays belong to.
     """
 
     leaf: float
     origin: NDArray[np.float64]
     lattice: NDArray[np.int32]
     lattice_origin: NDArray[np.int64]
-    count: NDArray[np.int32]
+    count: NDArray[np.uint32]
     mean: NDArray[np.float64]
     scatter: NDArray[np.float64]
     inverse: NDArray[np.float64]
+    memory: object = None
 
 
-def voxel_cell(points: NDArray[np.floating], leaf: float, *, min_points: int = 6) -> VoxelCell:
-    """Compute the Gaussians of a cloud.
+def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6) -> VoxelCell:
+    """Compute the Gaussians of a cloud, as the daemon's ``ndt`` layer has them.
 
     Parameters
     ----------
@@ -58,48 +62,46 @@ def voxel_cell(points: NDArray[np.floating], leaf: float, *, min_points: int = 6
         Edge of a voxel, metres.
     min_points
         Voxels with fewer points are left out.
+
+    Raises
+    ------
+    BadRequest, MapDataError
+        As `shmmap.build_layer`.
     """
-    xyz = np.asarray(points)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    # floor(x * (1 / leaf)) in the points' own precision, as the originals
-    scalar = xyz.dtype.type
-    ijk = np.floor(xyz * scalar(scalar(1.0) / scalar(leaf))).astype(np.int64)
-    if not len(xyz):
-        return VoxelCell(
-            leaf,
-            np.zeros(3),
-            np.full((1, 1, 1), -1, np.int32),
-            np.zeros(3, np.int64),
-            np.empty(0, np.int32),
-            np.empty((0, 3)),
-            np.empty((0, 6)),
-            np.empty((0, 6)),
-        )
-    low = ijk.min(axis=0)
-    shape = ijk.max(axis=0) - low + 1
-    origin = low * leaf
-    local = xyz.astype(np.float64) - origin
-    key = np.ravel_multi_index((ijk - low).T, tuple(shape))
-    keys, group, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(group, local[:, axis], len(keys)) for axis in range(3)], axis=1)
-    mean = sums / count[:, None]
-    off = local - mean[group]
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    scatter = np.asarray(
-        np.stack([np.bincount(group, off[:, a] * off[:, b], len(keys)) for a, b in pairs], axis=1), np.float64
-    )
-    kept = count >= min_points
-    lattice = np.full(int(np.prod(shape)), -1, np.int32)
-    lattice[keys[kept]] = np.arange(int(kept.sum()), dtype=np.int32)
-    counts = count[kept].astype(np.int32)
-    mean, scatter = mean[kept], scatter[kept]
+    return cell_from_layer(build_layer(f"ndt(leaf={leaf!r},min_points={min_points})", points))
+
+
+def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
+    """Return the Gaussians of an ``ndt`` layer, over the same memory.
+
+    Parameters
+    ----------
+    layer
+        As `shmmap.build_layer` or the daemon gave it.
+
+    Raises
+    ------
+    BadRequest
+        It is no ``ndt`` layer.
+    """
+    lattice = layer.header.lattice if isinstance(layer, Cell) else layer.lattice
+    if lattice is None or len(set(lattice.leaf)) != 1:
+        raise BadRequest("this layer has no voxels of one edge length", hint="ask for ndt(leaf=...)")
+    try:
+        arrays: list[Any] = [
+            layer[name] for name in ("table", "mean", "inverse_covariance", "scatter", "count")
+        ]
+    except KeyError as error:
+        raise BadRequest(f"this is no ndt layer: {error.args[0]}", hint="ask for ndt(leaf=...)") from None
+    table, mean, inverse, scatter, count = arrays
     return VoxelCell(
-        leaf,
-        origin,
-        lattice.reshape(shape),
-        low,
-        counts,
-        np.ascontiguousarray(mean),
-        np.ascontiguousarray(scatter),
-        inverse_covariances(counts, scatter, "autoware"),
+        leaf=lattice.leaf[0],
+        origin=np.array(layer.origin if isinstance(layer, Cell) else (0.0, 0.0, 0.0)),
+        lattice=table.transpose(2, 1, 0),
+        lattice_origin=np.array(lattice.first, np.int64),
+        count=count,
+        mean=mean,
+        scatter=scatter,
+        inverse=inverse,
+        memory=layer,
     )

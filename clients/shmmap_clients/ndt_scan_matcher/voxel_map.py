@@ -14,16 +14,17 @@ are not those that the cells hold.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.covariances import Covariance, inverse_covariances
+from shmmap import BadRequest, voxel_covariances
 from shmmap_clients.ndt_scan_matcher.voxel_cell import VoxelCell
 
-__all__ = ["TABLE_COLUMNS", "VoxelMap"]
+__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
+
+Covariance = Literal["autoware", "pclomp", "pcl"]
 
 TABLE_COLUMNS: Final = 11  # addresses of lattice, mean, inverse; i0 j0 k0; nk; strides; voxels
 _MAX_COLUMNS: Final = 1 << 22  # 16 MiB of directory: 2 km x 2 km at 1 m
@@ -85,7 +86,7 @@ class VoxelMap:
             return cell.inverse
         derived = self._derived.setdefault(key, {})
         if covariance not in derived:
-            derived[covariance] = inverse_covariances(cell.count, cell.scatter, covariance)
+            derived[covariance] = voxel_covariances(cell.count, cell.scatter, covariance)[1]
         return derived[covariance]
 
     def table(self, covariance: Covariance) -> NDArray[np.int64]:
