@@ -15,7 +15,7 @@ from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import Final
 
-from shmmap.layers import ndt, points, voxel
+from shmmap.layers import ndt, points, search, voxel
 from shmmap.layers.contract import LayerKind
 
 __all__ = ["find_kind", "kinds", "register"]
@@ -24,7 +24,9 @@ _log = logging.getLogger(__name__)
 
 GROUP: Final = "shmmap.layers"
 
-_own: Final[dict[str, LayerKind]] = {kind.name: kind for kind in (points.KIND, voxel.KIND, ndt.KIND)}
+_own: Final[dict[str, LayerKind]] = {
+    kind.name: kind for kind in (points.KIND, voxel.KIND, ndt.KIND, search.KIND)
+}
 _registered: Final[dict[str, LayerKind]] = {}
 
 

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The filter itself: a rule, the cells around, and a scan in; what the map does not explain out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest, Cell, LayerTable, MapWindow
+from shmmap_clients.compare_map_filter import numpy_path
+from shmmap_clients.compare_map_filter.rule import CompareRule
+from shmmap_clients.compare_map_filter.search_cell import SearchCell
+from shmmap_clients.compare_map_filter.search_table import SearchTable
+
+__all__ = ["CompareMapFilter", "Comparison"]
+
+BACKENDS = ("numba", "numpy")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """What came of one scan.
+
+    Attributes
+    ----------
+    kept
+        (N,) bool: points that the map does not explain; those not finite among them, as upstream.
+    cells
+        How many cells with points were looked into.
+    compare_s, update_s
+        Seconds for the comparison, and for taking over the window's cells before it (0 where the
+        window had not changed).
+    """
+
+    kept: NDArray[np.bool_]
+    cells: int
+    compare_s: float
+    update_s: float
+
+    @property
+    def indices(self) -> NDArray[np.int64]:
+        """Rows of the kept points, ascending."""
+        return np.flatnonzero(self.kept)
+
+    def select(self, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The kept rows of all columns of the scan."""
+        return {name: values[self.kept] for name, values in columns.items()}
+
+
+class CompareMapFilter:
+    """Says which points of a scan the map explains.
+
+    Follow a window of the layer that the rule needs (`CompareRule.layer`)::
+
+        rule = CompareRule("voxel", distance=0.5)
+        window = shmmap.MapWindow(radius=150.0, layers=rule.layer, update_distance=10.0)
+        compare = CompareMapFilter(rule)
+        window.move_to(x, y, wait=5.0)
+        moved = compare.follow(window).apply(xyz, T_map_sensor).kept
+
+    Nothing is copied from the cells and nothing built over them: an update makes a table of their
+    addresses.
+
+    Parameters
+    ----------
+    rule
+        What counts as explained.
+    backend
+        ``numba``, or ``numpy``: the same result, slower.
+
+    Raises
+    ------
+    BadRequest
+        The backend is unknown.
+    """
+
+    def __init__(self, rule: CompareRule | None = None, *, backend: str = "numba") -> None:
+        if backend not in BACKENDS:
+            raise BadRequest(f"backend {backend!r} is unknown", hint=f"use one of {', '.join(BACKENDS)}")
+        self.rule = rule if rule is not None else CompareRule()
+        self.backend = backend
+        self._table = SearchTable.of_cells(())
+        self._known: dict[int, SearchCell] = {}
+        self._update_s = 0.0
+        if backend == "numba":
+            from shmmap_clients.compare_map_filter import kernel
+
+            self._explain = kernel.explain
+
+    def follow(self, window: MapWindow) -> CompareMapFilter:
+        """Take the cells of a window as it is now; nothing to do where it has not changed."""
+        return self.use_cells(cell for cell in window.cells if cell.layer.startswith("search("))
+
+    def use_cells(self, cells: Iterable[Cell]) -> CompareMapFilter:
+        """Compare with these cells of a ``search`` layer from now on."""
+        begin = time.perf_counter()
+        wanted = {id(cell): cell for cell in cells}
+        if wanted.keys() != self._known.keys():
+            self._known = {key: self._known.get(key) or _wrapped(cell) for key, cell in wanted.items()}
+            self._table = SearchTable.of_cells(list(self._known.values()))
+            self._update_s += time.perf_counter() - begin
+        return self
+
+    def use_tables(self, tables: Iterable[LayerTable]) -> CompareMapFilter:
+        """Compare with tables made by `shmmap.build_layer`, without a daemon."""
+        self._known = {
+            id(table): SearchCell.of_table(table.columns, table.lattice, table)
+            for table in tables
+            if table.lattice is not None
+        }
+        self._table = SearchTable.of_cells(list(self._known.values()))
+        return self
+
+    def apply(self, points: NDArray[Any], T_map_sensor: NDArray[np.float64] | None = None) -> Comparison:
+        """Compare one scan.
+
+        Parameters
+        ----------
+        points
+            (N, 3) float32 or float64, metres, sensor frame.
+        T_map_sensor
+            (4, 4) float64; None: the points are in the map frame.
+
+        Raises
+        ------
+        BadRequest
+            The arrays have other shapes.
+        """
+        pose = np.eye(4) if T_map_sensor is None else np.ascontiguousarray(T_map_sensor, np.float64)
+        if pose.shape != (4, 4):
+            raise BadRequest(f"a pose is a 4 x 4 matrix, not {pose.shape}")
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise BadRequest(f"points must have shape (N, 3), not {points.shape}")
+        wide = points.dtype.kind != "f" or points.dtype.itemsize > 4
+        scan = np.ascontiguousarray(points, np.float64 if wide else np.float32)
+        begin = time.perf_counter()
+        if self.backend == "numba":
+            explained = self._compiled(scan, pose)
+        else:
+            explained = numpy_path.explain(scan, pose, self.rule, self._table)
+        compare_s = time.perf_counter() - begin
+        update_s, self._update_s = self._update_s, 0.0
+        return Comparison(~explained, len(self._table.cells), compare_s, update_s)
+
+    def _compiled(self, scan: NDArray[Any], pose: NDArray[np.float64]) -> NDArray[np.bool_]:
+        explained = np.empty(len(scan), np.bool_)
+        table = self._table
+        self._explain(
+            scan, pose, self.rule.code, self.rule.distance, self.rule.distance_z, table.leaf, table.rows,
+            table.bin_columns, *table.bin_first, *table.bin_shape, table.bin_start, table.bin_cells,
+            explained,
+        )  # fmt: skip
+        return explained
+
+
+def _wrapped(cell: Cell) -> SearchCell:
+    lattice = cell.header.lattice
+    if lattice is None:
+        raise BadRequest(f"{cell.id}: layer {cell.layer} has no lattice: it is no search layer")
+    return SearchCell.of_table(cell.columns, lattice, cell)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compiled comparison: one thread, no interpreter lock, straight from shared memory.
+
+Importing this module compiles the kernel, or loads it from numba's cache (tenths of a second).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from shmmap_clients.compare_map_filter.numpy_path import SLACK
+from shmmap_clients.compare_map_filter.rule import VOXEL, VOXEL_DISTANCE
+
+__all__ = ["explain"]
+
+
+def _loader(result: types.Type, llvm_type: ir.Type) -> Any:
+    @intrinsic
+    def load(_context: Any, _address: types.Type, _index: types.Type) -> tuple[Any, Callable[..., Any]]:
+        """Return element ``_index`` of the array that starts at ``_address``."""
+
+        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            pointer = builder.inttoptr(arguments[0], llvm_type.as_pointer())
+            return builder.load(builder.gep(pointer, [arguments[1]]))
+
+        return result(types.int64, types.int64), generate
+
+    return load
+
+
+_float32_at = _loader(types.float32, ir.FloatType())
+_float64_at = _loader(types.float64, ir.DoubleType())
+_int32_at = _loader(types.int32, ir.IntType(32))
+
+
+@numba.njit(inline="always")
+def _coordinate(address: Any, double: Any, index: Any) -> Any:
+    if double:
+        return _float64_at(address, index)
+    return np.float64(_float32_at(address, index))
+
+
+@numba.njit(inline="always")
+def _first_above(address: Any, double: Any, begin: Any, end: Any, z: Any) -> Any:
+    """First row of ``begin`` to ``end`` whose z is at least ``z``, by bisection."""
+    while begin < end:
+        middle = (begin + end) >> 1
+        if _coordinate(address, double, 3 * middle + 2) < z:
+            begin = middle + 1
+        else:
+            end = middle
+    return begin
+
+
+def _readonly(dtype: types.Type, dimensions: int) -> types.Array:
+    # a read-only array is another type: without it the first scan out of shared memory would compile anew
+    return types.Array(dtype, dimensions, "C", readonly=True)
+
+
+_ARGUMENTS: Final = (
+    _readonly(types.float64, 2),  # T_map_sensor
+    types.int64,  # mode
+    types.float64,  # distance
+    types.float64,  # distance along z
+    types.float64,  # leaf
+    _readonly(types.int64, 2),  # rows of the table
+    types.int64,  # columns in a bin
+    types.int64,  # first bin, x
+    types.int64,  # first bin, y
+    types.int64,  # bins along x
+    types.int64,  # bins along y
+    _readonly(types.int32, 1),  # bin_start
+    _readonly(types.int32, 1),  # bin_cells
+    types.boolean[::1],  # result
+)
+_SIGNATURES: Final = [types.void(_readonly(t, 2), *_ARGUMENTS) for t in (types.float32, types.float64)]
+
+
+@numba.njit(_SIGNATURES, nogil=True, cache=True, error_model="numpy")
+def explain(
+    points: Any, T: Any, mode: Any, d: Any, d_z: Any, leaf: Any, rows: Any, bin_columns: Any,
+    bin_first_x: Any, bin_first_y: Any, bins_x: Any, bins_y: Any, bin_start: Any, bin_cells: Any,
+    explained: Any,
+) -> None:  # fmt: skip
+    """Say of each point whether the map explains it; see `numpy_path.explain`, which this equals."""
+    inverse = 1.0 / leaf
+    inverse_z = 1.0 / d_z
+    reach = d + SLACK
+    reach_z = (d_z if mode == VOXEL else d) + SLACK
+    squared = d * d
+    for n in range(points.shape[0]):
+        explained[n] = False
+        sx, sy, sz = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
+        x = T[0, 0] * sx + T[0, 1] * sy + T[0, 2] * sz + T[0, 3]
+        y = T[1, 0] * sx + T[1, 1] * sy + T[1, 2] * sz + T[1, 3]
+        z = T[2, 0] * sx + T[2, 1] * sy + T[2, 2] * sz + T[2, 3]
+        if not (abs(x) < 1e9 and abs(y) < 1e9 and np.isfinite(z)):
+            continue
+        own_x = np.int64(np.floor(x * inverse))
+        own_y = np.int64(np.floor(y * inverse))
+        bin_x = np.int64(np.floor(own_x / bin_columns)) - bin_first_x
+        bin_y = np.int64(np.floor(own_y / bin_columns)) - bin_first_y
+        if not (0 <= bin_x < bins_x and 0 <= bin_y < bins_y):
+            continue
+        low_x = np.int64(np.floor((x - reach) * inverse))
+        high_x = np.int64(np.floor((x + reach) * inverse))
+        low_y = np.int64(np.floor((y - reach) * inverse))
+        high_y = np.int64(np.floor((y + reach) * inverse))
+        voxel_z = np.floor(z * inverse_z)
+        low_z, high_z = z - reach_z, z + reach_z
+        if mode == VOXEL_DISTANCE:
+            low_z, high_z = min(low_z, z - d_z - SLACK), max(high_z, z + d_z + SLACK)
+        at = bin_y * bins_x + bin_x
+        found = False
+        for entry in range(bin_start[at], bin_start[at + 1]):
+            cell = bin_cells[entry]
+            first_x, first_y = rows[cell, 5], rows[cell, 6]
+            tiles_x, tiles_y = rows[cell, 3], rows[cell, 4]
+            from_x, to_x = max(low_x, first_x), min(high_x, first_x + tiles_x * 8 - 1)
+            from_y, to_y = max(low_y, first_y), min(high_y, first_y + tiles_y * 8 - 1)
+            if from_x > to_x or from_y > to_y:
+                continue
+            address, double = rows[cell, 0], rows[cell, 7] != 0
+            # its own column first: most points of a scan are explained there
+            width = to_x - from_x + 1
+            columns = width * (to_y - from_y + 1)
+            own = -1
+            if from_x <= own_x <= to_x and from_y <= own_y <= to_y:
+                own = (own_y - from_y) * width + own_x - from_x
+            for k in range(-1, columns):
+                place = k
+                if k == -1:
+                    place = own
+                    if own < 0:
+                        continue
+                elif k == own:
+                    continue
+                c_x = from_x + place % width
+                c_y = from_y + place // width
+                right, up = c_x - first_x, c_y - first_y
+                tile = np.int64(_int32_at(rows[cell, 1], (up >> 3) * tiles_x + (right >> 3)))
+                if tile < 0:
+                    continue
+                column = tile * 64 + (up & 7) * 8 + (right & 7)
+                begin = np.int64(_int32_at(rows[cell, 2], column))
+                end = np.int64(_int32_at(rows[cell, 2], column + 1))
+                if begin == end:
+                    continue
+                row = _first_above(address, double, begin, end, low_z)
+                while row < end:
+                    m_z = _coordinate(address, double, 3 * row + 2)
+                    if m_z > high_z:
+                        break
+                    d_x = _coordinate(address, double, 3 * row) - x
+                    d_y = _coordinate(address, double, 3 * row + 1) - y
+                    away_z = m_z - z
+                    if mode == VOXEL:
+                        found = abs(d_x) < d and abs(d_y) < d and abs(away_z) < d_z
+                    else:
+                        found = d_x * d_x + d_y * d_y + away_z * away_z <= squared
+                        if mode == VOXEL_DISTANCE and not found:
+                            found = c_x == own_x and c_y == own_y and np.floor(m_z * inverse_z) == voxel_z
+                    if found:
+                        break
+                    row += 1
+                if found:
+                    break
+            if found:
+                break
+        explained[n] = found

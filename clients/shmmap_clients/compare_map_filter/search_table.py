@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where every attached cell lies in memory: the only thing that is made anew when a window moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest
+from shmmap_clients.compare_map_filter.search_cell import SearchCell
+
+__all__ = ["SearchTable"]
+
+_MAX_BINS: Final = 1 << 16
+ADDRESS_XYZ, ADDRESS_TILE, ADDRESS_START, TILES_X, TILES_Y, FIRST_X, FIRST_Y, IS_DOUBLE = range(8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchTable:
+    """A private table of base addresses, and a coarse grid that says which cells are near a column.
+
+    Attributes
+    ----------
+    cells
+        The cells; the table is good as long as it is kept, since they keep the memory mapped.
+    rows
+        (C, 8) int64: addresses of ``xyz``, ``tile`` and ``start``; tiles along x and y; first column
+        along x and y; whether ``xyz`` is float64.
+    leaf
+        Edge of a column, metres.
+    bin_columns, bin_first, bin_shape
+        The grid: columns in a bin, first bin along x and y, bins along x and y.
+    bin_start, bin_cells
+        (bins + 1,) and (entries,) int32: the cells of each bin, those within one column of it included.
+    """
+
+    cells: tuple[SearchCell, ...]
+    rows: NDArray[np.int64]
+    leaf: float
+    bin_columns: int
+    bin_first: tuple[int, int]
+    bin_shape: tuple[int, int]
+    bin_start: NDArray[np.int32]
+    bin_cells: NDArray[np.int32]
+
+    @classmethod
+    def of_cells(cls, given: Sequence[SearchCell], reach_columns: int = 1) -> SearchTable:
+        """Make the table.
+
+        Parameters
+        ----------
+        given
+            Cells, all of one ``leaf``; empty ones are left out.
+        reach_columns
+            How many columns away from a place its neighbours may lie.
+
+        Raises
+        ------
+        BadRequest
+            Cells of different ``leaf``.
+        """
+        cells = tuple(cell for cell in given if len(cell.xyz))
+        if len({cell.leaf for cell in cells}) > 1:
+            raise BadRequest("search layers of different leaf cannot be searched together")
+        nothing = np.zeros(1, np.int32)
+        if not cells:
+            return cls((), np.empty((0, 8), np.int64), 1.0, 1, (0, 0), (0, 0), nothing, nothing[:0])
+        rows = np.array(
+            [
+                (
+                    cell.xyz.ctypes.data, cell.tile.ctypes.data, cell.start.ctypes.data,
+                    cell.tile.shape[1], cell.tile.shape[0], *cell.first, cell.xyz.dtype.itemsize == 8,
+                )
+                for cell in cells
+            ],
+            np.int64,
+        )  # fmt: skip
+        low = np.array([cell.first for cell in cells], np.int64) - reach_columns - 1
+        high = np.array([cell.columns_end for cell in cells], np.int64) + reach_columns + 1
+        # about a cell in each bin, and never more bins than a cache holds
+        span = high.max(axis=0) - low.min(axis=0)
+        wide = max(1, int(np.median(high - low)))
+        while (span[0] // wide + 2) * (span[1] // wide + 2) > _MAX_BINS:
+            wide *= 2
+        first = low.min(axis=0) // wide
+        shape = (high.max(axis=0) - 1) // wide - first + 1
+        bin_low, bin_high = low // wide - first, (high - 1) // wide - first
+        entries = [
+            (int(y * shape[0] + x), number)
+            for number in range(len(cells))
+            for y in range(bin_low[number, 1], bin_high[number, 1] + 1)
+            for x in range(bin_low[number, 0], bin_high[number, 0] + 1)
+        ]
+        bins, members = np.array(sorted(entries), np.int64).T
+        start = np.searchsorted(bins, np.arange(int(shape[0]) * int(shape[1]) + 1)).astype(np.int32)
+        return cls(
+            cells, rows, cells[0].leaf, wide, (int(first[0]), int(first[1])), (int(shape[0]), int(shape[1])),
+            start, members.astype(np.int32),
+        )  # fmt: skip
