@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     )
     from shmmap.errors import (
         BadRequest,
+        Busy,
         CellError,
         ConfigError,
         DaemonUnreachable,
@@ -73,6 +74,7 @@ __all__ = [
     "AutowareSquare",
     "BadRequest",
     "Box",
+    "Busy",
     "Cell",
     "CellError",
     "CellInfo",

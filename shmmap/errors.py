@@ -17,6 +17,7 @@
     ├── InstanceBusy           another daemon owns this instance                  exit 75
     ├── NoSession              the daemon does not know this session: say hello       exit 1
     ├── NotPermitted           the daemon refuses this to this user               exit 1
+    ├── Busy                   too many requests of this process wait already     exit 75
     ├── SegmentError           a segment cannot be used
     │   ├── StaleHandle        it is gone: ask again                              exit 1
     │   └── SegmentCorrupt     its bytes are wrong (magic, version, checksum)     exit 65
@@ -39,6 +40,7 @@ from typing import ClassVar
 
 __all__ = [
     "BadRequest",
+    "Busy",
     "CellError",
     "ConfigError",
     "DaemonUnreachable",
@@ -204,6 +206,13 @@ class NotPermitted(ShmmapError):
 
     code = "not_permitted"
     exit_code = 1
+
+
+class Busy(ShmmapError):
+    """The daemon holds so many unanswered requests of this process that it takes no more: wait."""
+
+    code = "busy"
+    exit_code = 75
 
 
 class SegmentError(ShmmapError):

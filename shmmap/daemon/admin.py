@@ -10,6 +10,7 @@ from typing import Final
 from shmmap import __version__
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.operator_pins import OperatorPins
+from shmmap.daemon.pin_survey import Pinned
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
@@ -85,8 +86,6 @@ class Admin:
         """Answer one request."""
         if isinstance(message, messages.Metadata):
             return self._metadata(message)
-        if isinstance(message, messages.Stats):
-            return self._stats(message, now_s)
         if isinstance(message, messages.Show):
             return self._show(message)
         if isinstance(message, messages.Evict):
@@ -155,26 +154,17 @@ class Admin:
                 removed.pop(cell, None)
         return changed, list(removed)
 
-    def _stats(self, message: messages.Stats, now_s: float) -> messages.StatsReply:
-        reclaimer = self._store.reclaimer
-        unknown_bytes = unknown = pinned_bytes = 0
-        for resident in reclaimer.everything()[:2048]:
-            slots = reclaimer.slots_of(resident) or []
-            if any(self._sessions.by_slot(slot) for slot in slots):
-                pinned_bytes += resident.nbytes
-            elif reclaimer.is_pinned(resident):
-                pinned_bytes += resident.nbytes
-                unknown += 1
-                unknown_bytes += resident.nbytes
-        self._statistics.set("bytes_pinned", pinned_bytes)
+    def stats(self, message: messages.Stats, pinned: Pinned, now_s: float) -> messages.StatsReply:
+        """Answer a request for statistics with what a survey of pins found."""
+        self._statistics.set("bytes_pinned", pinned.pinned_bytes)
         return messages.StatsReply(
             request=message.request,
             epoch=self._epoch,
             map_version=self._store.catalogue.map_version,
             counters=dict(self._statistics.values),
             sessions=tuple(self._session_row(session, now_s) for session in self._sessions),
-            unknown_holders=unknown,
-            unknown_bytes=unknown_bytes,
+            unknown_holders=pinned.unknown,
+            unknown_bytes=pinned.unknown_bytes,
         )
 
     def _session_row(self, session: Session, now_s: float) -> messages.SessionRow:

@@ -56,6 +56,7 @@ from shmmap.daemon.prerequisites import (
 from shmmap.daemon.privileges import Privileges
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.reloading import Reloader
+from shmmap.daemon.replies import SEND_QUEUE
 from shmmap.daemon.residency import Residency
 from shmmap.daemon.server import Server
 from shmmap.daemon.service_manager import ServiceManager, status_line
@@ -78,8 +79,8 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 
-SEND_QUEUE: Final = 256
-"""Replies kept for a client that does not read them; further ones are dropped."""
+RECEIVE_QUEUE: Final = 32
+"""Requests that libzmq reads ahead from one connection, of up to `MAX_REQUEST_BYTES` each."""
 
 
 def run(config: DaemonConfig) -> int:
@@ -273,6 +274,7 @@ class _Life:
         socket.setsockopt(zmq.LINGER, 200)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
         socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
+        socket.setsockopt(zmq.RCVHWM, RECEIVE_QUEUE)
         self._manager = manager
         self._owns_socket = activated is None
         quota = self._config.session_quota
@@ -298,6 +300,7 @@ class _Life:
                     socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
                 self._bind(socket)
                 step("daemon.bind")
+                server.guard()
                 self._store.loads.pool.start_one()
                 _log.info(
                     "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
@@ -336,6 +339,7 @@ class _Life:
     def _beat(self) -> None:
         self._manager.beat(time.monotonic(), self._status)
         self._pins.keep(time.monotonic())
+        self._running.watch_crowd(time.monotonic())
         version = self._store.catalogue.map_version
         if version != self._identity.map_version:
             self._identity = _with_map_version(self._identity, version)

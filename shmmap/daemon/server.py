@@ -19,24 +19,32 @@ import zmq
 
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.cells import CellRequests
+from shmmap.daemon.crowd_control import CrowdControl
+from shmmap.daemon.hearing import Heard, Hearing, peer_of
 from shmmap.daemon.heartbeat import BEAT_S, Heartbeat
+from shmmap.daemon.listen_gate import ListenGate
+from shmmap.daemon.pin_survey import Pinned, PinSurvey
 from shmmap.daemon.privileges import Privileges
 from shmmap.daemon.reloading import Reloader
+from shmmap.daemon.replies import Replies
 from shmmap.daemon.residency import Resident
-from shmmap.daemon.sessions import Peer, Session, Sessions
+from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
-from shmmap.errors import BadRequest, InternalError, NoSession, ProtocolMismatch, ShmmapError
+from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ProtocolMismatch, ShmmapError
 from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
-from shmmap.segment.crash_steps import step
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Server"]
 
 _log = logging.getLogger(__name__)
 
-REQUESTS_AT_ONCE: Final = 64
+SERVE_S: Final = 0.002
+"""How long requests are served before the loop looks at everything else."""
+WORTH_AN_ANSWER_BYTES: Final = 1 << 16
+"""A longer request that is refused unread is dropped: finding its number takes too long."""
+_SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 _PRIVILEGED: Final = (
     messages.Reload,
     messages.Evict,
@@ -89,6 +97,16 @@ class Server:
         )
         self._heartbeat = Heartbeat(store, statistics, sessions=sessions, waiting=self.cells, on_beat=on_beat)
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map))
+        self._replies = Replies(socket, statistics)
+        self._hearing = Hearing(socket, sessions, statistics, self._refuse_unread)
+        self._survey = PinSurvey(store.reclaimer, sessions)
+        self._gate = ListenGate(self.watch, self.unwatch)
+        self._crowd = CrowdControl(
+            self._gate,
+            waiting_bytes=self._hearing.waiting_bytes,
+            unread_bytes=lambda: self._replies.unread(list(sessions)),
+            session_descriptors=lambda: [session.fd for session in sessions],
+        )
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
         self._poller.register(self._epoll.fileno(), zmq.POLLIN)
@@ -119,6 +137,16 @@ class Server:
         """Whether the loop ends after this turn."""
         return self._stopping
 
+    def guard(self) -> None:
+        """From now on descriptors and memory are watched; call it when everything is bound."""
+        self._gate.close_behind()
+        self._replies.paths = self._gate.paths
+        self._crowd.begin()
+
+    def watch_crowd(self, now_s: float) -> None:
+        """Look whether clients take more than there is; called a few times a second."""
+        self._crowd.beat(now_s)
+
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
         self._stopping = True
@@ -134,10 +162,14 @@ class Server:
                 self._store.loads.next_event_s(), self.cells.next_deadline_s(), self._heartbeat.next_s
             )
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
-            ready = self._poller.poll(min(timeout_ms, int(BEAT_S * 1000)))
+            busy = len(self._hearing) or not self._survey.idle or not self._crowd.idle
+            ready = self._poller.poll(0 if busy else min(timeout_ms, int(BEAT_S * 1000)))
             self._turn(ready)
+        self._gate.release()
         if self._answer_at_end:
             self.cells.answer_all(time.monotonic())
+            while not self._survey.idle:
+                self._survey.step()
 
     def close(self) -> None:
         """Stop watching; after everything watched is gone."""
@@ -145,15 +177,14 @@ class Server:
 
     def _turn(self, ready: list[tuple[object, int]]) -> None:
         for source, _events in ready:
-            if source is self._socket:
-                for _ in range(REQUESTS_AT_ONCE):
-                    if not self._receive():
-                        break
-            else:
+            if source is not self._socket:
                 for fd, _mask in self._epoll.poll(0):
                     callback = self._events.get(fd)
                     if callback is not None:
                         callback()
+        self._serve()
+        self._survey.step()
+        self._crowd.step()
         now_s = time.monotonic()
         self._store.loads.end_overdue(now_s)
         self._store.loads.pump(now_s)
@@ -162,32 +193,45 @@ class Server:
 
     # --- requests -----------------------------------------------------------------------------------
 
-    def _receive(self) -> bool:
-        """Take one request from the socket; False when there is none."""
-        try:
-            identity = self._socket.recv(zmq.NOBLOCK)
-        except zmq.Again:
-            return False
-        frame = self._socket.recv(copy=False)
-        extra = frame.more
-        while extra:  # no request has more than one frame: read and drop what is left of it
-            extra = self._socket.recv(copy=False).more
-        data = frame.buffer
-        self._statistics.add("requests")
-        self._statistics.add("bytes_received", len(data))
+    def _serve(self) -> None:
+        """Hear everybody, serve those whose turn it is; for a bounded time."""
+        start_s = time.monotonic()
+        end_s = start_s + SERVE_S
+        more = True
+        while start_s < end_s:
+            more = more and self._hearing.hear()
+            heard = self._hearing.take()
+            if heard is None:
+                if not more:
+                    return
+                continue
+            self._handle(heard)
+            now_s = time.monotonic()
+            self._hearing.served(heard, now_s - start_s)
+            start_s, more = now_s, True
+
+    def _handle(self, heard: Heard) -> None:
+        """Answer one request, or say why not."""
+        data = heard.frame.buffer
         request = 0
         try:
-            if frame.more:
+            if heard.several_frames:
                 raise BadRequest("a request is one frame")
             message = decode_request(data)
             request = message.request
-            self._dispatch(identity, frame, message)
+            self._dispatch(heard.identity, heard.frame, message)
         except ShmmapError as error:
-            self._refuse(identity, request or request_number(data), error)
+            self._refuse(heard.identity, request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
             _log.exception("a request could not be handled; this is a defect in shmmap")
-            self._refuse(identity, request, InternalError("the daemon failed on this request"))
-        return True
+            self._refuse(heard.identity, request, InternalError("the daemon failed on this request"))
+
+    def _refuse_unread(self, heard: Heard) -> None:
+        """A process has too many requests waiting to have this one served, ever."""
+        data = heard.frame.buffer
+        if len(data) <= WORTH_AN_ANSWER_BYTES:
+            error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
+            self._refuse(heard.identity, request_number(data), error)
 
     def _dispatch(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
         now_s = time.monotonic()
@@ -216,17 +260,21 @@ class Server:
             self.end_session(session)
         else:
             if isinstance(message, _PRIVILEGED):
-                self._privileges.require(_peer(frame), now_s)
+                self._privileges.require(peer_of(frame), now_s)
             if isinstance(message, messages.Shutdown):
                 _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
                 self._send(session, encode(messages.Stopping(message.request)))
                 self.stop()
             elif isinstance(message, messages.Reload):
                 self._reload_for(session, message)
+            elif isinstance(message, messages.Stats):
+                self._survey.ask(session, lambda pinned: self._tell_stats(session, message, pinned))
             else:
-                if isinstance(message, messages.Stats):
-                    self._heartbeat.measure()
                 self._send(session, encode(self._admin.answer(message, now_s)))
+
+    def _tell_stats(self, session: Session, message: messages.Stats, pinned: Pinned) -> None:
+        self._heartbeat.measure()
+        self._send(session, encode(self._admin.stats(message, pinned, time.monotonic())))
 
     def _hello(
         self, identity: bytes, frame: zmq.Frame, message: messages.Hello, old: Session | None, now_s: float
@@ -237,18 +285,19 @@ class Server:
                 f" daemon {messages.PROTOCOL_VERSION[0]}.{messages.PROTOCOL_VERSION[1]}",
                 hint="update the older of the two",
             )
-        peer = _peer(frame)
+        peer = peer_of(frame)
         if old is not None and old.peer == peer:
             session = old  # a repeated hello: its answer was late or lost
         else:
             if old is not None:
                 self.end_session(old)
-            idle = self._sessions.idlest_unwatched() if self._sessions.full else None
-            if idle is not None:
-                self.end_session(idle)
+            spare = self._sessions.spare() if self._sessions.full else None
+            if spare is not None:
+                self.end_session(spare)
             if self._sessions.full:
                 raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
             session = self._sessions.open(identity, peer, message.client, now_s)
+            session.fd = _descriptor(frame)
             self._statistics.add("sessions_opened")
             if session.pidfd >= 0:
                 self.watch(session.pidfd, lambda: self.end_session(session))
@@ -309,23 +358,10 @@ class Server:
     # --- replies --------------------------------------------------------------------------------------
 
     def _send(self, session: Session, reply: bytes) -> None:
-        self._send_to(session.identity, reply)
-
-    def _send_to(self, identity: bytes, reply: bytes) -> None:
-        step("daemon.reply")
-        try:
-            self._socket.send(identity, zmq.SNDMORE | zmq.NOBLOCK)
-            self._socket.send(reply, zmq.NOBLOCK)
-            step("daemon.replied")
-        except zmq.ZMQError as error:
-            _log.warning("a reply was dropped: %s", error)
-            return
-        self._statistics.add("replies")
-        self._statistics.add("bytes_sent", len(reply))
+        self._replies.send(session, reply)
 
     def _refuse(self, identity: bytes, request: int, error: ShmmapError) -> None:
-        self._statistics.add("errors_returned")
-        self._send_to(identity, encode(messages.ErrorReply(request, error.code, error.message, error.hint)))
+        self._replies.refuse(identity, request, error)
 
 
 def _check_intent(intent: messages.Intent) -> None:
@@ -335,9 +371,9 @@ def _check_intent(intent: messages.Intent) -> None:
         raise BadRequest("intent: every number in it must be finite")
 
 
-def _peer(frame: zmq.Frame) -> Peer:
+def _descriptor(frame: zmq.Frame) -> int:
+    """Descriptor of the connection that a message came on; -1 where libzmq does not tell."""
     try:
-        address = frame.get("Peer-Address")
+        return int(frame.get(_SOURCE))
     except zmq.ZMQError:
-        return Peer()
-    return Peer.parse(str(address))
+        return -1

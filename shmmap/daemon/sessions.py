@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,6 +48,8 @@ class Session:
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
     naming holders.  Safety never depends on it, pins are the kernel's word.  ``says_where`` tells
     an ``intent`` that the client stated from one that was guessed from the area it asked for.
+    ``fd`` is the connection's descriptor (libzmq's own: never closed here), ``unread_bytes`` what was
+    sent since the client is known to have read everything.
     """
 
     slot: int
@@ -61,6 +64,8 @@ class Session:
     says_where: bool = False
     requests: int = 0
     last_request_s: float = 0.0
+    fd: int = -1
+    unread_bytes: int = 0
 
     def asked_about(self, x: float, y: float) -> None:
         """The session asked for an area about (x, y): that is where it is, unless it says."""
@@ -170,13 +175,18 @@ class Sessions:
         """Whether no more sessions are accepted."""
         return len(self._by_slot) >= self.LIMIT
 
-    def idlest_unwatched(self) -> Session | None:
-        """The session to give up when there are too many: nobody tells us when its process ends.
+    def spare(self) -> Session | None:
+        """The session to give up when there are too many; None when everybody has just one.
 
+        It belongs to whoever has most: a process, or all those together whose end nobody tells us.
         Should it still be alive, it is told ``no_session`` and opens another.
         """
-        unwatched = [session for session in self if session.pidfd < 0]
-        return min(unwatched, key=lambda session: session.last_request_s, default=None)
+        sessions_of = Counter(session.peer.pid if session.pidfd >= 0 else 0 for session in self)
+        owner, count = max(sessions_of.items(), key=lambda item: item[1], default=(0, 0))
+        if owner and count < 2:
+            return None
+        mine = [session for session in self if (session.peer.pid if session.pidfd >= 0 else 0) == owner]
+        return min(mine, key=lambda session: session.last_request_s, default=None)
 
     def open(self, identity: bytes, peer: Peer, client: str, now_s: float) -> Session:
         """Begin a session; ``pidfd`` is -1 where the process cannot be watched.

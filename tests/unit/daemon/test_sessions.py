@@ -120,15 +120,18 @@ def test_slots_are_never_alike() -> None:
 
 def test_who_gives_way() -> None:
     sessions = Sessions()
-    assert sessions.idlest_unwatched() is None
+    assert sessions.spare() is None
     watched = sessions.open(b"w", Peer(0, 0, os.getpid()), "", 0.0)
-    assert sessions.idlest_unwatched() is None
+    assert sessions.spare() is None
     busy = sessions.open(b"1", Peer(), "", 9.0)
     idle = sessions.open(b"2", Peer(), "", 3.0)
-    assert sessions.idlest_unwatched() is idle
+    assert sessions.spare() is idle
     sessions.close(idle)
-    assert sessions.idlest_unwatched() is busy
-    sessions.close(watched)
+    hoarded = [sessions.open(bytes([n]), Peer(0, 0, os.getpid()), "", float(n)) for n in range(3, 6)]
+    assert sessions.spare() is watched  # the process that has most gives its idlest
+    for session in (watched, *hoarded):
+        sessions.close(session)
+    assert sessions.spare() is busy
 
 
 def test_where_a_client_is() -> None:

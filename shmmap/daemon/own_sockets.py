@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""This process's own descriptors, those that a library opened included: which there are, a look at one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterator
+from typing import Final
+
+__all__ = ["looked_at", "open_descriptors"]
+
+_DIRECTORY: Final = "/proc/self/fd"
+
+
+def open_descriptors() -> list[int]:
+    """Numbers of the open descriptors."""
+    return [int(name) for name in os.listdir(_DIRECTORY)]
+
+
+@contextlib.contextmanager
+def looked_at(fd: int) -> Iterator[socket.socket]:
+    """Give a socket object on a duplicate of ``fd``; whoever owns it may close it meanwhile.
+
+    Raises
+    ------
+    OSError
+        It is closed, or no socket.
+    """
+    twin = os.dup(fd)
+    try:
+        view = socket.socket(fileno=twin)
+    except OSError:
+        os.close(twin)
+        raise
+    with view:
+        yield view

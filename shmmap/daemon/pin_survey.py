@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much memory is pinned, and how much of it by nobody known: asked of the kernel bit by bit.
+
+One look at a segment takes about 30 us, and there may be thousands: the serving loop does a few per
+turn, and everybody who asked meanwhile gets the result of one survey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from shmmap.daemon.reclaim import Reclaimer
+from shmmap.daemon.residency import Resident
+from shmmap.daemon.sessions import Session, Sessions
+from shmmap.errors import Busy
+
+__all__ = ["PinSurvey", "Pinned"]
+
+LOOKS_AT_ONCE: Final = 16
+"""Half a millisecond of the serving loop."""
+MOST_SEGMENTS: Final = 2048
+"""The largest are looked at."""
+MOST_ASKED: Final = 16
+"""Answers one session may wait for."""
+
+
+class Pinned(NamedTuple):
+    """What the largest segments come to; `unknown` ones are mapped by nobody who told."""
+
+    pinned_bytes: int
+    unknown: int
+    unknown_bytes: int
+
+
+Answer = Callable[[Pinned], None]
+
+
+class PinSurvey:
+    """Looks at all segments, a few per `step`."""
+
+    def __init__(self, reclaimer: Reclaimer, sessions: Sessions) -> None:
+        self._reclaimer = reclaimer
+        self._sessions = sessions
+        self._asked: list[tuple[Session, Answer]] = []
+        self._running: list[tuple[Session, Answer]] = []
+        self._left: list[Resident] = []
+        self._sum = [0, 0, 0]
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to do."""
+        return not (self._asked or self._running)
+
+    def ask(self, session: Session, answer: Answer) -> None:
+        """Have ``answer`` called with the result of a survey that begins after now.
+
+        Raises
+        ------
+        Busy
+            The session waits for too many already.
+        """
+        if sum(asker is session for asker, _ in self._asked) >= MOST_ASKED:
+            raise Busy("this session waits for too many answers of this kind", hint="wait for them first")
+        self._asked.append((session, answer))
+
+    def step(self) -> None:
+        """Look at a few segments, or hand the result to one who asked."""
+        if self._left:
+            self._look()
+        elif self._running:
+            _, answer = self._running.pop()
+            answer(Pinned(*self._sum))
+        elif self._asked:
+            self._running, self._asked = self._asked[::-1], []
+            self._left = self._reclaimer.everything()[:MOST_SEGMENTS]
+            self._sum = [0, 0, 0]
+            self._look()
+
+    def _look(self) -> None:
+        for _ in range(min(LOOKS_AT_ONCE, len(self._left))):
+            resident = self._left.pop()
+            slots = self._reclaimer.slots_of(resident) or []
+            if any(self._sessions.by_slot(slot) for slot in slots):
+                self._sum[0] += resident.nbytes
+            elif self._reclaimer.is_pinned(resident):
+                self._sum[0] += resident.nbytes
+                self._sum[1] += 1
+                self._sum[2] += resident.nbytes
