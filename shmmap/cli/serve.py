@@ -63,6 +63,12 @@ def run(args: argparse.Namespace) -> int:
     """Serve until a signal says stop."""
     from shmmap.daemon.config import load_config
     from shmmap.daemon.lifecycle import run as serve
+    from shmmap.daemon.service_manager import ServiceManager
+    from shmmap.errors import ShmmapError
 
     settings = {name: value for name, value in vars(args).items() if name not in ("run", "config")}
-    return serve(load_config(settings, file=args.config))
+    try:
+        return serve(load_config(settings, file=args.config))
+    except ShmmapError as error:
+        ServiceManager().failed(str(error))
+        raise

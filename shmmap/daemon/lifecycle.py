@@ -96,15 +96,6 @@ def run(config: DaemonConfig) -> int:
         Another daemon has this instance.
     """
     set_up_logging()
-    manager = ServiceManager()
-    try:
-        return _run(config, manager)
-    except ShmmapError as error:
-        manager.failed(str(error))
-        raise
-
-
-def _run(config: DaemonConfig, manager: ServiceManager) -> int:
     prepare_process()
     raise_descriptor_limit()
     activated = take_activated_socket()
@@ -139,7 +130,7 @@ def _run(config: DaemonConfig, manager: ServiceManager) -> int:
         with signals.held():
             life = _Life(config, catalogue, directory, path, mode, gid)
             stack.callback(lambda: life.close(keep=signals.keep))
-        life.serve(Reloader(origin), started_s, signals, manager, activated)
+        life.serve(Reloader(origin), started_s, signals, ServiceManager(), activated)
     return 0
 
 

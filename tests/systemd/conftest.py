@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A booted systemd with the service installed, as an operator installs it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.booted_systemd import BootedSystemd
+from tests.support.divided_map import DividedMap, make_map
+
+MAP = "/home/alice/autoware_map"
+
+
+@pytest.fixture(scope="module")
+def machine() -> Iterator[BootedSystemd]:
+    """Return a machine with users `alice` (of the group) and `mallory` (not), and a map in alice's home."""
+    one = BootedSystemd()
+    try:
+        make_map(one.shared / "map")
+        one.shell(f"""
+            mkdir -p /etc/sysusers.d
+            printf 'u alice 61003 "" /home/alice\nu mallory 61004 "" /\n' >/etc/sysusers.d/people.conf
+            systemd-sysusers /etc/sysusers.d/people.conf
+            mkdir -p {MAP}; chmod 700 /home/alice
+            mount --bind /exchange/map {MAP}
+        """)
+        done = one.run(sys.executable, "-m", "shmmap.cli", "unit", "install", "--map", MAP)
+        assert "next: systemctl enable --now shmmapd" in done.stdout
+        one.shell("usermod -aG shmmap alice")
+        yield one
+    finally:
+        one.close()
+
+
+@pytest.fixture
+def fresh(machine: BootedSystemd) -> Iterator[BootedSystemd]:
+    """Return the machine with every unit of the service stopped, and nothing left of it."""
+    stop = """
+        systemctl stop 'shmmapd*.socket' 'shmmapd*.service'
+        systemctl reset-failed
+        rm -rf /run/systemd/system/shmmapd*.d
+        systemctl daemon-reload
+    """
+    machine.shell(stop)
+    yield machine
+    machine.shell(stop)
+    assert machine.shell("ls /dev/shm") == ""
+    left = machine.run("pgrep", "--count", "--full", "shmmap[.]daemon|shmmapd", check=False).stdout
+    assert left == "0\n"
+
+
+@pytest.fixture
+def the_map(machine: BootedSystemd) -> DividedMap:
+    """Return the map, as the machine outside sees it."""
+    return DividedMap(machine.shared / "map")

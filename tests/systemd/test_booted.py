@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The service under a real systemd: start, reload, watchdog, restart, activation, stop, users."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from types import TracebackType
+
+import pytest
+
+from tests.support.booted_systemd import BootedSystemd
+from tests.support.divided_map import DividedMap
+from tests.support.patience import Patience
+
+pytestmark = pytest.mark.root
+
+CLIENT = """
+import hashlib, json, os, sys
+import shmmap
+
+def digest(cells):
+    return {os.path.basename(c.id): hashlib.sha256(c.xyz.tobytes()).hexdigest() for c in cells}
+
+client = shmmap.connect(sys.argv[1] or None, timeout=120, connect_timeout=120)
+cells = []
+for line in sys.stdin:
+    if line == "ask\\n":
+        cells = client.around(0, 0, radius=25)
+    print(json.dumps(digest(cells)), flush=True)
+"""
+
+
+class Client:
+    """A program of some user's inside the machine: asks for cells and holds what it got."""
+
+    def __init__(self, machine: BootedSystemd, user: str, endpoint: str = "") -> None:
+        self._process = machine.spawn(sys.executable, "-c", CLIENT, endpoint, user=user)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def _say(self, word: str) -> dict[str, str]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(word + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        assert line, self._process.communicate()[1]
+        answer: dict[str, str] = json.loads(line)
+        return answer
+
+    def ask(self) -> dict[str, str]:
+        """Digests of the points around the origin, as the daemon hands them out now."""
+        return self._say("ask")
+
+    def held(self) -> dict[str, str]:
+        """Digests of what this client holds, read again."""
+        return self._say("held")
+
+
+def shmmap(machine: BootedSystemd, *words: str, user: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the command line inside."""
+    return machine.run(sys.executable, "-m", "shmmap.cli", *words, user=user, check=False)
+
+
+def segments(machine: BootedSystemd, instance: str = "default") -> dict[str, str]:
+    """Published segments by name, with their inodes."""
+    lines = machine.shell(
+        f"cd /dev/shm; ls -i | grep 'shmmap[.]{instance}[.][0-9a-f]*$' || true"
+    ).splitlines()
+    return {name: inode for inode, name in (line.split() for line in lines) if len(name.split(".")[-1]) == 16}
+
+
+def test_it_serves_the_members_of_the_group_and_nobody_else(fresh: BootedSystemd) -> None:
+    fresh.run("systemctl", "start", "shmmapd")
+    unit = fresh.properties("shmmapd")
+    assert (unit["ActiveState"], unit["SubState"], unit["NRestarts"]) == ("active", "running", "0")
+    assert " cells" in unit["StatusText"]
+    with Client(fresh, "alice") as alice:
+        assert len(alice.ask()) == 12
+        refused = shmmap(fresh, "query", "--circle", "0,0,25", user="mallory")
+        assert refused.returncode == 69
+        assert "may not connect" in refused.stderr
+        assert "group" in refused.stderr
+        modes = fresh.shell(
+            "stat -c '%n %a %U:%G' /run/shmmap /run/shmmap/default.sock /dev/shm/*"
+        ).splitlines()
+        found = {line.split()[0]: line.split(maxsplit=1)[1] for line in modes}
+        assert found.pop("/run/shmmap") == "750 shmmap:shmmap"
+        assert found.pop("/run/shmmap/default.sock") == "660 shmmap:shmmap"
+        assert len(found) >= 12
+        names = segments(fresh)
+        assert {found[f"/dev/shm/{name}"] for name in names} == {"440 shmmap:shmmap"}
+        for name in names:
+            assert fresh.run("cat", f"/dev/shm/{name}", user="mallory", check=False).returncode != 0
+        assert shmmap(fresh, "evict", "--all", user="alice").returncode != 0
+    fresh.run("systemctl", "stop", "shmmapd")
+    unit = fresh.properties("shmmapd")
+    assert (unit["ActiveState"], unit["Result"], unit["ExecMainStatus"]) == ("inactive", "success", "0")
+    assert fresh.shell("ls /dev/shm; ls /run/shmmap") == ""
+
+
+def test_the_daemon_has_no_rights_it_does_not_need(fresh: BootedSystemd) -> None:
+    """And still it loads cells, from a home directory that it cannot enter otherwise."""
+    fresh.run("systemctl", "start", "shmmapd")
+    with Client(fresh, "alice") as alice:
+        assert len(alice.ask()) == 12
+    pid = fresh.properties("shmmapd")["MainPID"]
+    status = dict(
+        line.split(":\t", 1) for line in fresh.shell(f"cat /proc/{pid}/status").splitlines() if ":\t" in line
+    )
+    assert (status["CapEff"].strip("0"), status["CapBnd"].strip("0")) == ("", "")
+    assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
+    inside = ["nsenter", f"--target={pid}", "--mount", "--net", "setpriv", "--reuid=shmmap", "--regid=shmmap"]
+    inside += ["--init-groups", "--"]
+    assert fresh.run(*inside, "ls", "/home/alice").stdout == "autoware_map\n"
+    assert fresh.run(*inside, "touch", "/home/alice/autoware_map/x", check=False).returncode != 0
+    assert fresh.run(*inside, "touch", "/etc/shmmap/x", check=False).returncode != 0
+    assert fresh.run(*inside, "cat", "/proc/net/dev").stdout.count(":") == 1  # lo alone
+
+
+def test_reload_returns_when_the_map_was_read(fresh: BootedSystemd, the_map: DividedMap) -> None:
+    fresh.run("systemctl", "start", "shmmapd")
+    with Client(fresh, "alice") as alice:
+        before = alice.ask()
+        points = the_map.points("0_0.pcd")
+        the_map.write_cell("0_0.pcd", (0, 0), {name: values[:7] for name, values in points.items()})
+        fresh.run("systemctl", "reload", "shmmapd")
+        assert fresh.properties("shmmapd")["ActiveState"] == "active"
+        after = alice.ask()
+        assert {name for name in before if before[name] != after[name]} == {"0_0.pcd"}
+        assert fresh.properties("shmmapd")["NRestarts"] == "0"
+
+
+def test_the_watchdog_ends_a_daemon_that_hangs_and_the_next_one_is_warm(fresh: BootedSystemd) -> None:
+    fresh.shell("""
+        mkdir -p /run/systemd/system/shmmapd.service.d
+        printf '[Service]\nWatchdogSec=5\n' >/run/systemd/system/shmmapd.service.d/test.conf
+        systemctl daemon-reload
+        systemctl start shmmapd
+    """)
+    with Client(fresh, "alice") as alice:
+        before = alice.ask()
+        names = segments(fresh)
+        pid = fresh.properties("shmmapd")["MainPID"]
+        fresh.run("kill", f"-{int(signal.SIGSTOP)}", pid)
+        waiting = Patience()
+        while waiting(fresh.properties("shmmapd")["MainPID"] in ("0", pid)):
+            pass
+        fresh.run("systemctl", "start", "shmmapd")  # returns when it is ready
+        assert "Watchdog timeout" in fresh.shell("journalctl --sync; journalctl --no-pager -u shmmapd")
+        assert alice.held() == before
+        assert alice.ask() == before
+        assert segments(fresh) == names
+
+
+def test_a_restart_keeps_the_cells_and_a_stop_does_not(fresh: BootedSystemd) -> None:
+    fresh.run("systemctl", "start", "shmmapd")
+    with Client(fresh, "alice") as alice:
+        before = alice.ask()
+        names = segments(fresh)
+        assert len(names) == 12
+        pid = fresh.properties("shmmapd")["MainPID"]
+        fresh.run("systemctl", "restart", "shmmapd")
+        assert fresh.properties("shmmapd")["MainPID"] != pid
+        assert segments(fresh) == names
+        assert alice.ask() == before
+        assert segments(fresh) == names
+    fresh.run("systemctl", "stop", "shmmapd")
+    assert fresh.shell("ls /dev/shm") == ""
+    fresh.run("systemctl", "start", "shmmapd")
+    assert segments(fresh) == {}
+
+
+def test_the_first_client_starts_it(fresh: BootedSystemd) -> None:
+    fresh.run("systemctl", "start", "shmmapd.socket")
+    assert fresh.properties("shmmapd")["ActiveState"] == "inactive"
+    made = fresh.shell("stat -c '%i %a %U:%G' /run/shmmap/default.sock")
+    assert made.split()[1:] == ["660", "shmmap:shmmap"]
+    refused = shmmap(fresh, "query", "--circle", "0,0,25", user="mallory")
+    assert (refused.returncode, fresh.properties("shmmapd")["ActiveState"]) == (69, "inactive")
+    with Client(fresh, "alice") as alice:
+        before = alice.ask()
+        assert len(before) == 12
+        assert fresh.properties("shmmapd")["ActiveState"] == "active"
+        fresh.run("systemctl", "restart", "shmmapd")
+        assert alice.ask() == before
+        assert fresh.shell("stat -c '%i %a %U:%G' /run/shmmap/default.sock") == made
+    fresh.run("systemctl", "stop", "shmmapd.socket", "shmmapd.service")
+    assert fresh.shell("ls /run/shmmap") == ""
+
+
+def test_several_maps_side_by_side(fresh: BootedSystemd) -> None:
+    fresh.shell("cp /etc/shmmap/shmmap.toml /etc/shmmap/car.toml")
+    # drop-ins of the plain service are its own: this one names its map's place itself
+    fresh.shell("""
+        mkdir -p /run/systemd/system/shmmapd@car.service.d
+        cp /etc/systemd/system/shmmapd.service.d/20-map.conf /run/systemd/system/shmmapd@car.service.d/
+        systemctl daemon-reload
+        systemctl start shmmapd shmmapd@car.socket
+    """)
+    with Client(fresh, "alice", "/run/shmmap/car.sock") as car, Client(fresh, "alice") as plain:
+        assert car.ask() == plain.ask()
+        assert (len(segments(fresh, "car")), len(segments(fresh))) == (12, 12)
+        fresh.run("systemctl", "stop", "shmmapd")
+        assert segments(fresh) == {}
+        assert len(car.ask()) == 12  # the directory of its socket is still there
+    fresh.shell("rm /etc/shmmap/car.toml")
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "says"),
+    [
+        ("echo 'bugdet = 3' >>/etc/shmmap/shmmap.toml", "78", "did you mean"),
+        ("sed -i 's|^map_path = .*|map_path = \"/no/map\"|' /etc/shmmap/shmmap.toml", "66", "/no/map"),
+        ("rm /etc/shmmap/shmmap.toml", "78", "No such file"),
+    ],
+)
+def test_what_cannot_get_better_is_tried_once(
+    fresh: BootedSystemd, change: str, status: str, says: str
+) -> None:
+    fresh.shell("cp /etc/shmmap/shmmap.toml /etc/shmmap/kept")
+    try:
+        fresh.shell(change)
+        assert fresh.run("systemctl", "start", "shmmapd", check=False).returncode != 0
+        unit = fresh.properties("shmmapd")
+        assert (unit["ActiveState"], unit["ExecMainStatus"], unit["NRestarts"]) == ("failed", status, "0")
+        assert says in unit["StatusText"]
+    finally:
+        fresh.shell("mv /etc/shmmap/kept /etc/shmmap/shmmap.toml")
