@@ -44,6 +44,7 @@ class Admin:
         self._statistics = statistics
         self._epoch = epoch
         self.pins = OperatorPins(store)
+        self._kinds = tuple(kind.describe() for kind in kinds())
         self._bounds_of: Catalogue | None = None
         self._known_bounds: tuple[float, float, float, float] | None = None
 
@@ -66,7 +67,7 @@ class Admin:
             segment_prefix=self._store.segment_prefix,
             cells=len(catalogue),
             bounds=self._bounds(),
-            layers=tuple(kind.describe() for kind in kinds()),
+            layers=self._kinds,
             budget_bytes=self._store.books.budget_bytes,
             pid=os.getpid(),
         )
@@ -200,7 +201,7 @@ class Admin:
                 state = (
                     "zombie"
                     if resident.name in zombies
-                    else "resident" if resident.version == version else "stale"
+                    else "resident" if store.is_current(resident) else "stale"
                 )  # fmt: skip
                 shown.append(self._segment(resident, state))
         z_min, z_max = store.heights.get(index, (None, None))

@@ -222,7 +222,7 @@ class CellRequests:
             return
         chilled = set(cold)
         sizes = [
-            store.estimate(index) if (index, layer) in chilled else store.warm[layer][index].nbytes
+            store.estimate(index, layer) if (index, layer) in chilled else store.warm[layer][index].nbytes
             for index, layer in wanted.cells
         ]
         if session.held_bytes + sum(sizes) <= self._quota_bytes:
@@ -386,7 +386,7 @@ class CellRequests:
         slot = store.books.slot(key)
         refusal = wanted.refused.get(key)
         resident = slot.resident if slot.resident is None or slot.resident.checked else None
-        current = resident is not None and resident.version == store.catalogue.version(index)
+        current = resident is not None and resident.version == store.layers.version(index, layer)
         if resident is not None and refusal is None and (current or key.cell_id not in wanted.held_old):
             answer.handles.append(resident.handle if current else resident.stale_handle)
             answer.residents.append(resident)

@@ -112,11 +112,11 @@ def difference(
     store: Store, message: Differential, indices: Sequence[int], layers: tuple[str, ...]
 ) -> Difference:
     """Return what the client lacks of the area's cells ``indices``, whether in memory or not."""
-    version_of, id_of = store.catalogue.version, store.catalogue.id
+    version_of, id_of = store.layers.version, store.catalogue.id
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
     result = Difference(held=set(packed))
-    has: dict[int, frozenset[str]] = {}
+    has: dict[int, set[str]] = {}
     removed: dict[str, None] = {}
     for cell in message.held:
         index = store.index_of(cell.id)
@@ -125,26 +125,26 @@ def difference(
         if index is None or index not in inside:
             removed[cell.id] = None
             continue
-        if cell.version is None:
-            result.held.add(version_of(index))
-        elif cell.version != version_of(index):
-            result.old.add(id_of(index))
-            continue
-        had = layers if cell.layers is None else canonical_layers(cell.layers)
-        has[index] = has.get(index, frozenset()).union(had)
-    result.cells = [
-        (index, layer)
-        for index in indices
-        if version_of(index) not in packed
-        for layer in layers
-        if layer not in has.get(index, ())
-    ]
-    gone = packed.difference(map(version_of, indices))
+        for layer in layers if cell.layers is None else canonical_layers(cell.layers):
+            if cell.version is None:
+                result.held.add(version_of(index, layer))
+            elif cell.version != version_of(index, layer):
+                result.old.add(id_of(index))
+                continue
+            has.setdefault(index, set()).add(layer)
+    current: set[int] = set()
+    for index in indices:
+        for layer in layers:
+            version = version_of(index, layer)
+            current.add(version)
+            if version not in packed and layer not in has.get(index, ()):
+                result.cells.append((index, layer))
+    gone = packed - current
     for version in [*gone]:
-        index = store.index_of_version.get(version)
-        if index in inside and index is not None:
+        known = store.index_of_version.get(version)
+        if known in inside and known is not None:
             gone.discard(version)
-            result.old.add(id_of(index))
+            result.old.add(id_of(known))
     result.removed = tuple(removed)
     result.removed_packed = pack_versions(gone)
     return result

@@ -34,7 +34,11 @@ MAX_PACKET_BYTES: Final = 1 << 16
 
 
 class Job(msgspec.Struct, array_like=True, tag="job"):
-    """Load one layer of one cell; ``granted`` bytes are reserved for it."""
+    """Load one layer of one cell; ``granted`` bytes are reserved for it.
+
+    ``points`` names the cell's ``points`` segment where that is in memory: a computed layer need not
+    read the file then.  ``neighbours`` are the files around the cell, for a layer with a halo.
+    """
 
     number: int
     cell_id: str
@@ -43,6 +47,8 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
     box: tuple[float, float, float, float]
     frame_id: str
     granted: int
+    points: str = ""
+    neighbours: tuple[str, ...] = ()
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
@@ -85,6 +91,8 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     """The segment sent just before is finished, and the worker has closed its own descriptor of it.
 
     That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
+    ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the source's points; ``neighbours`` are
+    the stamps of the job's, as they were read.
     """
 
     number: int
@@ -96,6 +104,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     stamp: tuple[int, int, int]
     load_ns: int
     warnings: tuple[str, ...] = ()
+    neighbours: tuple[tuple[int, int, int], ...] = ()
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):

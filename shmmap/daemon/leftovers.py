@@ -17,13 +17,13 @@ import errno
 import logging
 import os
 import stat
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from shmmap.daemon.reclaim import HAND_OUT_GRACE_S, Reclaimer
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.store import Store
-from shmmap.errors import SegmentCorrupt
-from shmmap.layers.points import BUILDER_VERSION, LAYER
+from shmmap.errors import BadRequest, SegmentCorrupt
+from shmmap.layers.spec import layer_spec
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import PublishBlock, SegmentHeader
@@ -34,8 +34,6 @@ from shmmap.segment.verify import read_header
 __all__ = ["Leftovers", "TakenOver"]
 
 _log = logging.getLogger(__name__)
-
-_BUILDERS: Final = {LAYER: BUILDER_VERSION}
 
 
 class TakenOver(NamedTuple):
@@ -133,12 +131,19 @@ class Leftovers:
             return "it was retired"
         if status.st_mode & 0o222 or status.st_nlink != 1:
             return "others may have changed it"
-        if _BUILDERS.get(header.layer) != header.builder_version:
+        try:
+            spec = layer_spec(header.layer)
+        except BadRequest:
+            return f"there is no layer {header.layer} any more"
+        if str(spec) != header.layer or spec.builder_version != header.builder_version:
             return f"layer {header.layer} is built otherwise now"
         index = catalogue.find(header.cell_id)
         if index is None:
             return "its cell is not in the map"
-        if (block.version, header.source) != (catalogue.version(index), catalogue.stamp(index)):
+        if (block.version, header.source) != (
+            store.layers.version(index, header.layer),
+            catalogue.stamp(index),
+        ):
             return "its source has changed"
         if header.box != catalogue.box(index) or header.frame_id != catalogue.frame_id:
             return "its cell has moved"

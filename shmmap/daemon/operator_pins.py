@@ -117,7 +117,7 @@ class OperatorPins:
         if slot is not None and slot.resident is not None:
             return slot.resident.nbytes
         index = self._store.index_of(key.cell_id)
-        return 0 if index is None else self._store.estimate(index)
+        return 0 if index is None else self._store.estimate(index, key.layer)
 
     def _answer(self, request: int, keys: Iterable[Key], unknown: list[str]) -> messages.Pinned:
         rows = [self._row(key) for key in sorted(keys)]

@@ -19,10 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon import jobs
+from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.daemon.loading import Loading
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Key, Load, Residency, Resident, Slot
 from shmmap.daemon.workers import WorkerPool
+from shmmap.layers.points import LAYER
+from shmmap.layers.spec import layer_spec
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
 from shmmap.origin.stamp import Stamp
 from shmmap.protocol.codec import encode_handle
@@ -89,6 +92,7 @@ class Store:
         self.catalogue = catalogue
         self.books = residency
         self.reclaimer = reclaimer
+        self.layers = LayerVersions(lambda: self.catalogue)
         self.loads = Loading(self, residency, reclaimer, pool, statistics, on_settled)
         self.warm: dict[str, dict[int, Resident]] = {}
         self.versions: dict[str, NDArray[np.uint64]] = {}
@@ -130,10 +134,10 @@ class Store:
 
     def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
         """The current version of a cell, if it is in memory (retired ones are put back in service)."""
-        resident = self.warm.setdefault(layer, {}).get(index)
+        resident = self.warm.get(layer, {}).get(index)
         if resident is None and self.books.zombies:
             key = Key(self.catalogue.id(index), layer)
-            resident = self.reclaimer.revive(key, self.catalogue.version(index), now_s)
+            resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
             if resident is not None:
                 self._enter(resident, index)
         return resident
@@ -148,15 +152,17 @@ class Store:
             and not self.loads.may_retry(key, slot.failure, now_s)
         ):
             return slot
-        self.books.want(key, self.estimate(index), priority)
+        self.books.want(key, self.estimate(index, layer), priority)
         return slot
 
-    def estimate(self, index: int) -> int:
-        """Bytes to reserve before a load: a segment has its file's bytes, plus its header, at most.
+    def estimate(self, index: int, layer: str) -> int:
+        """Bytes to reserve before a load: `points` has its file's bytes, plus its header, at most.
 
-        Only for compressed and ASCII files can it be more; their worker asks for it.
+        Only for compressed and ASCII files can it be more; their worker asks for it, as does that of
+        a computed layer, of which this is a guess.
         """
-        size = self.catalogue.stamp(index).size + _HEADER_ALLOWANCE_BYTES
+        share = 1.0 if layer == LAYER else layer_spec(layer).kind.bytes_ratio
+        size = int(self.catalogue.stamp(index).size * share) + _HEADER_ALLOWANCE_BYTES
         return -(-size // _PAGE_BYTES) * _PAGE_BYTES
 
     # --- publishing -----------------------------------------------------------------------------
@@ -173,15 +179,19 @@ class Store:
             load.adopted = None  # it was retired before its turn came
             if not load.wanted:
                 return None
-            load.estimate = self.estimate(index)
+            load.estimate = self.estimate(index, load.key.layer)
+        layer = load.key.layer
+        points = self.warm.get(LAYER, {}).get(index) if layer != LAYER else None
         return jobs.Job(
             number,
             load.key.cell_id,
             self.catalogue.path(index),
-            load.key.layer,
+            layer,
             self.catalogue.box(index),
             self.catalogue.frame_id,
             load.estimate,
+            points.name if points is not None else "",
+            tuple(map(self.catalogue.path, self.layers.neighbours(index, layer)[: MAX_NEIGHBOURS + 1])),
         )
 
     def publish(self, load: Load, done: jobs.Done, fd: int, now_s: float) -> None:
@@ -191,15 +201,20 @@ class Store:
             self._statistics.add("loads_failed")
             self.loads.abandon(load)
             return
-        stamp, known = Stamp(*done.stamp), self.catalogue.stamp(index)
-        if stamp != known:
-            if self._lies_on_disk(index, known):
-                self.books.requeue(load)  # it read what a reload has already found replaced
-                return
-            self._remember({load.key.cell_id}, ())
-            self.catalogue.set_stamp(index, stamp)
-            self._chill(index)
-        version = self.catalogue.version(index)
+        around = self.layers.neighbours(index, load.key.layer)
+        if len(around) != len(done.neighbours):
+            self.books.requeue(load)  # the map has got or lost a neighbour meanwhile
+            return
+        for cell, read in zip((index, *around), (done.stamp, *done.neighbours), strict=True):
+            stamp, known = Stamp(*read), self.catalogue.stamp(cell)
+            if stamp != known:
+                if self._lies_on_disk(cell, known):
+                    self.books.requeue(load)  # it read what a reload has already found replaced
+                    return
+                self._remember({self.catalogue.id(cell)}, ())
+                self.catalogue.set_stamp(cell, stamp)
+                self._chill(cell)
+        version = self.layers.version(index, load.key.layer)
         name = new_segment_name(self._instance)
         try:
             nbytes = self._directory.publish(
@@ -265,7 +280,7 @@ class Store:
     def estimate_of(self, key: Key) -> int:
         """Bytes to reserve before loading a key."""
         index = self.index_of(key.cell_id)
-        return self.estimate(index) if index is not None else 0
+        return self.estimate(index, key.layer) if index is not None else 0
 
     def _lies_on_disk(self, index: int, stamp: Stamp) -> bool:
         try:
@@ -283,7 +298,8 @@ class Store:
             self._show(resident)
             return
         self._encode(resident)
-        if resident.version == self.catalogue.version(index):
+        current = resident.version == self.layers.version(index, resident.key.layer)
+        if current:
             self.warm.setdefault(resident.key.layer, {})[index] = resident
             versions = self.versions.get(resident.key.layer)
             if versions is None:
@@ -292,7 +308,7 @@ class Store:
             self.heights[index] = (resident.z_min, resident.z_max)
         self.index_of_version[resident.version] = index
         self._indices[self.wire_id(resident.key.cell_id)] = index
-        self._show(resident, "resident" if resident.version == self.catalogue.version(index) else "stale")
+        self._show(resident, "resident" if current else "stale")
 
     def _leave(self, resident: Resident) -> None:
         """A resident was retired: nobody finds it any more, its bytes still show."""
@@ -302,6 +318,8 @@ class Store:
         if index is not None and warm.get(index) is resident:
             del warm[index]
             self.versions[resident.key.layer][index] = 0
+            if not warm:  # whoever asks for ever new layers must not fill the daemon's memory
+                del self.warm[resident.key.layer], self.versions[resident.key.layer]
         self._show(resident, "zombie")
 
     def _encode(self, resident: Resident) -> None:
@@ -346,16 +364,26 @@ class Store:
     def is_current(self, resident: Resident) -> bool:
         """Whether a resident segment is the newest version of its cell."""
         index = self.index_of(resident.key.cell_id)
-        return index is not None and self.catalogue.version(index) == resident.version
+        return index is not None and self.layers.version(index, resident.key.layer) == resident.version
 
     # --- leaving --------------------------------------------------------------------------------
 
     def _chill(self, index: int) -> None:
-        """What is resident of this cell is not its current version any more, nor are its heights."""
+        """What is resident of this cell is not its current version any more, nor are its heights.
+
+        The same goes for its neighbours in layers that look into it.
+        """
         self.heights.pop(index, None)
+        self.layers.forget()
         for layer, warm in self.warm.items():
-            if warm.pop(index, None) is not None:
-                self.versions[layer][index] = 0
+            for cell in (index, *self.layers.neighbours(index, layer)):
+                if warm.pop(cell, None) is not None:
+                    self.versions[layer][cell] = 0
+
+    def _chill_one(self, resident: Resident, index: int) -> None:
+        warm = self.warm.get(resident.key.layer, {})
+        if warm.pop(index, None) is not None:
+            self.versions[resident.key.layer][index] = 0
 
     def evict(self, resident: Resident, now_s: float) -> bool:
         """Retire on request; True if nobody has it mapped."""
@@ -368,6 +396,7 @@ class Store:
         if change:
             self._remember({*change.changed, *change.added, *change.moved}, change.removed)
         self.catalogue = new
+        self.layers.forget()
         if renumbered:
             self._indices.clear()
             self.warm.clear()
@@ -395,7 +424,7 @@ class Store:
                 self.evict(resident, now_s)
                 self.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
-            self._chill(index)
+            self._chill_one(resident, index)
             if not resident.checked and not self.is_current(resident):
                 self.evict(resident, now_s)
                 continue

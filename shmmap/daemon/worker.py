@@ -19,11 +19,15 @@ from pathlib import Path
 from typing import Final
 
 from shmmap.daemon import jobs
+from shmmap.daemon.layer_versions import MAX_NEIGHBOURS
 from shmmap.errors import MapDataError, SegmentCorrupt
-from shmmap.layers.points import build_points
+from shmmap.layers.derive import CellJob, derive
+from shmmap.layers.points import LAYER, build_points
+from shmmap.layers.sources import CellSource, read_segment
+from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, is_full
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.verify import verify_file
 
 __all__ = ["main"]
@@ -92,15 +96,7 @@ class _Worker:
             fd = self._directory.create()
             try:
                 step("worker.alloc")
-                header = build_points(
-                    job.path,
-                    fd,
-                    cell_id=job.cell_id,
-                    box=job.box,
-                    frame_id=job.frame_id,
-                    reserve=lambda nbytes: self._reserve(job, nbytes),
-                    warn=warnings.append,
-                )
+                header, neighbours = self._build(job, fd, warnings)
                 done = jobs.Done(
                     job.number,
                     header.header_bytes,
@@ -111,6 +107,7 @@ class _Worker:
                     header.source,
                     time.monotonic_ns() - started_ns,
                     tuple(warning[:500] for warning in warnings[:20]),
+                    neighbours,
                 )
                 step("worker.pass")
                 self._send(jobs.Segment(), fd)
@@ -128,6 +125,56 @@ class _Worker:
             self._fail(job, code, f"{job.path}: {error.strerror or error}")
         except MemoryError:
             self._fail(job, "load_failed", f"{job.path}: loading it ran out of memory")
+        except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one cell
+            self._fail(job, "load_failed", f"{job.path}: building {job.layer} failed: {error!r}")
+
+    def _build(
+        self, job: jobs.Job, fd: int, warnings: list[str]
+    ) -> tuple[SegmentHeader, tuple[SourceStamp, ...]]:
+        """Fill the segment; returns its header and the stamps of the neighbours that were read."""
+        if job.layer == LAYER:
+            header = build_points(
+                job.path,
+                fd,
+                cell_id=job.cell_id,
+                box=job.box,
+                frame_id=job.frame_id,
+                reserve=lambda nbytes: self._reserve(job, nbytes),
+                warn=warnings.append,
+            )
+            return header, ()
+        if len(job.neighbours) > MAX_NEIGHBOURS:
+            raise MapDataError(
+                f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one", path=job.path,
+                cause="unsupported_format", hint="use a smaller radius, or larger cells",
+            )  # fmt: skip
+        spec = layer_spec(job.layer)
+        cell = CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours)
+        done = derive(
+            spec,
+            cell,
+            fd,
+            source=self._points_in_memory(job, spec),
+            reserve=lambda nbytes: self._reserve(job, nbytes),
+        )
+        warnings += done.warnings
+        return done.header, done.neighbours
+
+    def _points_in_memory(self, job: jobs.Job, spec: LayerSpec) -> CellSource | None:
+        """The cell's points out of their segment, if that is still there and of this state of the file."""
+        if not job.points:
+            return None
+        try:
+            fd = self._directory.open(job.points)
+        except OSError:
+            return None
+        try:
+            source = read_segment(fd, job.box, spec.source_columns)
+            return source if source.stamp == SourceStamp.of(os.stat(job.path)) else None
+        except (OSError, SegmentCorrupt):
+            return None
+        finally:
+            os.close(fd)
 
     def _check(self, job: jobs.Check) -> None:
         wrong = ""

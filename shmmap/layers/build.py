@@ -29,7 +29,7 @@ def build_layer(
     *,
     units: Mapping[str, str] | None = None,
     box: Box = BUILT_ANYWHERE,
-    halo: Mapping[str, NDArray[np.generic]] | None = None,
+    halo: NDArray[np.generic] | None = None,
 ) -> LayerTable:
     """Build one layer of a cloud.
 
@@ -45,7 +45,7 @@ def build_layer(
     box
         (min_x, min_y, max_x, max_y) of the cell, metres; only kinds with a halo look at it.
     halo
-        Points around the cell, in the same columns, for such kinds.
+        (M, 3) coordinates of points around the cell, for such kinds.
 
     Returns
     -------
@@ -61,9 +61,9 @@ def build_layer(
     spec = parse_layer(layer) if isinstance(layer, str) else layer
     given = points if isinstance(points, Mapping) else {"xyz": points}
     columns = _checked(given)
-    around = _checked(halo) if halo is not None else None
-    if around is not None and around.keys() != columns.keys():
-        raise BadRequest("the halo must have the same columns as the points")
+    around = None
+    if halo is not None:
+        around = np.ascontiguousarray(_checked({"xyz": halo})["xyz"], columns["xyz"].dtype)
     return build_spec(spec, PointTable(columns, dict(units or {}), box, around))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ __all__ = [
 
 Value: TypeAlias = float | int
 Parameters: TypeAlias = Mapping[str, Value]
-Columns: TypeAlias = "dict[str, NDArray[np.generic]]"
+Columns: TypeAlias = "dict[str, NDArray[Any]]"
 Box: TypeAlias = tuple[float, float, float, float]
 
 BUILT_ANYWHERE: Final[Box] = (-math.inf, -math.inf, math.inf, math.inf)
@@ -137,16 +137,17 @@ class PointTable:
     box
         The cell's (min_x, min_y, max_x, max_y), metres; infinite where the points are no cell's.
     halo
-        For a kind with a halo: points of neighbouring cells within it, in the same columns.
+        For a kind with a halo: (M, 3) coordinates of the neighbouring cells' points within it, dtype
+        as ``xyz``; None where there are no neighbours.
     """
 
     columns: Columns
     units: Mapping[str, str] = field(default_factory=dict)
     box: Box = BUILT_ANYWHERE
-    halo: Columns | None = None
+    halo: NDArray[Any] | None = None
 
     @property
-    def xyz(self) -> NDArray[np.generic]:
+    def xyz(self) -> NDArray[Any]:
         """The coordinates, (N, 3) float32 or float64, map frame, metres."""
         return self.columns["xyz"]
 
@@ -168,18 +169,14 @@ class LayerTable:
         Unit of each column, empty where unknown.
     lattice
         The lattice that the rows or tables lie on; None where there is none.
-    z_min, z_max
-        Bounds of the layer's points; NaN where there are none.
     """
 
     columns: Columns
     rows: int
     units: Mapping[str, str] = field(default_factory=dict)
     lattice: Lattice | None = None
-    z_min: float = math.nan
-    z_max: float = math.nan
 
-    def __getitem__(self, name: str) -> NDArray[np.generic]:
+    def __getitem__(self, name: str) -> NDArray[Any]:
         return self.columns[name]
 
     @property
@@ -206,7 +203,7 @@ class LayerKind:
     name
         ASCII identifier; what specs say before the parenthesis.
     builder_version
-        Raise it when the same points would give other bytes: caches then build anew.
+        1 to 255; raise it when the same points would give other bytes: caches then build anew.
     summary, borders
         For people: what it holds, and what happens where two cells meet.
     parameters, columns

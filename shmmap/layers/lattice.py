@@ -36,16 +36,14 @@ class Grouping:
         (V,) int32: points of each row's voxel.
     indices
         (V, 3) int64: lattice index x, y, z of each row.
-    z_min, z_max
-        Bounds of the finite points, metres; NaN without any.
+    leaf
+        Edge lengths of a voxel, metres.
     """
 
     rows: NDArray[np.int32]
     counts: NDArray[np.int32]
     indices: NDArray[np.int64]
     leaf: tuple[float, float, float]
-    z_min: float
-    z_max: float
 
     @property
     def lattice(self) -> Lattice:
@@ -83,14 +81,13 @@ def group_points(xyz: NDArray[np.generic], leaf: tuple[float, float, float], *, 
 
     real = xyz.dtype.type
     inverse_x, inverse_y, inverse_z = (real(1.0) / real(edge) for edge in leaf)
-    found = np.empty(8)
+    found = np.empty(6)
     kept = bounds(xyz, inverse_x, inverse_y, inverse_z, found)
     if not kept:
         return Grouping(
-            np.full(len(xyz), -1, np.int32), np.empty(0, np.int32), np.empty((0, 3), np.int64),
-            leaf, math.nan, math.nan,
-        )  # fmt: skip
-    if not np.all(np.abs(found[:6]) < _INDEX_LIMIT):
+            np.full(len(xyz), -1, np.int32), np.empty(0, np.int32), np.empty((0, 3), np.int64), leaf
+        )
+    if not np.all(np.abs(found) < _INDEX_LIMIT):
         raise MapDataError(
             f"coordinates are too large for a lattice of {min(leaf):g} m",
             cause="coordinate_range",
@@ -116,7 +113,7 @@ def group_points(xyz: NDArray[np.generic], leaf: tuple[float, float, float], *, 
         indices[:, 1] = places // shape[0] % shape[1]
         indices[:, 2] = places // (shape[0] * shape[1])
         indices += first
-    return Grouping(rows, counts, indices, leaf, float(found[6]), float(found[7]))
+    return Grouping(rows, counts, indices, leaf)
 
 
 def _by_sorting(

@@ -25,13 +25,12 @@ __all__ = ["bounds", "count_points", "number_voxels"]
 def bounds(xyz: Any, inverse_x: Any, inverse_y: Any, inverse_z: Any, result: Any) -> Any:
     """Find the extent of finite points on the lattice.
 
-    ``result`` (8,) receives the least and greatest index along x, y, z, then the least and greatest
-    z in metres.  Returns how many points are finite.
+    ``result`` (6,) receives the least and then the greatest index along x, y, z.  Returns how many
+    points are finite.
     """
     kept = 0
     low_x, low_y, low_z = np.inf, np.inf, np.inf
     high_x, high_y, high_z = -np.inf, -np.inf, -np.inf
-    bottom, top = np.inf, -np.inf
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
         if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
@@ -45,11 +44,8 @@ def bounds(xyz: Any, inverse_x: Any, inverse_y: Any, inverse_z: Any, result: Any
         high_x = max(high_x, a)
         high_y = max(high_y, b)
         high_z = max(high_z, c)
-        bottom = min(bottom, z)
-        top = max(top, z)
     result[0], result[1], result[2] = np.floor(low_x), np.floor(low_y), np.floor(low_z)
     result[3], result[4], result[5] = np.floor(high_x), np.floor(high_y), np.floor(high_z)
-    result[6], result[7] = bottom, top
     return kept
 
 

@@ -52,8 +52,6 @@ def build_ndt(points: PointTable, parameters: Parameters) -> LayerTable:
         rows=voxels,
         units={column.name: column.unit for column in KIND.columns},
         lattice=grouping.lattice,
-        z_min=grouping.z_min,
-        z_max=grouping.z_max,
     )
 
 

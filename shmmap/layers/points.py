@@ -124,13 +124,10 @@ def _from_arrays(points: PointTable, parameters: Parameters) -> LayerTable:
     del parameters
     finite = np.isfinite(points.xyz).all(axis=1)
     columns = points.columns if finite.all() else {n: c[finite] for n, c in points.columns.items()}
-    z = columns["xyz"][:, 2]
     return LayerTable(
         columns=dict(columns),
-        rows=len(z),
+        rows=len(columns["xyz"]),
         units={**points.units, "xyz": "m"},
-        z_min=float(z.min()) if len(z) else np.nan,
-        z_max=float(z.max()) if len(z) else np.nan,
     )
 
 

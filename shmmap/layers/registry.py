@@ -40,6 +40,8 @@ def register(kind: LayerKind) -> None:
     """
     if (find_kind(kind.name) or kind) is not kind or not kind.name.isidentifier() or not kind.name.isascii():
         raise ValueError(f"a layer kind cannot be called {kind.name!r}")
+    if not 1 <= kind.builder_version <= 255:
+        raise ValueError(f"{kind.name}: builder_version must be 1 to 255")
     _registered[kind.name] = kind
 
 

@@ -75,9 +75,8 @@ def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
         "tile": table.reshape(tiles[1], tiles[0]),
         "start": start,
     }
-    z = xyz[:, 2]
     shape = (tiles[0] * TILE_COLUMNS, tiles[1] * TILE_COLUMNS)
-    return LayerTable(columns, len(xyz), units, _lattice(leaf, first, shape), float(z.min()), float(z.max()))
+    return LayerTable(columns, len(xyz), units, _lattice(leaf, first, shape))
 
 
 def _lattice(leaf: float, first: tuple[int, int], shape: tuple[int, int]) -> Lattice:

@@ -23,7 +23,14 @@ from shmmap.errors import BadRequest
 from shmmap.layers.contract import LayerKind, Value
 from shmmap.layers.registry import find_kind, kinds
 
-__all__ = ["MAX_SPEC_CHARACTERS", "LayerSpec", "canonical_layer", "canonical_layers", "parse_layer"]
+__all__ = [
+    "MAX_SPEC_CHARACTERS",
+    "LayerSpec",
+    "canonical_layer",
+    "canonical_layers",
+    "layer_spec",
+    "parse_layer",
+]
 
 MAX_SPEC_CHARACTERS: Final = 200
 MAX_CHAIN: Final = 4
@@ -52,9 +59,9 @@ class LayerSpec:
         return self.kind.halo_m(self.parameters) + (self.of.halo_m if self.of is not None else 0.0)
 
     @property
-    def builder_versions(self) -> tuple[int, ...]:
-        """Builder versions along the chain, this layer's first."""
-        return (self.kind.builder_version, *(self.of.builder_versions if self.of is not None else ()))
+    def builder_version(self) -> int:
+        """Builder versions along the chain, one byte each, this layer's in the lowest."""
+        return self.kind.builder_version | (self.of.builder_version << 8 if self.of is not None else 0)
 
     @property
     def source_columns(self) -> tuple[str, ...] | None:
@@ -170,7 +177,7 @@ def _spec(words: _Words, depth: int) -> LayerSpec:
 
 def _source(words: _Words, kind: LayerKind, depth: int) -> LayerSpec:
     of = _spec(words, depth + 1)
-    if not kind.takes_layers:
+    if not kind.takes_layers:  # kinds with a halo do not: their neighbours' layers would be needed too
         raise BadRequest(f"{kind.name} is built of the source, not of another layer")
     if not of.kind.gives_points:
         raise BadRequest(f"{kind.name} cannot be built of {of.kind.name}, which has no points")
@@ -207,6 +214,12 @@ def _checked(kind: LayerKind, given: dict[str, Value], of: LayerSpec | None) -> 
 def canonical_layer(spec: str) -> str:
     """Return the canonical form of a layer spec; errors are those of `parse_layer`."""
     return str(parse_layer(spec))
+
+
+@lru_cache(maxsize=1024)
+def layer_spec(canonical: str) -> LayerSpec:
+    """Return the spec of a canonical form, remembered."""
+    return parse_layer(canonical)
 
 
 def canonical_layers(specs: Sequence[str]) -> tuple[str, ...]:

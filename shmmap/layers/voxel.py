@@ -65,14 +65,11 @@ def build_voxel(points: PointTable, parameters: Parameters) -> LayerTable:
         if name != "count":
             columns[name] = means(column, grouping).astype(_kept_dtype(column.dtype))
     columns["count"] = grouping.counts.astype(np.uint32)
-    z = columns["xyz"][:, 2]
     return LayerTable(
         columns=columns,
         rows=len(grouping.counts),
         units={**points.units, "xyz": "m", "count": ""},
         lattice=grouping.lattice,
-        z_min=float(z.min()) if len(z) else np.nan,
-        z_max=float(z.max()) if len(z) else np.nan,
     )
 
 

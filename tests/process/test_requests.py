@@ -46,7 +46,7 @@ def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMa
     assert client.pid == one.pid
     assert client.cells == 36
     assert client.bounds == [-60.0, -60.0, 60.0, 60.0]
-    assert client.layers == ["points"]
+    assert client.layers[:3] == ["points", "voxel(leaf,leaf_x,leaf_y,leaf_z)", "ndt(leaf,min_points=6)"]
     assert 0 < client.session < 2**62
     assert client.budget_bytes > 0
 

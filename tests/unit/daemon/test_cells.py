@@ -266,7 +266,7 @@ def test_a_budget_that_is_just_enough(inner: Inner, small_map: DividedMap) -> No
     """While cells load more is reserved than they come to need: no reason to refuse the last ones."""
     each = sizes(small_map, inner)
     one = inner(small_map.root, workers=2)
-    estimate = one.store.estimate(0)
+    estimate = one.store.estimate(0, "points")
     assert estimate > each
     one.books.budget_bytes = one.books.overhead_bytes + 15 * each + estimate
     reply = everything(one)
@@ -321,7 +321,7 @@ def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: Di
     for name in ("0_0.pcd", "20_20.pcd"):
         ascii_cell(small_map, name, 50_000)
     one = inner(small_map.root, workers=2)
-    half = one.store.estimate(one.store.index_of("0_0.pcd") or 0)
+    half = one.store.estimate(one.store.index_of("0_0.pcd") or 0, "points")
     one.books.budget_bytes = one.books.overhead_bytes + 2 * half + 100_000
     one.cells.selected(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0), one.now_s())
     reply = one.cells_of(1)
@@ -370,7 +370,7 @@ def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map:
 
 
 def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:
-    quota = 3 * inner(small_map.root).store.estimate(0)
+    quota = 3 * inner(small_map.root).store.estimate(0, "points")
     one = inner(small_map.root, quota_bytes=quota)
     session, ids = one.session(), ("0_0.pcd",) * 10 + ("20_20.pcd",) * 10
     for request in (1, 2):  # cold, then warm

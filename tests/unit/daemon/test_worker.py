@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 
 from shmmap.daemon import jobs
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.layout import PublishBlock
 from shmmap.segment.pins import is_pinned, prepare_process
 from tests.support.daemon_process import wait_ended, wait_readable
 from tests.support.divided_map import random_points
@@ -276,3 +278,37 @@ def test_it_does_not_keep_what_it_passed_on(loader: Loader, tmp_path: Path) -> N
             os.close(fd)
         assert not is_pinned(again)
         os.close(again)
+
+
+def test_a_layer_is_made_of_points_in_memory_while_they_are_of_the_file_s_state(
+    loader: Loader, shm_dir: str, tmp_path: Path
+) -> None:
+    path = cell(tmp_path / "cell.pcd", 400)
+    loader.load(1, path)
+    done, fd = loader.receive()
+    assert isinstance(done, jobs.Done)
+    directory = ShmDirectory(shm_dir)
+    segment = "/shmmap.test.0123456789abcdef"
+    block = PublishBlock(1, 2)
+    directory.publish(fd, segment, block=block, header_bytes=done.header_bytes, mode=0o600, gid=-1)
+    os.close(fd)
+    with open(f"{shm_dir}{segment}", "r+b") as file:  # other points than the file's: what is read shows
+        file.seek(done.header_bytes)
+        file.write(np.full((400, 3), 0.25, "<f4").tobytes())
+
+    def voxels(number: int) -> int:
+        loader.send(jobs.Job(number, str(path), str(path), "voxel(leaf=1.0)", BOX, "map", 1 << 30, segment))
+        made, made_fd = loader.receive()
+        assert isinstance(made, jobs.Done)
+        os.close(made_fd)
+        return made.points
+
+    try:
+        assert voxels(2) == 1
+        cell(path, 401)
+        assert voxels(3) > 300
+    finally:
+        directory.unlink(segment)
+        directory.close()
+    cell(path, 400)
+    assert voxels(4) > 300

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Versions of computed layers: the cell's own, and for a layer with a halo its neighbours' as well."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from xxhash import xxh3_64_intdigest
+
+from shmmap.geometry import Box
+from shmmap.layers.points import LAYER
+from shmmap.layers.spec import layer_spec
+from shmmap.origin.catalogue import Catalogue
+
+__all__ = ["MAX_NEIGHBOURS", "LayerVersions"]
+
+MAX_NEIGHBOURS: Final = 64
+"""Most files that a layer with a halo reads beside its own."""
+
+
+class LayerVersions:
+    """Answers for the layers of one daemon's map.
+
+    Parameters
+    ----------
+    catalogue
+        Returns the map's current catalogue.
+    """
+
+    def __init__(self, catalogue: Callable[[], Catalogue]) -> None:
+        self._catalogue = catalogue
+        self._halos: dict[str, float] = {LAYER: 0.0}
+        self._versions: dict[tuple[int, str], int] = {}
+
+    def halo_m(self, layer: str) -> float:
+        """How far beyond a cell a layer looks, metres."""
+        halo = self._halos.get(layer)
+        if halo is None:
+            if len(self._halos) > 4096:
+                self._halos = {LAYER: 0.0}
+            halo = self._halos[layer] = layer_spec(layer).halo_m
+        return halo
+
+    def version(self, index: int, layer: str) -> int:
+        """Current version of one layer of a cell.
+
+        It is the cell's own (`shmmap.origin.stamp.cell_version`) unless the layer has a halo: then
+        the XXH3-64 of it and of the neighbours' versions in id order, as u64.
+        """
+        if not self.halo_m(layer):
+            return self._catalogue().version(index)
+        version = self._versions.get((index, layer))
+        if version is None:
+            own = self._catalogue().version
+            cells = [index, *self.neighbours(index, layer)]
+            version = xxh3_64_intdigest(struct.pack(f"<{len(cells)}Q", *map(own, cells)))
+            self._versions[index, layer] = version
+        return version
+
+    def neighbours(self, index: int, layer: str) -> list[int]:
+        """Catalogue indices of the cells that a layer of this one looks into, ascending."""
+        halo = self.halo_m(layer)
+        if not halo:
+            return []
+        min_x, min_y, max_x, max_y = self._catalogue().box(index)
+        area = Box(min_x - halo, min_y - halo, max_x + halo, max_y + halo)
+        return [found for found in self._catalogue().query(area).tolist() if found != index]
+
+    def forget(self) -> None:
+        """A stamp or the catalogue has changed."""
+        self._versions.clear()

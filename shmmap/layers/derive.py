@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A computed layer of one cell, from its points to a finished segment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xxhash
+
+from shmmap.layers.build import build_spec
+from shmmap.layers.contract import Box
+from shmmap.layers.sources import CellSource, read_halo, read_source
+from shmmap.layers.spec import LayerSpec
+from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.table_writer import SegmentOrigin, write_table
+
+__all__ = ["CellJob", "Derived", "combined_digest", "derive"]
+
+
+@dataclass(frozen=True, slots=True)
+class CellJob:
+    """Which cell: id, source file, box (metres), frame, and its neighbours' files for a layer with a halo."""
+
+    cell_id: str
+    path: str
+    box: Box
+    frame_id: str = "map"
+    neighbours: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Derived:
+    """A finished segment's header, and what was read for it.
+
+    ``neighbours`` are the stamps of the neighbours' files, in the job's order.
+    """
+
+    header: SegmentHeader
+    neighbours: tuple[SourceStamp, ...]
+    warnings: tuple[str, ...]
+
+
+def combined_digest(own: bytes, neighbours: Sequence[bytes]) -> bytes:
+    """Digest of everything that a layer was computed from: the source's own where there is no more."""
+    return xxhash.xxh3_128_digest(b"".join([own, *neighbours])) if neighbours else own
+
+
+def derive(
+    spec: LayerSpec,
+    job: CellJob,
+    fd: int,
+    *,
+    source: CellSource | None = None,
+    reserve: Callable[[int], None] | None = None,
+) -> Derived:
+    """Build a layer of a cell into an empty segment file.
+
+    Parameters
+    ----------
+    fd
+        Empty file, open for writing; after an error its contents mean nothing.
+    source
+        The cell's points, where they are at hand; else its file is read.
+    reserve
+        Called with the segment's size in bytes before anything is written; it refuses by raising.
+
+    Raises
+    ------
+    MapDataError
+        If a file cannot be read, or its points cannot become this layer.
+    OSError
+        ENOSPC if the file system is full.
+    """
+    if source is None:
+        source = read_source(job.path, job.box, spec.source_columns)
+    points = source.points
+    around: tuple[tuple[SourceStamp, bytes], ...] = ()
+    if job.neighbours:
+        points.halo, around = read_halo(job.neighbours, job.box, spec.halo_m, points.xyz.dtype)
+    table = build_spec(spec, points)
+    header = write_table(
+        fd,
+        {name: np.ascontiguousarray(column) for name, column in table.columns.items()},
+        layer=str(spec),
+        rows=table.rows,
+        origin=SegmentOrigin(
+            cell_id=job.cell_id,
+            box=job.box,
+            frame_id=job.frame_id,
+            source=source.stamp,
+            source_digest=combined_digest(source.digest, [digest for _, digest in around]),
+            source_points=source.source_points,
+            dropped_points=source.dropped_points,
+        ),
+        builder_version=spec.builder_version,
+        units=table.units,
+        lattice=table.lattice,
+        z_min=source.z_min,
+        z_max=source.z_max,
+        reserve=reserve,
+    )
+    return Derived(header, tuple(stamp for stamp, _ in around), source.warnings)
