@@ -60,6 +60,7 @@ if TYPE_CHECKING:
         UnknownCell,
     )
     from shmmap.formats.cloud import read_cloud
+    from shmmap.formats.pcd_writer import write_pcd
     from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
     from shmmap.layers.build import build_layer
     from shmmap.layers.contract import LayerKind, LayerTable
@@ -122,6 +123,7 @@ __all__ = [
     "connect",
     "read_cloud",
     "voxel_covariances",
+    "write_pcd",
 ]
 
 _GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
@@ -163,6 +165,8 @@ def __getattr__(name: str) -> Any:
         module = f"shmmap.layers.{_LAYERS[name]}"
     elif name == "read_cloud":
         module = "shmmap.formats.cloud"
+    elif name == "write_pcd":
+        module = "shmmap.formats.pcd_writer"
     elif name in __all__:
         module = "shmmap.errors"
     else:

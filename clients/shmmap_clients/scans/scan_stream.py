@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans over ZeroMQ: whoever makes them binds a publisher, whoever wants them subscribes.
+
+A message has a first frame in msgpack, ``{"shmmap_scan": 1, "name", "stamp_s", "pose", "columns"}``,
+and one frame of plain bytes for each column.  ``pose`` is null or 16 numbers, the rows of
+T_map_sensor; ``columns`` are ``[name, dtype, shape]`` with numpy's dtype strings (``"<f4"``), in the
+order of the frames.  ``"last": true`` (without columns) says that no more scans come.
+"""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from shmmap import BadRequest
+from shmmap_clients.scans.scan_sequence import Scan
+
+__all__ = ["ScanPublisher", "ScanSubscriber", "decode_scan", "encode_scan"]
+
+_VERSION: Final = 1
+_QUEUE: Final = 64  # scans that wait for a slow reader before the oldest are lost
+_LINGER_MS: Final = 10_000
+
+
+class _Head(msgspec.Struct, omit_defaults=True):
+    shmmap_scan: int = 0
+    name: str = ""
+    stamp_s: float = 0.0
+    pose: list[float] | None = None
+    columns: list[tuple[str, str, list[int]]] = []
+    last: bool = False
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(_Head)
+
+
+def encode_scan(scan: Scan | None) -> list[bytes]:
+    """Return the frames of a scan, or of the end of the stream."""
+    if scan is None:
+        return [_encoder.encode(_Head(_VERSION, last=True))]
+    arrays = {name: np.ascontiguousarray(values) for name, values in scan.columns.items()}
+    pose = None if scan.T_map_sensor is None else [float(v) for v in scan.T_map_sensor.ravel()]
+    columns = [(name, values.dtype.str, list(values.shape)) for name, values in arrays.items()]
+    head = _Head(_VERSION, scan.name, scan.stamp_s, pose, columns)
+    return [_encoder.encode(head), *(values.tobytes() for values in arrays.values())]
+
+
+def decode_scan(frames: list[bytes]) -> Scan | None:
+    """Return the scan, None at the end of the stream.
+
+    Raises
+    ------
+    BadRequest
+        The frames are no scan.
+    """
+    try:
+        head = _decoder.decode(frames[0])
+        if head.shmmap_scan != _VERSION:
+            raise ValueError(f"version {head.shmmap_scan}, not {_VERSION}")
+        if head.last:
+            return None
+        if len(frames) != len(head.columns) + 1:
+            raise ValueError(f"{len(frames) - 1} frames for {len(head.columns)} columns")
+        columns: dict[str, NDArray[Any]] = {}
+        for (name, dtype, shape), frame in zip(head.columns, frames[1:], strict=True):
+            kind = np.dtype(dtype)
+            if kind.kind not in "fiu":
+                raise ValueError(f"column {name!r} of type {dtype}")
+            columns[name] = np.frombuffer(frame, kind).reshape(shape)
+        xyz = columns.get("xyz")
+        if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3:
+            raise ValueError("no column xyz of shape (N, 3)")
+        if any(len(values) != len(xyz) for values in columns.values()):
+            raise ValueError("columns of different lengths")
+        pose = None
+        if head.pose is not None:
+            pose = np.array(head.pose).reshape(4, 4)
+            if not np.isfinite(pose).all():
+                raise ValueError("a pose that is not finite")
+    except (msgspec.DecodeError, ValueError, TypeError, IndexError) as error:
+        raise BadRequest(f"a message that is no scan: {error}") from None
+    return Scan(head.name, head.stamp_s, columns, pose)
+
+
+class ScanPublisher:
+    """Sends scans to whoever listens.
+
+    Parameters
+    ----------
+    endpoint
+        Address to bind, such as ``ipc:///tmp/scans`` or ``tcp://127.0.0.1:5600``.
+
+    Raises
+    ------
+    BadRequest
+        The address cannot be bound.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.XPUB)
+        self._socket.sndhwm = _QUEUE
+        self._socket.linger = _LINGER_MS
+        try:
+            self._socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            self._socket.close(0)
+            self._context.term()
+            raise BadRequest(f"cannot bind {endpoint}: {error}") from None
+        self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def __enter__(self) -> ScanPublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def wait_for_listener(self, timeout_s: float) -> bool:
+        """Wait until somebody has subscribed; False if nobody has in time."""
+        if not self._socket.poll(int(timeout_s * 1000)):
+            return False
+        self._socket.recv()
+        return True
+
+    def send(self, scan: Scan | None) -> None:
+        """Send a scan; None: the last one was sent."""
+        self._socket.send_multipart(encode_scan(scan))
+
+    def close(self) -> None:
+        """Deliver what is queued (ten seconds at most) and close."""
+        self._socket.close()
+        self._context.term()
+
+
+class ScanSubscriber:
+    """Scans from a publisher: iterate until it sends the last one.
+
+    Parameters
+    ----------
+    endpoint
+        Its address.
+
+    Raises
+    ------
+    BadRequest
+        The address makes no sense.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.rcvhwm = _QUEUE
+        self._socket.linger = 0
+        try:
+            self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise BadRequest(f"cannot connect to {endpoint}: {error}") from None
+        self._socket.subscribe(b"")
+
+    def __enter__(self) -> ScanSubscriber:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> ScanSubscriber:
+        return self
+
+    def __next__(self) -> Scan:
+        scan = decode_scan(self._socket.recv_multipart())
+        if scan is None:
+            raise StopIteration
+        return scan
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close(0)
+        self._context.term()

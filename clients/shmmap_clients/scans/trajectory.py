@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses by time, in the TUM format: ``t tx ty tz qx qy qz qw`` on each line."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest, MapDataError, MapMissing
+
+__all__ = ["Trajectory", "matrix_of", "quaternion_of", "read_trajectory", "tum_line"]
+
+_NORM_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses of a sensor in the order of a file.
+
+    Attributes
+    ----------
+    stamps_s
+        (N,) float64, seconds.
+    T_map_sensor
+        (N, 4, 4) float64, metres.
+    """
+
+    stamps_s: NDArray[np.float64]
+    T_map_sensor: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamps_s)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(N, 3), metres, map frame."""
+        return self.T_map_sensor[:, :3, 3]
+
+
+def matrix_of(translation: Iterable[float], quaternion: Iterable[float]) -> NDArray[np.float64]:
+    """Return the (4, 4) pose of a translation (metres) and a quaternion (x, y, z, w), normalised.
+
+    Raises
+    ------
+    BadRequest
+        The quaternion is zero or not finite.
+    """
+    x, y, z, w = quaternion
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not (math.isfinite(norm) and norm > 0):
+        raise BadRequest(f"{(x, y, z, w)} is no rotation")
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = list(translation)
+    return T
+
+
+def quaternion_of(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Return the quaternion (x, y, z, w) of a (3, 3) rotation, w not negative.
+
+    The largest component is found first, so that none is lost to rounding (Shepperd 1978).
+    """
+    r = rotation
+    trace = float(r[0, 0] + r[1, 1] + r[2, 2])
+    squares = [1 + 2 * float(r[i, i]) - trace for i in range(3)] + [1 + trace]
+    i = int(np.argmax(squares))
+    q = [0.0] * 4
+    q[i] = math.sqrt(max(squares[i], 0.0)) / 2
+    scale = 4 * q[i]
+    if i == 3:
+        q[0], q[1], q[2] = ((r[2, 1] - r[1, 2]), (r[0, 2] - r[2, 0]), (r[1, 0] - r[0, 1]))
+        q[:3] = [float(v) / scale for v in q[:3]]
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[j] = float(r[j, i] + r[i, j]) / scale
+        q[k] = float(r[k, i] + r[i, k]) / scale
+        q[3] = float(r[k, j] - r[j, k]) / scale
+    sign = -1.0 if q[3] < 0 else 1.0
+    return sign * q[0], sign * q[1], sign * q[2], sign * q[3]
+
+
+def tum_line(stamp_s: float, T_map_sensor: NDArray[np.float64]) -> str:
+    """Return one line of the format, without its end."""
+    numbers = (*T_map_sensor[:3, 3], *quaternion_of(T_map_sensor[:3, :3]))
+    return " ".join([f"{stamp_s:.9f}", *(f"{float(v):.9f}" for v in numbers)])
+
+
+def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Read a TUM file; empty lines and lines that begin with ``#`` are skipped.
+
+    Raises
+    ------
+    MapMissing
+        There is no such file.
+    MapDataError
+        A line is not eight numbers, or its rotation is none; the message names the line.
+    """
+    name = os.fspath(path)
+    stamps: list[float] = []
+    poses: list[NDArray[np.float64]] = []
+    try:
+        with open(name, encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                text = line.partition("#")[0].strip()
+                if not text:
+                    continue
+                try:
+                    values = [float(word) for word in text.split()]
+                except ValueError:
+                    values = []
+                good = len(values) == 8 and all(math.isfinite(value) for value in values)
+                if not good or abs(math.hypot(*values[4:]) - 1.0) > _NORM_TOLERANCE:
+                    raise MapDataError(
+                        f"{name}, line {number}: not `t tx ty tz qx qy qz qw`", cause="trajectory"
+                    )
+                stamps.append(values[0])
+                poses.append(matrix_of(values[1:4], values[4:]))
+    except FileNotFoundError:
+        raise MapMissing(f"there is no file {name}") from None
+    except UnicodeDecodeError:
+        raise MapDataError(f"{name}: not a text file", cause="trajectory") from None
+    return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4))

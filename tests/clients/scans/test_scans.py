@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses from files, scans from directories, scans over sockets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
+from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber, decode_scan, encode_scan
+from shmmap_clients.scans.trajectory import matrix_of, quaternion_of, read_trajectory, tum_line
+
+from shmmap import BadRequest, MapDataError, MapMissing
+
+
+def test_rotations_there_and_back() -> None:
+    rng = np.random.default_rng(1)
+    quaternions = rng.normal(size=(200, 4))
+    quaternions[:4] = np.eye(4)  # half turns about each axis, and none
+    v = rng.normal(size=3)
+    for q in quaternions / np.linalg.norm(quaternions, axis=1)[:, None]:
+        T = matrix_of((1, 2, 3), q)
+        assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+        # q v q* by the vector formula
+        t = 2 * np.cross(q[:3], v)
+        assert np.allclose(T[:3, :3] @ v, v + q[3] * t + np.cross(q[:3], t))
+        back = np.array(quaternion_of(T[:3, :3]))
+        assert np.allclose(back, q if back @ q > 0 else -q, atol=1e-9)
+
+
+def test_a_trajectory_is_read_and_written(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    T = matrix_of((1.5, -2.0, 0.25), (0.1, -0.2, 0.3, 0.9))
+    path.write_text(f"# t x y z qx qy qz qw\n\n{tum_line(0.1, np.eye(4))}\n{tum_line(0.2, T)}  # last\n")
+    read = read_trajectory(path)
+    assert read.stamps_s.tolist() == [0.1, 0.2]
+    assert np.allclose(read.T_map_sensor[1], T, atol=1e-8)
+    assert np.allclose(read.positions[1], T[:3, 3])
+
+
+@pytest.mark.parametrize("line", ["1 2 3", "a b c d e f g h", "0 0 0 0 0 0 0 0", "0 nan 0 0 0 0 0 1"])
+def test_a_wrong_line_is_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"0 0 0 0 0 0 0 1\n{line}\n")
+    with pytest.raises(MapDataError, match="line 2"):
+        read_trajectory(path)
+
+
+def test_trajectory_refusals(tmp_path: Path) -> None:
+    with pytest.raises(MapMissing):
+        read_trajectory(tmp_path / "none.txt")
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(MapDataError):
+        read_trajectory(tmp_path / "binary")
+    with pytest.raises(BadRequest):
+        matrix_of((0, 0, 0), (0, 0, 0, 0))
+
+
+def write_scans(directory: Path, names: list[str]) -> None:
+    directory.mkdir()
+    for n, name in enumerate(names):
+        np.savez(directory / f"{name}.npz", xyz=np.full((3 + n, 3), n, np.float32))
+    (directory / "README").write_text("not a scan")
+
+
+def test_poses_go_to_scans_by_place_or_by_number(tmp_path: Path) -> None:
+    write_scans(tmp_path / "a", ["s_2", "s_0", "s_4"])
+    poses = tmp_path / "poses.txt"
+    lines = [tum_line(float(n), matrix_of((10.0 * n, 0, 0), (0, 0, 0, 1))) for n in range(5)]
+    poses.write_text("\n".join(lines))
+    scans = list(ScanSequence(tmp_path / "a", read_trajectory(poses)))
+    assert [scan.name for scan in scans] == ["s_0", "s_2", "s_4"]
+    assert [scan.stamp_s for scan in scans] == [0.0, 2.0, 4.0]
+    assert [float(scan.T_map_sensor[0, 3]) for scan in scans if scan.T_map_sensor is not None] == [0, 20, 40]
+    assert [len(scan.xyz) for scan in scans] == [4, 3, 5]
+    poses.write_text("\n".join(lines[:3]))
+    assert [scan.stamp_s for scan in ScanSequence(tmp_path / "a", read_trajectory(poses))] == [0.0, 1.0, 2.0]
+    poses.write_text("\n".join(lines[:4]))
+    with pytest.raises(BadRequest, match="s_4"):
+        ScanSequence(tmp_path / "a", read_trajectory(poses))
+    bare = list(ScanSequence(tmp_path / "a"))
+    assert [scan.T_map_sensor for scan in bare] == [None] * 3
+    with pytest.raises(MapMissing):
+        ScanSequence(tmp_path / "b")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MapMissing):
+        ScanSequence(tmp_path / "empty")
+
+
+def make_scan(pose: bool = True) -> Scan:
+    columns: dict[str, NDArray[Any]] = {
+        "xyz": np.arange(12, dtype=np.float32).reshape(4, 3),
+        "intensity": np.arange(4, dtype=np.uint8),
+        "normal": np.ones((4, 2), np.float64),
+    }
+    return Scan("one", 12.5, columns, matrix_of((1, 2, 3), (0, 0, 0.6, 0.8)) if pose else None)
+
+
+@pytest.mark.parametrize("pose", [True, False])
+def test_a_message_there_and_back(pose: bool) -> None:
+    scan = make_scan(pose)
+    back = decode_scan(encode_scan(scan))
+    assert back is not None
+    assert (back.name, back.stamp_s) == ("one", 12.5)
+    assert (back.T_map_sensor is not None) == pose
+    for name, values in scan.columns.items():
+        assert back.columns[name].dtype == values.dtype
+        assert np.array_equal(back.columns[name], values)
+    assert decode_scan(encode_scan(None)) is None
+
+
+def test_messages_that_are_no_scans() -> None:
+    good = encode_scan(make_scan())
+    for wrong in ([b""], [b"\x80"], good[:-1], [good[0], b"123", *good[2:]], [*good, b""]):
+        with pytest.raises(BadRequest):
+            decode_scan(wrong)
+
+
+def test_scans_over_a_socket(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/scans"
+    with ScanPublisher(endpoint) as publisher, ScanSubscriber(endpoint) as subscriber:
+        assert publisher.wait_for_listener(30.0)
+        for n in range(3):
+            publisher.send(Scan(f"s{n}", n, make_scan().columns))
+        publisher.send(None)
+        assert [scan.name for scan in subscriber] == ["s0", "s1", "s2"]
+        assert not publisher.wait_for_listener(0.0)
+    with pytest.raises(BadRequest):
+        ScanPublisher("nowhere")
+    with pytest.raises(BadRequest):
+        ScanSubscriber("nowhere")
