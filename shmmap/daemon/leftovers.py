@@ -140,6 +140,9 @@ class Leftovers:
         index = catalogue.find(header.cell_id)
         if index is None:
             return "its cell is not in the map"
+        known = store.books.slots.get(Key(header.cell_id, header.layer))
+        if known is not None and known.resident is not None:
+            return "there is another one"
         if (block.version, header.source) != (
             store.layers.version(index, header.layer),
             catalogue.stamp(index),
@@ -147,9 +150,6 @@ class Leftovers:
             return "its source has changed"
         if header.box != catalogue.box(index) or header.frame_id != catalogue.frame_id:
             return "its cell has moved"
-        known = store.books.slots.get(Key(header.cell_id, header.layer))
-        if known is not None and known.resident is not None:
-            return "there is another of the same version"
         if store.books.shortage(status.st_blocks * 512) > 0:
             return "it does not fit in the budget"
         return ""
