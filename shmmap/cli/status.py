@@ -93,6 +93,12 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         lines.append(("stale", f"{count['stale_cells']:,} segments wait for their successor"))
     if count["zombies"]:
         lines.append(("zombies", f"{count['zombies']:,} segments, {format_bytes(count['bytes_zombie'])}"))
+    if count["adopted"]:
+        failed = f", {count['adoptions_failed']:,} of them damaged" if count["adoptions_failed"] else ""
+        lines.append(("warm start", f"{count['adopted']:,} segments of an earlier daemon taken over{failed}"))
+    if count["pin_source"]:
+        source = "the locks of clients" if count["pin_source"] == 1 else "what clients say"
+        lines.append(("pins", f"this system grants no leases: known from {source} only"))
     lines += [
         ("clients", f"{count['sessions']:,} now, {count['sessions_opened']:,} so far"),
         ("requests", f"{count['requests']:,}, {format_bytes(count['bytes_sent'])} sent{hit_rate}"),

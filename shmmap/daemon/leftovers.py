@@ -28,7 +28,6 @@ from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import PublishBlock, SegmentHeader
 from shmmap.segment.names import is_zombie, segment_prefix, statistics_name, zombie_name
-from shmmap.segment.pins import is_pinned
 from shmmap.segment.verify import read_header
 
 __all__ = ["Leftovers", "TakenOver"]
@@ -169,7 +168,7 @@ class Leftovers:
     def _keep_for_readers(self, fd: int, name: str, found: _Found, now_s: float) -> bool:
         """Watch it as a zombie if somebody uses it, else remove it; True if it is used."""
         try:
-            used = is_pinned(fd)
+            used = self._reclaimer.pins.told(fd)
         except OSError:  # not ours, or nothing that has leases
             used = False
         if not used:

@@ -47,9 +47,11 @@ from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import Leftovers
 from shmmap.daemon.logs import set_up_logging
+from shmmap.daemon.pin_support import Rung
+from shmmap.daemon.pin_watch import PinWatch
 from shmmap.daemon.prerequisites import (
     access_of_segments,
-    check_leases,
+    choose_pins,
     make_runtime_dir,
     raise_descriptor_limit,
 )
@@ -106,7 +108,7 @@ def run(config: DaemonConfig) -> int:
         make_runtime_dir(Path(path).parent, gid)
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
-        check_leases(directory)
+        pins = choose_pins(directory)
         origin = open_map(
             config.map_path,
             metadata=config.metadata or None,
@@ -128,7 +130,7 @@ def run(config: DaemonConfig) -> int:
         for problem in catalogue.problems:
             _log.warning("%s", problem)
         with signals.held():
-            life = _Life(config, catalogue, directory, path, mode, gid)
+            life = _Life(config, catalogue, directory, pins, path, mode, gid)
             stack.callback(lambda: life.close(keep=signals.keep))
         life.serve(Reloader(origin), started_s, signals, ServiceManager(), activated)
     return 0
@@ -179,6 +181,7 @@ class _Life:
         config: DaemonConfig,
         catalogue: Catalogue,
         directory: ShmDirectory,
+        pins: PinWatch,
         socket_path: str,
         mode: int,
         gid: int,
@@ -219,7 +222,8 @@ class _Life:
             return fits
 
         self._statistics.reserve = grow_statistics
-        reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction])
+        reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction], pins)
+        self._statistics.set("pin_source", list(Rung).index(pins.rung))
         pool = WorkerPool(
             config.loaders(),
             directory.path,

@@ -147,6 +147,11 @@ class Loading:
         """
         return any(worker.queue and next(iter(worker.queue)) not in self.hungry for worker in self.pool)
 
+    def hear(self, now_s: float) -> None:
+        """The kernel reports that segments were closed."""
+        if self.reclaimer.hear(now_s):
+            self.books.clear_failures(SPACE_CODES)
+
     def next_event_s(self) -> float:
         """When `pump` has something to do although nothing arrives; infinity for never."""
         return min(self.reclaimer.next_sweep_s(), self.reclaimer.wake_s, self.pool.next_deadline_s())

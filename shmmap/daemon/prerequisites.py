@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import resource
 from pathlib import Path
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.pin_support import Rung, probe_pins
+from shmmap.daemon.pin_watch import PinWatch
 from shmmap.daemon.privileges import group_id
 from shmmap.errors import ConfigError
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import leases_work
 
-__all__ = ["access_of_segments", "check_leases", "make_runtime_dir", "raise_descriptor_limit"]
+__all__ = ["access_of_segments", "choose_pins", "make_runtime_dir", "raise_descriptor_limit"]
+
+_log = logging.getLogger(__name__)
 
 
 def raise_descriptor_limit() -> None:
@@ -43,15 +47,19 @@ def make_runtime_dir(path: Path, gid: int) -> None:
         ) from error
 
 
-def check_leases(directory: ShmDirectory) -> None:
-    """Refuse a file system that cannot tell who uses a file."""
-    fd = directory.create()
-    try:
-        if not leases_work(fd):
-            raise ConfigError(
-                f"{directory.path}: its file system grants no leases, so nobody could tell what is in use",
-                key="shm_dir",
-                hint="name a directory on a tmpfs",
-            )
-    finally:
-        os.close(fd)
+def choose_pins(directory: ShmDirectory) -> PinWatch:
+    """Find out how well this machine tells who uses a segment, and say so."""
+    support = probe_pins(directory)
+    if support.rung is not Rung.LEASES:
+        _log.warning(
+            "%s grants no leases: who uses a segment is known from %s only",
+            directory.path,
+            support.rung.value,
+        )
+    _log.info(
+        "pins: leases=%d locks=%d close_events=%d process_ends=%d, taken: %s",
+        support.leases, support.locks, support.close_events, support.process_ends, support.rung.value,
+    )  # fmt: skip
+    return PinWatch(
+        directory, support.rung, events=support.close_events and support.rung is not Rung.SESSIONS
+    )

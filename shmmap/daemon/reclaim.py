@@ -3,31 +3,36 @@
 
 Renaming first means that nobody new can open the segment; looking again on a later tick catches
 whoever was just opening it.  A segment that is still mapped stays in the books as a zombie, and is
-looked at again now and then, at once when its reader says or shows that it let go.
+looked at again when its reader says that it let go, when the kernel reports that somebody closed it,
+or when a client's process ends; on a timer only as a precaution.
 """
 
 from __future__ import annotations
 
 import contextlib
 import enum
-import os
 from collections.abc import Callable, Iterable
 from typing import Final
 
 from shmmap.daemon.eviction import EvictionPolicy
+from shmmap.daemon.pin_support import Rung
+from shmmap.daemon.pin_watch import PinWatch
 from shmmap.daemon.residency import Key, Residency, Resident, Zombie
 from shmmap.daemon.sessions import Sessions
 from shmmap.protocol.messages import Holder
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import zombie_name
-from shmmap.segment.pins import holders, is_pinned
+from shmmap.segment.pins import holders
 
 __all__ = ["Outcome", "Reclaimer"]
 
 TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
 ZOMBIE_INTERVAL_S: Final = 0.1
-"""How often a segment that is still mapped is looked at, when nothing else gives a reason to."""
+"""How often a segment that is still mapped is looked at where the kernel does not report closes."""
+WATCHED_INTERVAL_S: Final = 5.0
+"""How often, at most, where it does: a precaution.  A report comes a moment before the close counts,
+so the first looks after it follow each other quickly."""
 ZOMBIE_SHARE_S: Final = 0.0005
 """With very many of them each is looked at less often: at most one per this time (a look takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0
@@ -52,6 +57,11 @@ def _nothing(resident: Resident) -> None:
 class Reclaimer:
     """Carries out what the books decide about memory.
 
+    Parameters
+    ----------
+    pins
+        Asks the kernel, and hears from it.
+
     Attributes
     ----------
     freed_count, evicted_count
@@ -63,8 +73,14 @@ class Reclaimer:
     """
 
     def __init__(
-        self, residency: Residency, directory: ShmDirectory, sessions: Sessions, policy: EvictionPolicy
+        self,
+        residency: Residency,
+        directory: ShmDirectory,
+        sessions: Sessions,
+        policy: EvictionPolicy,
+        pins: PinWatch | None = None,
     ) -> None:
+        self.pins = pins or PinWatch(directory)
         self._books = residency
         self._directory = directory
         self._sessions = sessions
@@ -84,16 +100,9 @@ class Reclaimer:
 
     def is_pinned(self, resident: Resident) -> bool | None:
         """The kernel's word on a segment; None if its name is gone."""
-        try:
-            fd = self._directory.open(self._on_disk(resident))
-        except FileNotFoundError:
-            return None
-        except OSError:
-            return True  # out of descriptors, say: who cannot look must not take it for free
-        try:
-            return is_pinned(fd)
-        finally:
-            os.close(fd)
+        if self.pins.rung is Rung.SESSIONS:
+            return bool(resident.sessions)
+        return self.pins.is_used(self._on_disk(resident))
 
     def retire(self, resident: Resident, now_s: float) -> bool:
         """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
@@ -118,6 +127,7 @@ class Reclaimer:
     def _watch(self, zombie: Zombie, now_s: float) -> bool:
         if zombie.resident.checked:
             self._by_key[zombie.resident.key] = zombie
+        self.pins.keep(zombie_name(zombie.resident.name))
         zombie.condemned = self.is_pinned(zombie.resident) is False
         zombie.probe_after_s = now_s + TICK_S
         return zombie.condemned
@@ -125,6 +135,7 @@ class Reclaimer:
     def adopt(self, resident: Resident, now_s: float) -> None:
         """Watch a retired segment of an earlier life of the daemon."""
         zombie = self._books.adopt_zombie(resident)
+        self.pins.keep(zombie_name(resident.name))
         zombie.probe_after_s = now_s + TICK_S
 
     def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
@@ -135,6 +146,7 @@ class Reclaimer:
         if not self._directory.rename(zombie_name(zombie.resident.name), zombie.resident.name):
             self._forget(zombie)
             return None
+        self.pins.release(zombie_name(zombie.resident.name))
         del self._by_key[key]
         old = self._books.revive(zombie)
         if old is not None:
@@ -147,6 +159,7 @@ class Reclaimer:
 
     def _forget(self, zombie: Zombie) -> int:
         resident = zombie.resident
+        self.pins.release(zombie_name(resident.name))
         if self._by_key.get(resident.key) is zombie:
             del self._by_key[resident.key]
         for slot in list(resident.sessions):
@@ -181,14 +194,37 @@ class Reclaimer:
         pinned = self.is_pinned(zombie.resident)
         if pinned:
             zombie.condemned = False
-            interval_s = max(ZOMBIE_INTERVAL_S, ZOMBIE_SHARE_S * len(self._books.zombies))
-            zombie.probe_after_s = now_s + interval_s
+            zombie.probe_after_s = now_s + self._interval_s(zombie)
             return 0
         if pinned is False and now_s < zombie.probe_after_s:
             zombie.condemned = True  # its tick is not over yet
             return 0
         self._directory.unlink(zombie_name(zombie.resident.name))
         return self._forget(zombie)
+
+    def _interval_s(self, zombie: Zombie) -> float:
+        """When to look again at a segment that was found in use."""
+        if self.pins.keeps(zombie_name(zombie.resident.name)):
+            zombie.interval_s = min(max(TICK_S, 2 * zombie.interval_s), WATCHED_INTERVAL_S)
+            return zombie.interval_s
+        return max(ZOMBIE_INTERVAL_S, ZOMBIE_SHARE_S * len(self._books.zombies))
+
+    def hear(self, now_s: float) -> bool:
+        """Somebody closed something: free what nobody has now; whether anything may fit that did not."""
+        names = self.pins.closed()
+        zombies = self._books.zombies
+        if names is None:
+            self._pinned_until_s.clear()
+            names = {zombie_name(name) for name in zombies}
+        changed = False
+        for name in names:
+            zombie = zombies.get(name.removesuffix(zombie_name("")))
+            if zombie is not None:
+                zombie.interval_s = 0.0
+                changed |= self._probe(zombie, now_s) > 0
+            else:
+                changed |= self._pinned_until_s.pop(name, None) is not None
+        return changed
 
     def next_sweep_s(self) -> float:
         """When the next zombie is due; infinity when there is none."""
@@ -212,6 +248,7 @@ class Reclaimer:
         for resident in ordered[:PROBES_AT_ONCE]:
             if self.is_pinned(resident):
                 self._pinned_until_s[resident.name] = now_s + PIN_MEMO_S
+                self.pins.tell_once(resident.name)
                 continue
             missing -= resident.nbytes
             self.retire(resident, now_s)
@@ -238,13 +275,10 @@ class Reclaimer:
     def slots_of(self, resident: Resident) -> list[int] | None:
         """Slots that have a segment locked; None if its name is gone."""
         try:
-            fd = self._directory.open(self._on_disk(resident))
+            with self.pins.opened(self._on_disk(resident)) as fd:
+                return holders(fd)
         except OSError:
             return None
-        try:
-            return holders(fd)
-        finally:
-            os.close(fd)
 
     def holders_of(self, residents: Iterable[Resident], *, limit: int = 512) -> tuple[Holder, ...]:
         """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock."""
@@ -281,3 +315,7 @@ class Reclaimer:
         for resident in self.everything():
             with contextlib.suppress(OSError):
                 self._directory.unlink(self._on_disk(resident))
+
+    def close(self) -> None:
+        """Hear of nothing any more."""
+        self.pins.close()

@@ -55,12 +55,13 @@ class Zombie:
     """A retired segment; ``resident`` says what it was.
 
     ``probe_after_s`` is when its pins are next worth a look, ``condemned`` that nobody had it open
-    at the last look.
+    at the last look, ``interval_s`` how long the last wait between two looks was.
     """
 
     resident: Resident
     condemned: bool = False
     probe_after_s: float = 0.0
+    interval_s: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

@@ -107,6 +107,9 @@ class Server:
             unread_bytes=lambda: self._replies.unread(list(sessions)),
             session_descriptors=lambda: [session.fd for session in sessions],
         )
+        for fd, hear in ((store.reclaimer.pins.fd, store.loads.hear), (store.names.fd, store.hear_of_names)):
+            if fd >= 0:
+                self.watch(fd, lambda hear=hear: hear(time.monotonic()))  # type: ignore[misc]
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
         self._poller.register(self._epoll.fileno(), zmq.POLLIN)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from shmmap.daemon import jobs
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.daemon.loading import Loading
+from shmmap.daemon.name_watch import NameWatch
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Key, Load, Residency, Resident, Slot
 from shmmap.daemon.workers import WorkerPool
@@ -61,6 +62,8 @@ class Store:
     ----------
     loads
         What is being loaded.
+    names
+        Hears of names that vanish.
     history : deque
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
     used : set
@@ -99,6 +102,7 @@ class Store:
         self.id_prefix = id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
+        self.names = NameWatch(directory.path, self.segment_prefix)
         self._directory = directory
         self._statistics = statistics
         self._instance = instance
@@ -389,6 +393,14 @@ class Store:
         """Retire on request; True if nobody has it mapped."""
         return self.reclaimer.retire(resident, now_s)
 
+    def hear_of_names(self, now_s: float) -> None:
+        """Names vanished from the directory: what somebody else removed is handed out no more."""
+        names = self.names.gone()
+        residents = self.books.residents() if names is None else map(self.books.resident_named, names)
+        for resident in [r for r in residents if r is not None and not self._directory.exists(r.name)]:
+            _log.warning("%s of %s was removed by somebody else", resident.name, resident.key.cell_id)
+            self.reclaimer.retire(resident, now_s)  # it finds no name
+
     def replace_catalogue(self, new: Catalogue, now_s: float) -> CatalogueChange:
         """Serve another state of the map; takes effect cell by cell as cells are asked for."""
         change = compare(self.catalogue, new)
@@ -442,3 +454,5 @@ class Store:
         self.loads.pool.close()
         if not keep:
             self.reclaimer.remove_all()
+        self.reclaimer.close()
+        self.names.close()

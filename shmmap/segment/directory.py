@@ -120,6 +120,10 @@ class ShmDirectory:
         step("daemon.unlinked")
         return True
 
+    def exists(self, name: str) -> bool:
+        """Whether there is such a name."""
+        return os.access(name.lstrip("/"), os.F_OK, dir_fd=self._fd, follow_symlinks=False)
+
     def names(self, prefix: str) -> list[str]:
         """Names that start with ``prefix`` (slash included), sorted."""
         bare = prefix.lstrip("/")

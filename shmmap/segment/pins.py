@@ -11,7 +11,6 @@ slot right after opening, and the lock lives as long as its mapping.
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import os
 import signal
@@ -20,7 +19,7 @@ from typing import Final
 
 from shmmap.segment.crash_steps import step
 
-__all__ = ["MAX_SLOT", "holders", "is_pinned", "leases_work", "lock_slot", "prepare_process"]
+__all__ = ["MAX_SLOT", "holders", "is_pinned", "lock_slot", "prepare_process"]
 
 MAX_SLOT: Final = (1 << 62) - 1
 
@@ -75,13 +74,3 @@ def holders(fd: int, *, limit: int = 1024) -> list[int]:
         if end < last:
             ranges.append((end + 1, last))
     return sorted(found)
-
-
-def leases_work(fd: int) -> bool:
-    """Whether this file system grants leases at all; ``fd`` must be used by nobody else."""
-    try:
-        fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
-    except OSError as error:
-        return error.errno == errno.EAGAIN
-    fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_UNLCK)
-    return True

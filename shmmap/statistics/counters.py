@@ -56,6 +56,12 @@ COUNTERS: Final = (
     Counter("reloads", "counter", "", "Times the map's catalogue was read again"),
     Counter("adopted", "counter", "", "Segments of an earlier life of the daemon taken over at its start"),
     Counter("adoptions_failed", "counter", "", "Segments taken over that did not match their checksums"),
+    Counter(
+        "pin_source",
+        "gauge",
+        "",
+        "How the use of a segment is known: 0 leases, 1 locks of clients, 2 what sessions say",
+    ),
     Counter("map_cells", "gauge", "", "Cells in the map's catalogue"),
 )
 

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+import shmmap
+from shmmap.daemon.inotify import NAME_GONE, Inotify
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
@@ -98,18 +103,64 @@ def test_clients_that_die_let_go(daemon: DaemonFactory, connect: Connect, divide
     until_freed(one, client)
 
 
-def test_a_name_removed_behind_the_daemon_s_back(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+@pytest.mark.parametrize("at_once", [False, True])
+def test_names_removed_behind_the_daemon_s_back(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, at_once: bool
 ) -> None:
-    """The handle is stale; once evicted the cell is loaded anew, and the books stay right."""
+    """``rm /dev/shm/*``: readers keep what they map, the cells are loaded anew, the books stay right."""
     one = daemon(divided_map.root)
     client = connect(one)
-    handle = client.selected(["0_0.pcd"]).cells[0]
-    os.unlink(client.path(handle))
-    client.ask("evict", ["0_0.pcd"])
-    again = client.selected(["0_0.pcd"]).cells[0]
-    assert again.segment != handle.segment
-    assert Path(client.path(again)).exists()
+    handles = client.area(circle(0, 0, 25)).cells
+    kept = client.path(handles[0])
+    expected = zlib.crc32(Path(kept).read_bytes())
+    with MappingProcess([kept]) as reader:
+        for handle in handles if at_once else handles[:1]:
+            os.unlink(client.path(handle))
+        again = client.area(circle(0, 0, 25)).cells
+        waiting = Patience()
+        while waiting(not all(Path(client.path(handle)).exists() for handle in again)):
+            again = client.area(circle(0, 0, 25)).cells
+        assert again[0].segment != handles[0].segment
+        assert reader.checksums() == [expected]
     waiting = Patience()
     while waiting(client.ask("stats")[4]["bytes_resident"] != one.segment_bytes()):
         pass
+
+
+@pytest.mark.parametrize("source", ["locks", "sessions"])
+def test_where_there_are_no_leases(daemon: DaemonFactory, divided_map: DividedMap, source: str) -> None:
+    """What clients of the library hold is known by their locks, or by what they say; it says so itself."""
+    one = daemon(divided_map.root, environment={"SHMMAP_TEST_PINS": source})
+    with shmmap.connect(one.endpoint) as client:
+        held = client.around(0, 0, 25).raise_for_failures()
+        expected = [zlib.crc32(cell.xyz.data) for cell in held]
+        assert client.stats().counters["pin_source"] == {"locks": 1, "sessions": 2}[source]
+        evicted = client.evict()
+        assert (evicted.freed, evicted.pinned) == (0, len(held))
+        assert len(one.segments()) == len(held)
+        assert [zlib.crc32(cell.xyz.data) for cell in held] == expected
+        del held
+        client.release()
+        waiting = Patience()
+        while waiting(bool(one.segments())):
+            client.stats()
+    assert "grants no leases" in one.log
+
+
+def test_a_retired_segment_goes_when_its_reader_does_without_a_request(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Nobody tells the daemon anything: the kernel reports that the mapping is gone."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    handle = client.selected(["0_0.pcd"]).cells[0]
+    events = Inotify()
+    with MappingProcess([client.path(handle)]):
+        client.ask("evict")
+        assert len(one.segments()) == 1
+        events.add(one.shm_dir, NAME_GONE)
+    waiting = Patience()
+    while waiting(bool(one.segments())):
+        select.select([events.fd], [], [], 1.0)
+        events.read()
+    events.close()
