@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from shmmap.errors import (
         BadRequest,
         Busy,
+        CannotWrite,
         CellError,
         ConfigError,
         DaemonUnreachable,
@@ -76,6 +77,7 @@ __all__ = [
     "BadRequest",
     "Box",
     "Busy",
+    "CannotWrite",
     "Cell",
     "CellError",
     "CellInfo",

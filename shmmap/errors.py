@@ -8,6 +8,7 @@
     ├── BadRequest             an argument or a message makes no sense            exit 2
     ├── MapDataError           a file is not what it claims to be                 exit 65
     ├── MapMissing             there is no map there                              exit 66
+    ├── CannotWrite            an output cannot be made: disk full, no permission exit 73
     ├── DaemonUnreachable      nobody answers                                     exit 69
     │   ├── NoSocket           nothing listens: the daemon was never started
     │   ├── SocketPermission   the socket is there, but not for this user
@@ -41,6 +42,7 @@ from typing import ClassVar
 __all__ = [
     "BadRequest",
     "Busy",
+    "CannotWrite",
     "CellError",
     "ConfigError",
     "DaemonUnreachable",
@@ -147,6 +149,13 @@ class MapMissing(ShmmapError):
 
     code = "map_missing"
     exit_code = 66
+
+
+class CannotWrite(ShmmapError):
+    """An output cannot be made: the disk is full, not writable, or something else is in its place."""
+
+    code = "cannot_write"
+    exit_code = 73  # EX_CANTCREAT of sysexits.h
 
 
 class DaemonUnreachable(ShmmapError):

@@ -35,7 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Read a point-cloud file to its end and show its fields, points, bounds and oddities.",
         json=_JSON,
     )
-    parser.add_argument("file", metavar="FILE", help="a PCD file, or .ply .pts .xyz .xyzn .xyzrgb")
+    parser.add_argument("file", metavar="FILE", help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb")
     add_json_option(parser)
 
 

@@ -13,6 +13,7 @@ from shmmap.cli import (
     clients,
     config,
     demo,
+    divide,
     evict,
     export,
     health,
@@ -34,6 +35,7 @@ __all__ = ["VERBS", "build_parser", "join_negative_values", "verb_first"]
 
 VERBS: Final = (
     demo,
+    divide,
     serve,
     status,
     ls,
@@ -55,7 +57,7 @@ VERBS: Final = (
 
 _OWN_OPTIONS: Final = frozenset({"--help", "--version"})
 _FLAGS: Final = frozenset({"--json"})  # common options without a value
-_NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z"})
+_NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z", "--origin", "--translate"})
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 

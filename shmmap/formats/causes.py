@@ -33,6 +33,7 @@ CAUSES: Final[dict[str, str]] = {
     "coordinate_range": "a 64-bit integer coordinate that float64 cannot hold exactly",
     "unsupported_format": "a file format that is not read",
     "bad_cloud": "Open3D could not read the file",
+    "bad_las": "a LAS or LAZ file that contradicts itself or cannot be decompressed",
 }
 
 

@@ -13,13 +13,18 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
 from shmmap.formats.finite import Bounds
+from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.open3d_reader import OPEN3D_SUFFIXES, read_with_open3d
 from shmmap.formats.pcd_header import IDENTITY_VIEWPOINT
 from shmmap.formats.pcd_reader import PcdReader
 
-__all__ = ["CloudDescription", "PointCloud", "describe", "read_cloud", "read_pcd"]
+__all__ = ["CLOUD_SUFFIXES", "CloudDescription", "PointCloud", "describe", "read_cloud", "read_pcd"]
 
-_READABLE: Final = (".pcd", *OPEN3D_SUFFIXES)
+CLOUD_SUFFIXES: Final = (".pcd", *LAS_SUFFIXES, *OPEN3D_SUFFIXES)
+"""Endings of the files that are read, in lower case."""
+
+_LAS_BLOCK_POINTS: Final = 1 << 20
+_NO_WARNINGS: Final[tuple[str, ...]] = ()
 
 Bound = NDArray[np.float64]
 
@@ -118,7 +123,7 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
 
 
 def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> PointCloud:
-    """Read a whole cloud: PCD by our own reader, PLY, PTS and the XYZ family through Open3D.
+    """Read a whole cloud: PCD by our own reader, LAS and LAZ through laspy, the rest through Open3D.
 
     Raises
     ------
@@ -128,7 +133,10 @@ def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -
     suffix = _suffix(path)
     if suffix == ".pcd":
         return read_pcd(path, keep_non_finite=keep_non_finite)
-    columns, warnings = read_with_open3d(os.fspath(path), suffix)
+    if suffix in LAS_SUFFIXES:
+        columns, warnings = _read_las(path), _NO_WARNINGS
+    else:
+        columns, warnings = read_with_open3d(os.fspath(path), suffix)
     points = len(columns["xyz"])
     bounds = Bounds()
     mask = bounds.add(np.ascontiguousarray(columns["xyz"]))
@@ -196,15 +204,24 @@ def describe(path: str | os.PathLike[str]) -> CloudDescription:
         )
 
 
+def _read_las(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
+    with LasReader(path) as reader:
+        blocks = list(reader.blocks(_LAS_BLOCK_POINTS))
+        return {
+            spec.name: np.concatenate([np.empty(_shape(spec), spec.dtype), *(b[spec.name] for b in blocks)])
+            for spec in reader.columns
+        }
+
+
 def _suffix(path: str | os.PathLike[str]) -> str:
     name = os.fspath(path)
     suffix = os.path.splitext(name)[1].lower()
-    if suffix not in _READABLE:
+    if suffix not in CLOUD_SUFFIXES:
         raise refusal(
             "unsupported_format",
             f"files called {suffix or 'without a suffix'} are not read",
             path=name,
-            hint=f"readable are {', '.join(_READABLE)}; convert it to one of them",
+            hint=f"readable are {', '.join(CLOUD_SUFFIXES)}; convert it to one of them",
         )
     return suffix
 

@@ -16,7 +16,7 @@ from shmmap.formats.pcd_table import FieldTable, RawBlock
 from shmmap.formats.scratch import borrow_scratch
 from shmmap.formats.source_file import SourceFile
 
-__all__ = ["binary_blocks", "compressed_blocks"]
+__all__ = ["binary_blocks", "check_sizes", "compressed_blocks", "field_arrays"]
 
 _BLOCK_BYTES: Final = 1 << 20  # of file data per block, at most
 _BYTE: Final = np.dtype(np.uint8)
@@ -68,23 +68,8 @@ def compressed_blocks(
     if not header.points:
         return
     compressed_bytes, output_bytes = (int(size) for size in source.read(8).view("<u4"))
-    with_padding = header.points * header.point_bytes
-    without = header.points * sum(field.row_bytes for field in header.fields if not field.padding)
+    with_padding = check_sizes(header, compressed_bytes, output_bytes, left=source.left, path=source.path)
     at = header.data_offset
-    if output_bytes not in (with_padding, without):
-        raise refusal(
-            "bad_lzf",
-            f"{header.points} points are {without} bytes, but the data claims {output_bytes} decompressed",
-            path=source.path,
-            offset=at + 4,
-        )
-    if compressed_bytes > source.left:
-        raise refusal(
-            "truncated",
-            f"{compressed_bytes} compressed bytes announced, {source.left} are there",
-            path=source.path,
-            offset=at,
-        )
     sound = lzf.reachable(compressed_bytes, output_bytes)
     rows = _balanced(header.points, block_points)
     with borrow_scratch() as scratch:
@@ -104,7 +89,7 @@ def compressed_blocks(
                 path=source.path,
                 offset=at + 8,
             )
-        fields = _field_arrays(data, header, padded=output_bytes == with_padding)
+        fields = field_arrays(data, header, padded=with_padding)
         for start in range(0, header.points, rows):
             stop = min(start + rows, header.points)
             part = xyz[: stop - start]
@@ -115,7 +100,38 @@ def compressed_blocks(
             yield (part, *others), axes if table.axes_are_xyz else ()
 
 
-def _field_arrays(data: NDArray[np.uint8], header: PcdHeader, *, padded: bool) -> dict[str, NDArray[Any]]:
+def check_sizes(header: PcdHeader, compressed_bytes: int, output_bytes: int, *, left: int, path: str) -> bool:
+    """Check the two sizes before a compressed body against the header and the ``left`` bytes of the file.
+
+    Returns
+    -------
+    Whether the decompressed data has the padding fields too.
+
+    Raises
+    ------
+    MapDataError
+        ``bad_lzf`` or ``truncated``.
+    """
+    with_padding = header.points * header.point_bytes
+    without = header.points * sum(field.row_bytes for field in header.fields if not field.padding)
+    if output_bytes not in (with_padding, without):
+        raise refusal(
+            "bad_lzf",
+            f"{header.points} points are {without} bytes, but the data claims {output_bytes} decompressed",
+            path=path,
+            offset=header.data_offset + 4,
+        )
+    if compressed_bytes > left:
+        raise refusal(
+            "truncated",
+            f"{compressed_bytes} compressed bytes announced, {left} are there",
+            path=path,
+            offset=header.data_offset,
+        )
+    return output_bytes == with_padding
+
+
+def field_arrays(data: NDArray[np.uint8], header: PcdHeader, *, padded: bool) -> dict[str, NDArray[Any]]:
     """Return a view of each field's values in the decompressed bytes."""
     arrays: dict[str, NDArray[Any]] = {}
     at = 0

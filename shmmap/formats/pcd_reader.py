@@ -118,6 +118,15 @@ class PcdReader:
         self._fd = -1
 
     @property
+    def record(self) -> np.dtype[np.void]:
+        """Type of one point in a ``binary`` file: every field by its unique name, padding skipped."""
+        return self._table.record
+
+    def put_axis(self, xyz: NDArray[Any], axis: int, values: NDArray[Any]) -> None:
+        """Copy one coordinate to where it belongs, as `FieldTable.put_axis`."""
+        self._table.put_axis(xyz, axis, values, self.path)
+
+    @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(min_xyz, max_xyz) of the finite points read so far, metres, map frame; NaN when there are none."""
         return self._bounds.result()

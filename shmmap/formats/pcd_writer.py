@@ -17,7 +17,7 @@ from shmmap.formats import lzf
 from shmmap.formats.pcd_fields import PADDING
 from shmmap.formats.pcd_header import ENCODINGS, IDENTITY_VIEWPOINT
 
-__all__ = ["write_pcd"]
+__all__ = ["pcd_header", "write_pcd"]
 
 _BLOCK_POINTS: Final = 1 << 16
 _LZF_LIMIT_BYTES: Final = (1 << 31) - 1  # liblzf's int sizes; the file's own size words are uint32
@@ -59,7 +59,8 @@ def write_pcd(
         raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(ENCODINGS)}")
     fields = _fields(columns)
     points = len(fields[0][1]) if fields else 0
-    header = _header(fields, points, encoding, viewpoint)
+    described = [(name, array.dtype, _count(array)) for name, array in fields]
+    header = pcd_header(described, points, encoding, viewpoint)
     body = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[encoding]
     if isinstance(target, str | os.PathLike):
         _replace(Path(target), header, body(fields, points))
@@ -98,28 +99,47 @@ def _fields(columns: Mapping[str, NDArray[Any]]) -> list[tuple[str, NDArray[Any]
     return [(name, array.astype(array.dtype.newbyteorder("<"), copy=False)) for name, array in fields]
 
 
-def _header(
-    fields: list[tuple[str, NDArray[Any]]], points: int, encoding: str, viewpoint: Sequence[float]
+def pcd_header(
+    fields: Sequence[tuple[str, np.dtype[Any], int]],
+    points: int,
+    encoding: str,
+    viewpoint: Sequence[float] = IDENTITY_VIEWPOINT,
+    *,
+    header_bytes: int = 0,
 ) -> bytes:
+    """Return the header of a file with ``fields`` (name, dtype of one value, values per point).
+
+    ``header_bytes`` asks for that length, got by spaces at the end of the comment line: so a header can
+    be written last, before points whose number was not known.
+
+    Raises
+    ------
+    BadRequest
+        The viewpoint makes no sense, there are too many points, or the header is longer than asked for.
+    """
     numbers = [float(number) for number in viewpoint]
     if len(numbers) != 7 or not np.isfinite(numbers).all():
         raise BadRequest(f"a viewpoint is 7 finite numbers, not {list(viewpoint)!r}")
     if points >= 1 << 32:
         raise BadRequest(f"{points} points do not fit a PCD file")
+    comment = "# .PCD v0.7 - Point Cloud Data file format"
     lines = [
-        "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
-        "FIELDS " + " ".join(name for name, _ in fields),
-        "SIZE " + " ".join(str(array.dtype.itemsize) for _, array in fields),
-        "TYPE " + " ".join(array.dtype.kind.upper() for _, array in fields),
-        "COUNT " + " ".join(str(_count(array)) for _, array in fields),
+        "FIELDS " + " ".join(name for name, _, _ in fields),
+        "SIZE " + " ".join(str(dtype.itemsize) for _, dtype, _ in fields),
+        "TYPE " + " ".join(dtype.kind.upper() for _, dtype, _ in fields),
+        "COUNT " + " ".join(str(count) for _, _, count in fields),
         f"WIDTH {points}",
         "HEIGHT 1",
         "VIEWPOINT " + " ".join(f"{number:.17g}" for number in numbers),
         f"POINTS {points}",
         f"DATA {encoding}",
     ]
-    return ("\n".join(lines) + "\n").encode()
+    text = ("\n".join(lines) + "\n").encode()
+    first = comment.ljust(header_bytes - len(text) - 1).encode() + b"\n"
+    if header_bytes and len(first) + len(text) > header_bytes:
+        raise BadRequest(f"the header needs {len(first) + len(text)} bytes, more than {header_bytes}")
+    return first + text
 
 
 def _count(array: NDArray[Any]) -> int:

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import itertools
-import json
 import logging
 import math
 import os
-import re
 import secrets
 import shutil
 from collections.abc import Mapping
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd_writer import write_pcd
+from shmmap.origin.metadata_text import metadata_text
 
 __all__ = ["MapWriter", "WrittenMap"]
 
@@ -30,7 +29,6 @@ _log = logging.getLogger(__name__)
 
 # Autoware's loader reads corners into an int
 _MAX_CORNER = 2**31
-_PLAIN_KEY = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.+-]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,13 +275,14 @@ class MapWriter:
         self._points += len(rows)
 
     def _write_metadata(self) -> None:
-        lines = [f"{axis}_resolution: {_number_text(self._size)}\n" for axis in "xy"]
-        for where, name in sorted(self._written.items(), key=lambda item: item[1]):
-            key = name if _PLAIN_KEY.fullmatch(name) else json.dumps(name, ensure_ascii=False)
-            lines.append(f"{key}: [{self._corner_text(where, ', ')}]\n")
+        entries = [
+            (name, (_number_text(where[0] * self._size), _number_text(where[1] * self._size)))
+            for where, name in self._written.items()
+        ]
+        text = metadata_text(_number_text(self._size), entries)
         path = os.path.join(self._partial, "pointcloud_map_metadata.yaml")
         with open(path, "x", encoding="utf-8") as file:
-            file.writelines(lines)
+            file.write(text)
             if self._durable:
                 file.flush()
                 os.fsync(file.fileno())

@@ -36,7 +36,7 @@ def write_pcd(path: Path, columns: dict[str, NDArray[Any]]) -> None:
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    """Read a binary PCD with one value per field."""
+    """Read a binary PCD without padding; a field of k > 1 values becomes (N, k)."""
     data = path.read_bytes()
     end = data.index(b"\n", data.index(b"DATA ")) + 1
     keys = {}
@@ -46,8 +46,12 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
             keys[key.upper()] = values
     assert keys["DATA"] == ["binary"]
     kinds = {"F": "f", "I": "i", "U": "u"}
+    described = zip(keys["FIELDS"], keys["TYPE"], keys["SIZE"], keys["COUNT"], strict=True)
     dtype = np.dtype(
-        [(n, f"<{kinds[t]}{s}") for n, t, s in zip(keys["FIELDS"], keys["TYPE"], keys["SIZE"], strict=True)]
+        [
+            (n, f"<{kinds[t]}{s}", (int(k),)) if k != "1" else (n, f"<{kinds[t]}{s}")
+            for n, t, s, k in described
+        ]
     )
     record = np.frombuffer(data, dtype, int(keys["POINTS"][0]), end)
     return {name: np.ascontiguousarray(record[name]) for name in keys["FIELDS"]}

@@ -29,14 +29,16 @@ LAYERS = {
     "statistics": {"errors", "columns", "geometry", "segment"},
     "layers": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
     "origin": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
+    "dividing": {"errors", "columns", "geometry", "formats", "origin"},
     "daemon": {
         "errors", "columns", "geometry", "formats", "segment", "protocol", "statistics", "layers", "origin",
+        "dividing",
     },
     "client": {"errors", "columns", "geometry", "segment", "protocol"},
 }  # fmt: skip
 
 CLIENT_PACKAGES = {"numpy", "zmq", "posix_ipc", "msgspec"}
-HEAVY = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
+HEAVY = {"open3d", "numba", "laspy", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
 
 
 def modules() -> list[str]:

@@ -17,6 +17,7 @@ CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evic
 CONTRACT += ["pin", "unpin", "stop"]
 CONTRACT += ["config", "unit"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
+CONTRACT += ["divide"]
 
 
 def parse(*words: str) -> argparse.Namespace:

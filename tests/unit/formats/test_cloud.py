@@ -129,7 +129,10 @@ def test_formats_of_open3d(tmp_path: Path, name: str, data: bytes, columns: list
         ("a.pts", b"10\n1 2 3 4\n", "truncated"),
         ("a.pts", b"many\n1 2 3 4\n", "bad_row"),
         ("a.pts", b"-1\n1 2 3 4\n", "bad_cloud"),
-        ("a.las", b"LASF", "unsupported_format"),
+        ("a.las", b"LASF", "truncated"),
+        ("b.laz", b"PK", "bad_las"),
+        ("c.las", b"", "empty_file"),
+        ("a.e57", b"ASTM", "unsupported_format"),
         ("a", b"", "unsupported_format"),
     ],
 )

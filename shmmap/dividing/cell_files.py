@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The PCD files of a map being divided: rows are appended, headers written last.
+
+A file begins with room for its header, so that rows go to their final place at once and are written
+one time only.  Where rows go is decided in the order of the blocks, and written in any order: rows keep
+their order within a cell, though blocks are worked on in parallel.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import BadRequest
+from shmmap.formats.pcd_writer import pcd_header
+
+__all__ = ["CellFiles", "Slot", "raise_open_files_limit"]
+
+_ALIGNMENT: Final = 64
+_SPARE_DESCRIPTORS: Final = 128
+_MOST_POINTS: Final = (1 << 32) - 1
+
+Slot = tuple[int, str, int]
+"""(descriptor or -1, path, offset): where the next rows of a cell go."""
+
+
+class CellFiles:
+    """Files of cells, by the index of the cell.
+
+    Parameters
+    ----------
+    directory
+        Where the files are.
+    row
+        Packed type of a point.
+    name
+        File name of a cell.
+
+    Attributes
+    ----------
+    counts
+        Rows of each cell, those under way included.
+    """
+
+    def __init__(self, directory: str, row: np.dtype[np.void], name: Callable[[int, int], str]) -> None:
+        self.directory = directory
+        self.row = row
+        self.counts: dict[tuple[int, int], int] = {}
+        self.name = name
+        self._fields = [_field(field, row[field]) for field in row.names or ()]
+        longest = len(pcd_header(self._fields, _MOST_POINTS, "binary"))
+        self.header_bytes = -(-longest // _ALIGNMENT) * _ALIGNMENT
+        self._descriptors: dict[tuple[int, int], int] = {}
+        soft, _hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self._most_open = max(16, soft - _SPARE_DESCRIPTORS)
+
+    def path(self, where: tuple[int, int]) -> str:
+        """Path of a cell's file."""
+        return os.path.join(self.directory, self.name(*where))
+
+    def reserve(self, where: tuple[int, int], rows: int) -> Slot:
+        """Make room for ``rows`` after what the cell has.
+
+        Raises
+        ------
+        BadRequest
+            The cell would have more points than a PCD file can.
+        """
+        have = self.counts.get(where, 0)
+        if have + rows > _MOST_POINTS:
+            raise BadRequest(
+                f"the cell {self.name(*where)} has more points than a PCD file can", hint="smaller cells"
+            )
+        path = self.path(where)
+        fd = self._descriptors.get(where, -1)
+        if fd < 0 and len(self._descriptors) < self._most_open:
+            fd = self._descriptors[where] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self.counts[where] = have + rows
+        return fd, path, self.header_bytes + have * self.row.itemsize
+
+    def finish(self) -> None:
+        """Write every header; no rows may be under way."""
+        for where, count in self.counts.items():
+            header = pcd_header(self._fields, count, "binary", header_bytes=self.header_bytes)
+            write_at((self._descriptors.get(where, -1), self.path(where), 0), header)
+        self.close()
+
+    def restore(self, counts: Iterable[tuple[int, int, int]]) -> None:
+        """Return to a state seen before: (ix, iy, rows) of every cell; what is beyond goes away.
+
+        Raises
+        ------
+        OSError
+            A file is missing or shorter than it was.
+        """
+        self.counts = {(ix, iy): rows for ix, iy, rows in counts}
+        known = {self.name(*where) for where in self.counts}
+        for name in os.listdir(self.directory):
+            if name not in known:
+                os.unlink(os.path.join(self.directory, name))
+        for where, rows in self.counts.items():
+            path = self.path(where)
+            size = self.header_bytes + rows * self.row.itemsize
+            if os.stat(path).st_size < size:
+                raise OSError(f"{path} is shorter than {size} bytes")
+            os.truncate(path, size)
+
+    def read(self, where: tuple[int, int]) -> NDArray[np.void]:
+        """All rows of a cell."""
+        rows = np.empty(self.counts[where], self.row)
+        with open(self.path(where), "rb", buffering=0) as file:
+            file.seek(self.header_bytes)
+            view = rows.view(np.uint8).data
+            done = 0
+            while done < len(view):
+                got = file.readinto(view[done:])
+                if not got:
+                    raise OSError(f"{self.path(where)} became shorter")
+                done += got
+        return rows
+
+    def close(self) -> None:
+        """Close every file."""
+        while self._descriptors:
+            os.close(self._descriptors.popitem()[1])
+
+
+def write_at(slot: Slot, data: Any) -> None:
+    """Write ``data`` where ``slot`` says."""
+    fd, path, offset = slot
+    own = fd < 0
+    if own:
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        view = memoryview(data).cast("B")
+        while len(view):
+            done = os.pwrite(fd, view, offset)
+            view, offset = view[done:], offset + done
+    finally:
+        if own:
+            os.close(fd)
+
+
+def raise_open_files_limit() -> None:
+    """Let this process hold as many files open as it may; 1024 cells are few."""
+    _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def _field(name: str, dtype: np.dtype[Any]) -> tuple[str, np.dtype[Any], int]:
+    return name, dtype.base, int(np.prod(dtype.shape, dtype=int))

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which files are meant, and whether an output may lie where it is to lie."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from shmmap.errors import BadRequest, MapMissing
+from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.origin.metadata_text import METADATA_NAME
+
+__all__ = ["REPORT_NAME", "InputFile", "check_output_directory", "check_output_place", "find_inputs"]
+
+REPORT_NAME = "shmmap_divide.json"
+_MAP_PARTS = frozenset({"pointcloud_map.pcd", METADATA_NAME, REPORT_NAME})
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """A file to read, and its state when it was found: size in bytes, mtime and ctime."""
+
+    path: str
+    size: int
+    mtime_ns: int
+    ctime_ns: int
+
+
+def find_inputs(paths: Sequence[str]) -> list[InputFile]:
+    """Return the clouds named by ``paths``; of a directory every cloud in and below it, in path order.
+
+    Raises
+    ------
+    MapMissing
+        There is nothing there, or no cloud in a directory.
+    """
+    found: dict[str, InputFile] = {}
+    for path in map(os.path.abspath, paths):
+        if os.path.isdir(path):
+            names = [
+                os.path.join(folder, name)
+                for folder, _, files in os.walk(path)
+                for name in files
+                if name.lower().endswith(CLOUD_SUFFIXES) and not name.startswith(".")
+            ]
+            if not names:
+                raise MapMissing(
+                    f"there is no cloud in {path}", hint=f"clouds are {', '.join(CLOUD_SUFFIXES)}"
+                )
+        else:
+            names = [path]
+        for name in sorted(names):
+            try:
+                status = os.stat(name)
+            except OSError as error:
+                raise MapMissing(f"cannot read {name}: {error.strerror}") from error
+            found.setdefault(name, InputFile(name, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+    return list(found.values())
+
+
+def check_output_place(inputs: Sequence[str], files: Sequence[InputFile], out: str) -> None:
+    """Refuse an output inside an input directory, and inputs that the output would replace.
+
+    Raises
+    ------
+    BadRequest
+        See above.
+    """
+    real = os.path.realpath(out)
+    for path in map(os.path.realpath, inputs):
+        if os.path.isdir(path) and _is_within(real, path):
+            raise BadRequest(
+                f"the output {out} lies inside the input {path}", hint="choose a place outside the inputs"
+            )
+    for file in files:
+        if _is_within(os.path.realpath(file.path), real):
+            raise BadRequest(
+                f"the input {file.path} lies inside the output {out}", hint="choose another output"
+            )
+
+
+def check_output_directory(out: str, *, force: bool) -> None:
+    """Refuse to touch what is at ``out``, unless it is a divided map and ``force`` is given.
+
+    Raises
+    ------
+    BadRequest
+        See above.
+    """
+    if not os.path.lexists(out):
+        return
+    if os.path.islink(out) or not os.path.isdir(out):
+        raise BadRequest(f"{out} exists and is no directory", hint="choose another output")
+    there = set(os.listdir(out))
+    if not there:
+        return
+    if there - _MAP_PARTS or METADATA_NAME not in there:
+        odd = sorted(there - _MAP_PARTS) or sorted(there)
+        raise BadRequest(
+            f"{out} is no divided map, it has {', '.join(odd[:3])}{', ...' if len(odd) > 3 else ''}",
+            hint="choose another output; nothing but a divided map is ever replaced",
+        )
+    if not force:
+        raise BadRequest(f"{out} is a map already", hint="--force replaces it, once the new one is complete")
+
+
+def _is_within(path: str, directory: str) -> bool:
+    return path == directory or path.startswith(os.path.join(directory, ""))

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The inner loops of dividing, compiled: which cell each point is in, and points sorted by cell.
+
+They release the interpreter's lock, so that blocks are worked on in parallel.  Compiled code is kept
+on the disk where numba finds a place for it; else it is compiled at each start, a few seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final, TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["NOWHERE", "assign_cells", "count_cells", "scatter_rows"]
+
+NOWHERE: Final = -(1 << 31)
+"""Index of a point that is not finite."""
+
+_LIMIT: Final = float((1 << 31) - 2)
+_NEAR: Final = 1e-6  # of a cell; nearer to a border the exact corners decide
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def _compiled(function: _Function) -> _Function:
+    compiler: Any = numba.njit  # its types say that a function becomes something else
+    try:
+        made: _Function = compiler(nogil=True, cache=True)(function)
+    except RuntimeError:  # no directory to keep the code in
+        made = compiler(nogil=True)(function)
+    return made
+
+
+@_compiled
+def _index(value: float, size: float, origin: float, step: int, first: int, scale: int) -> float:
+    """Index of the cell that holds ``value`` on one axis, as a whole float64."""
+    quotient = (value - origin) / size
+    index: float = np.floor(quotient)
+    part = quotient - index
+    if (part < _NEAR or part > 1.0 - _NEAR) and abs(index) < _LIMIT:
+        whole = np.int64(index)
+        if value < (first + whole * step) / scale:
+            index -= 1.0
+        elif value >= (first + (whole + 1) * step) / scale:
+            index += 1.0
+    return index
+
+
+@_compiled
+def assign_cells(
+    x: NDArray[Any],
+    y: NDArray[Any],
+    z: NDArray[Any],
+    lattice: tuple[float, float, float, int, int, int, int],
+    ix: NDArray[np.int32],
+    iy: NDArray[np.int32],
+    extremes: NDArray[np.float64],
+) -> tuple[int, int, int, int, int]:
+    """Write each point's cell to ``ix`` and ``iy``; widen ``extremes`` (2, 3) by the finite points.
+
+    Parameters
+    ----------
+    x, y, z
+        (N,) float32 or float64, any stride, metres.
+    lattice
+        (size, origin_x, origin_y) in metres; (step, origin_x, origin_y, scale) as integers.
+
+    Returns
+    -------
+    Number of finite points, then least and greatest ix, least and greatest iy of them.  The number is
+    -1 if some point is more than 2**31 cells away.
+    """
+    size, origin_x, origin_y, step, first_x, first_y, scale = lattice
+    kept = 0
+    low_x = low_y = np.int64(1 << 31)
+    high_x = high_y = np.int64(-(1 << 31))
+    a0 = a1 = a2 = np.inf
+    b0 = b1 = b2 = -np.inf
+    for row in range(len(x)):
+        u, v, w = np.float64(x[row]), np.float64(y[row]), np.float64(z[row])
+        if not (np.isfinite(u) and np.isfinite(v) and np.isfinite(w)):
+            ix[row] = NOWHERE
+            iy[row] = NOWHERE
+            continue
+        i = _index(u, size, origin_x, step, first_x, scale)
+        j = _index(v, size, origin_y, step, first_y, scale)
+        if not (abs(i) < _LIMIT and abs(j) < _LIMIT):
+            return -1, 0, 0, 0, 0
+        m, n = np.int64(i), np.int64(j)
+        ix[row] = m
+        iy[row] = n
+        kept += 1
+        low_x, high_x = min(low_x, m), max(high_x, m)
+        low_y, high_y = min(low_y, n), max(high_y, n)
+        a0, b0 = min(a0, u), max(b0, u)
+        a1, b1 = min(a1, v), max(b1, v)
+        a2, b2 = min(a2, w), max(b2, w)
+    extremes[0, 0], extremes[0, 1], extremes[0, 2] = (
+        min(extremes[0, 0], a0),
+        min(extremes[0, 1], a1),
+        min(extremes[0, 2], a2),
+    )
+    extremes[1, 0], extremes[1, 1], extremes[1, 2] = (
+        max(extremes[1, 0], b0),
+        max(extremes[1, 1], b1),
+        max(extremes[1, 2], b2),
+    )
+    return kept, low_x, high_x, low_y, high_y
+
+
+@_compiled
+def count_cells(
+    ix: NDArray[np.int32],
+    iy: NDArray[np.int32],
+    low_x: int,
+    low_y: int,
+    width: int,
+    counts: NDArray[np.int64],
+) -> None:
+    """Count the points of each cell of a window: place ``(iy - low_y) * width + (ix - low_x)``."""
+    for row in range(len(ix)):
+        if ix[row] != NOWHERE:
+            counts[(np.int64(iy[row]) - low_y) * width + (np.int64(ix[row]) - low_x)] += 1
+
+
+@_compiled
+def scatter_rows(
+    rows: NDArray[Any],
+    ix: NDArray[np.int32],
+    iy: NDArray[np.int32],
+    low_x: int,
+    low_y: int,
+    width: int,
+    places: NDArray[np.int64],
+    out: NDArray[Any],
+) -> None:
+    """Copy rows (N, words) to ``out``, those of a cell together and in their order.
+
+    ``places`` holds where each cell's first row goes, and is advanced.
+    """
+    words = rows.shape[1]
+    for row in range(len(ix)):
+        if ix[row] == NOWHERE:
+            continue
+        cell = (np.int64(iy[row]) - low_y) * width + (np.int64(ix[row]) - low_x)
+        place = places[cell]
+        places[cell] = place + 1
+        for word in range(words):
+            out[place, word] = rows[row, word]

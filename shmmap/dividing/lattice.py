@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lattice of square cells, with corners that are exact decimal numbers.
+
+A cell is half open: ``corner(i) <= x < corner(i + 1)``.  Sizes such as 0.1 m have no exact binary
+form, and ``floor(x / 0.1)`` and ``3 * 0.1`` disagree with the 0.3 that a metadata file says.  So
+corners are kept as integers over a power of ten; their quotient is the very number that reading the
+decimal text gives, and membership is decided against it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from typing import Final
+
+from shmmap.errors import BadRequest
+
+__all__ = ["MAX_DECIMALS", "CellLattice"]
+
+MAX_DECIMALS: Final = 9
+_EXACT: Final = 1 << 53  # beyond, an integer is not exact in float64
+
+
+@dataclass(frozen=True, slots=True)
+class CellLattice:
+    """Cells of ``step / scale`` metres, one of whose corners is ``(origin_x, origin_y) / scale``.
+
+    Attributes
+    ----------
+    step, origin_x, origin_y
+        Integers, in units of ``1 / scale`` metres.
+    scale
+        A power of ten.
+    """
+
+    step: int
+    origin_x: int = 0
+    origin_y: int = 0
+    scale: int = 1
+
+    @classmethod
+    def of(cls, cell_size: float, origin: tuple[float, float] = (0.0, 0.0)) -> CellLattice:
+        """Lattice of cells of ``cell_size`` metres with a corner at ``origin`` (x, y in metres).
+
+        Raises
+        ------
+        BadRequest
+            The size is not positive, or a number has more than 9 decimals or is out of range.
+        """
+        if not (math.isfinite(cell_size) and cell_size > 0):
+            raise BadRequest(f"the cell size must be a positive number of metres, not {cell_size!r}")
+        decimals = [_decimal(value) for value in (cell_size, *origin)]
+        places = max(max(0, -int(value.as_tuple().exponent)) for value in decimals)
+        if places > MAX_DECIMALS:
+            raise BadRequest(
+                f"cell size and origin may have {MAX_DECIMALS} decimals, not {places}",
+                hint="round them, so that the corners are exact decimal numbers",
+            )
+        step, x, y = (int(value.scaleb(places)) for value in decimals)
+        if max(step, abs(x), abs(y)) >= _EXACT:
+            raise BadRequest("cell size or origin has too many digits")
+        return cls(step, x, y, 10**places)
+
+    @property
+    def size(self) -> float:
+        """Side of a cell, metres."""
+        return self.step / self.scale
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """A corner of the lattice, metres."""
+        return self.origin_x / self.scale, self.origin_y / self.scale
+
+    @property
+    def whole(self) -> bool:
+        """Whether every corner is a whole number of metres, as Autoware's loader needs."""
+        return self.step % self.scale == self.origin_x % self.scale == self.origin_y % self.scale == 0
+
+    def corner(self, ix: int, iy: int) -> tuple[float, float]:
+        """Lower left corner of a cell, metres: the float64 nearest to its exact decimal value."""
+        return (self.origin_x + ix * self.step) / self.scale, (self.origin_y + iy * self.step) / self.scale
+
+    def corner_text(self, ix: int, iy: int) -> tuple[str, str]:
+        """The corner in decimals, exact; an integer whenever it is whole."""
+        return (
+            self._text(self.origin_x + ix * self.step),
+            self._text(self.origin_y + iy * self.step),
+        )
+
+    @property
+    def size_text(self) -> str:
+        """The size in decimals, exact."""
+        return self._text(self.step)
+
+    def moved(self, x: float, y: float) -> CellLattice:
+        """The same squares of ground in a frame whose origin lies at (x, y), metres, of this one."""
+        shift = CellLattice.of(1.0, (x, y))
+        scale = max(self.scale, shift.scale)
+        mine, theirs = scale // self.scale, scale // shift.scale
+        return CellLattice(
+            self.step * mine,
+            self.origin_x * mine - shift.origin_x * theirs,
+            self.origin_y * mine - shift.origin_y * theirs,
+            scale,
+        )
+
+    def common_step(self) -> float:
+        """Smallest whole number of metres that is a whole number of cells, if below 10 km; else a cell."""
+        cell = Fraction(self.step, self.scale)
+        whole = cell.numerator  # cell * denominator
+        return float(whole) if whole < 10_000 else self.size
+
+    def _text(self, units: int) -> str:
+        whole, rest = divmod(abs(units), self.scale)
+        sign = "-" if units < 0 else ""
+        if not rest:
+            return f"{sign}{whole}"
+        places = len(str(self.scale)) - 1
+        return f"{sign}{whole}.{rest:0{places}d}".rstrip("0")
+
+
+def _decimal(value: float) -> Decimal:
+    if not math.isfinite(value):
+        raise BadRequest(f"{value!r} is no number of metres")
+    return Decimal(repr(float(value))).normalize()

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds as streams of rows, in bounded memory, whatever their format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.columns import ColumnSpec
+from shmmap.dividing.row_layout import AXES, RowLayout
+from shmmap.errors import BadRequest
+from shmmap.formats.causes import refusal
+from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
+from shmmap.formats.open3d_reader import read_with_open3d
+from shmmap.formats.pcd_mapped import expanded_blocks
+from shmmap.formats.pcd_reader import PcdReader
+
+__all__ = ["Bound3", "Source", "open_source"]
+
+Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+_BLOCK_POINTS: Final = 1 << 16  # of files that must be converted; small enough for the cache
+_LAS_BLOCK_POINTS: Final = 1 << 18  # a few of LAZ's chunks of 50000 points, so that all cores help
+_OPEN3D_FACTOR: Final = 5  # bytes in memory per byte of file, at the worst moment of reading
+
+
+class Source(Protocol):
+    """A cloud that is read from front to back.
+
+    Attributes
+    ----------
+    path
+        The file.
+    points
+        Points in it, as announced and checked against its size.
+    row
+        Packed type of a point: x, y, z (both float32 or float64) and every other field.
+    claimed_bounds
+        (min_xyz, max_xyz) where the file's header says so.
+    warnings
+        Oddities of the file.
+    """
+
+    path: str
+    points: int
+    row: np.dtype[np.void]
+    claimed_bounds: Bound3 | None
+    warnings: tuple[str, ...]
+
+    def begin(self, layout: RowLayout, start: int) -> None:
+        """Go to point ``start``; `read` gives rows of ``layout`` from there on."""
+
+    def read(self, rows: NDArray[np.void]) -> int:
+        """Fill ``rows`` with the next points; returns how many, less than asked for only at the end.
+
+        Raises
+        ------
+        MapDataError
+            The data contradicts the header.
+        """
+
+    def close(self) -> None:
+        """Give up the file."""
+
+
+def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
+    """Open a cloud and check its header.
+
+    Parameters
+    ----------
+    path
+        The file; its ending says the format.
+    memory_bytes
+        What reading it may take.
+    scratch_dir
+        Where a compressed PCD file larger than that is expanded, in a file without a name.
+
+    Raises
+    ------
+    MapDataError
+        The file is not what it claims to be.
+    BadRequest
+        It would have to be read whole, and is too large for that.
+    """
+    suffix = os.path.splitext(path)[1].lower()
+    if suffix == ".pcd":
+        reader = PcdReader(path, keep_non_finite=True, block_points=_BLOCK_POINTS)
+        floats = all(reader.record[axis].kind == "f" for axis in AXES)
+        if reader.header.encoding == "binary" and floats:
+            return _BinaryPcd(reader)
+        return _StreamedPcd(reader, memory_bytes, scratch_dir)
+    if suffix in LAS_SUFFIXES:
+        return _Las(path)
+    if suffix not in CLOUD_SUFFIXES:
+        raise refusal(
+            "unsupported_format",
+            f"files called {suffix or 'without a suffix'} are not read",
+            path=path,
+            hint=f"readable are {', '.join(CLOUD_SUFFIXES)}; convert it to one of them",
+        )
+    return _Whole(path, suffix, memory_bytes)
+
+
+class _BinaryPcd:
+    """Binary PCD: records straight from the file."""
+
+    claimed_bounds: Bound3 | None = None
+
+    def __init__(self, reader: PcdReader) -> None:
+        self.path = reader.path
+        self.points = reader.header.points
+        self.warnings = reader.warnings
+        self._reader = reader
+        self._record = reader.record
+        names = self._record.names or ()
+        axis = reader.columns[0].dtype
+        self.row = np.dtype([(name, axis if name in AXES else self._record[name]) for name in names])
+        self._at = 0
+        self._layout = RowLayout(self.row)
+        self._direct = False
+        self._staged = np.empty(0, self._record)
+
+    def begin(self, layout: RowLayout, start: int) -> None:
+        self._layout, self._at = layout, start
+        self._direct = self.row == self._record and layout.takes_as_is(self.row)
+        if not self._direct:
+            self._staged = np.empty(_BLOCK_POINTS, self._record)
+
+    def read(self, rows: NDArray[np.void]) -> int:
+        count = min(len(rows), self.points - self._at)
+        if self._direct:
+            self._fill(rows[:count].view(np.uint8))
+        else:
+            for start in range(0, count, _BLOCK_POINTS):
+                part = rows[start : min(start + _BLOCK_POINTS, count)]
+                staged = self._staged[: len(part)]
+                self._fill(staged.view(np.uint8), start)
+                self._layout.put(staged, part)
+        self._at += count
+        return count
+
+    def _fill(self, memory: NDArray[np.uint8], ahead: int = 0) -> None:
+        view = memory.data
+        offset = self._reader.header.data_offset + (self._at + ahead) * self._record.itemsize
+        done = 0
+        while done < len(view):
+            try:
+                got = os.preadv(self._reader.fileno(), [view[done:]], offset + done)
+            except OSError as error:
+                raise refusal("unreadable", f"cannot be read: {error.strerror}", path=self.path) from error
+            if not got:
+                raise refusal(
+                    "truncated",
+                    "the file became shorter while being read",
+                    path=self.path,
+                    offset=offset + done,
+                )
+            done += got
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+class _Stream:
+    """What is common to formats that come as blocks of columns."""
+
+    claimed_bounds: Bound3 | None = None
+
+    def __init__(self, path: str, points: int, columns: tuple[ColumnSpec, ...]) -> None:
+        self.path = path
+        self.points = points
+        self.row = _row_of(columns)
+        self.warnings: tuple[str, ...] = ()
+        self._layout = RowLayout(self.row)
+        self._iterator: Iterator[Mapping[str, NDArray[Any]]] = iter(())
+        self._block: Mapping[str, NDArray[Any]] = {}
+        self._used = self._length = 0
+
+    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+        raise NotImplementedError
+
+    def begin(self, layout: RowLayout, start: int) -> None:
+        self._layout = layout
+        self._iterator = self._blocks(start)
+        self._used = self._length = 0
+
+    def read(self, rows: NDArray[np.void]) -> int:
+        at = 0
+        while at < len(rows):
+            if self._used == self._length:
+                block = next(self._iterator, None)
+                if block is None:
+                    break
+                xyz = block["xyz"]
+                self._block = {**block, **{axis: xyz[:, i] for i, axis in enumerate(AXES)}}
+                self._used, self._length = 0, len(xyz)
+            count = min(len(rows) - at, self._length - self._used)
+            part = slice(self._used, self._used + count)
+            self._layout.put(
+                {name: values[part] for name, values in self._block.items()}, rows[at : at + count]
+            )
+            self._used += count
+            at += count
+        return at
+
+    def close(self) -> None:
+        self._iterator = iter(())
+        self._block = {}
+
+
+class _StreamedPcd(_Stream):
+    """PCD in ascii or binary_compressed, or with coordinates that are integers."""
+
+    def __init__(self, reader: PcdReader, memory_bytes: int, scratch_dir: str) -> None:
+        super().__init__(reader.path, reader.header.points, reader.columns)
+        self._reader = reader
+        self._scratch_dir = scratch_dir
+        header = reader.header
+        expanded = header.points * header.point_bytes
+        packed = os.fstat(reader.fileno()).st_size
+        self._expand = header.encoding == "binary_compressed" and expanded + packed > memory_bytes
+        self.warnings = reader.warnings
+
+    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+        if self._expand:
+            yield from expanded_blocks(self._reader, self._scratch_dir, _BLOCK_POINTS, start)
+            return
+        names = [spec.name for spec in self._reader.columns]
+        for block in self._reader.blocks():
+            skipped = min(start, len(block[0]))
+            start -= skipped
+            if skipped < len(block[0]):
+                yield dict(zip(names, (column[skipped:] for column in block), strict=True))
+
+    def close(self) -> None:
+        super().close()
+        self._reader.close()
+
+
+class _Las(_Stream):
+    """LAS, LAZ and COPC."""
+
+    def __init__(self, path: str) -> None:
+        self._reader = LasReader(path)
+        super().__init__(path, self._reader.points, self._reader.columns)
+        self.claimed_bounds = self._reader.bounds
+
+    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+        return self._reader.blocks(_LAS_BLOCK_POINTS, start)
+
+    def close(self) -> None:
+        super().close()
+        self._reader.close()
+
+
+class _Whole(_Stream):
+    """What only Open3D reads, which knows no blocks."""
+
+    def __init__(self, path: str, suffix: str, memory_bytes: int) -> None:
+        try:
+            size = os.stat(path).st_size
+        except FileNotFoundError:
+            raise refusal("missing", "no such file", path=path) from None
+        except OSError as error:
+            raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
+        if size * _OPEN3D_FACTOR > memory_bytes:
+            raise BadRequest(
+                f"{path} must be read whole, which takes about {size * _OPEN3D_FACTOR >> 20} MiB of memory",
+                hint="give more --max-memory, or convert it to PCD or LAS, which are streamed",
+            )
+        self._columns, warnings = read_with_open3d(path, suffix)
+        specs = tuple(
+            ColumnSpec(name, values.dtype, 1 if values.ndim == 1 else values.shape[1])
+            for name, values in self._columns.items()
+        )
+        super().__init__(path, len(self._columns["xyz"]), specs)
+        self.warnings = warnings
+
+    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+        for at in range(start, self.points, _BLOCK_POINTS):
+            yield {name: values[at : at + _BLOCK_POINTS] for name, values in self._columns.items()}
+
+
+def _row_of(columns: tuple[ColumnSpec, ...]) -> np.dtype[np.void]:
+    """Packed row of a table whose first column is ``xyz``."""
+    axis = np.dtype("<f8" if columns[0].dtype.itemsize == 8 else "<f4")
+    others = [
+        (spec.name, spec.dtype, (spec.components,)) if spec.components > 1 else (spec.name, spec.dtype)
+        for spec in columns[1:]
+    ]
+    return np.dtype([*((name, axis) for name in AXES), *others])

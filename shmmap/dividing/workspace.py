@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where an output is made before it appears, and what a killed run can go on from.
+
+The directory lies beside the output, hidden.  Its state file says how far the run came; it is replaced
+in one step and only after the rows it speaks of were handed to the kernel.  What a killed process wrote
+is still there, what a machine lost with its power is not: so a state counts only in the same boot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+from shmmap.errors import CannotWrite, InstanceBusy
+
+__all__ = ["Workspace", "flush_directory", "writing_errors"]
+
+_STATE: Final = "state.json"
+_LOCK: Final = "lock"
+_RENAME_EXCHANGE: Final = 2  # linux/fs.h
+_AT_FDCWD: Final = -100  # fcntl.h
+
+
+class Workspace:
+    """A hidden directory beside ``out``, held by this process alone.
+
+    Attributes
+    ----------
+    path
+        The directory.
+    content
+        The directory in it that becomes ``out``.
+    """
+
+    def __init__(self, out: str) -> None:
+        parent, name = os.path.split(out)
+        self.out = out
+        self.path = os.path.join(parent, f".{name}.dividing")
+        self.content = os.path.join(self.path, "map")
+        with writing_errors(self.path):
+            os.makedirs(parent, exist_ok=True)
+            self._lock = self._take()
+
+    def _take(self) -> int:
+        while True:
+            os.makedirs(self.path, exist_ok=True)
+            path = os.path.join(self.path, _LOCK)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                os.close(fd)
+                raise InstanceBusy(
+                    f"another run is making {self.out}", hint="wait for it, or choose another output"
+                ) from None
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(fd), os.stat(path)):
+                    return fd
+            os.close(fd)  # the run that held it has just removed it
+
+    def __enter__(self) -> Workspace:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # an interrupted run can be resumed; one that failed would fail again
+        if error is None or isinstance(error, Exception) or self.state() is None:
+            self.remove()
+        os.close(self._lock)
+
+    def state(self) -> dict[str, Any] | None:
+        """What `save` wrote last since the machine started; None when there is nothing to go on from."""
+        try:
+            state = json.loads(Path(self.path, _STATE).read_bytes())
+        except (OSError, ValueError):
+            return None
+        return state if isinstance(state, dict) and state.get("boot") == _boot_id() else None
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Remember how far the run came."""
+        interim = Path(self.path, _STATE + ".new")
+        interim.write_text(json.dumps({**state, "boot": _boot_id()}))
+        interim.replace(Path(self.path, _STATE))
+
+    def empty(self) -> None:
+        """Start anew: remove everything but the lock."""
+        for name in os.listdir(self.path):
+            path = os.path.join(self.path, name)
+            if os.path.isdir(path):
+                shutil.rmtree(path)
+            elif name != _LOCK:
+                os.unlink(path)
+
+    def directory(self, name: str) -> str:
+        """Return the path of a directory in the workspace, made if it is not there."""
+        path = os.path.join(self.path, name)
+        os.makedirs(path, exist_ok=True)
+        return path
+
+    def publish(self, *, replace: bool, durable: bool) -> None:
+        """Let `content` appear as ``out``, in one step; with ``replace`` in the place of what is there."""
+        if durable:
+            _flush_file_system(self.path)
+        if replace and os.path.isdir(self.out) and os.listdir(self.out):
+            _exchange(self.content, self.out, aside=os.path.join(self.path, "replaced"))
+        else:
+            os.rename(self.content, self.out)  # replaces an empty directory, fails on any other
+        if durable:
+            flush_directory(os.path.dirname(self.out))
+
+    def remove(self) -> None:
+        """Remove the directory and everything in it."""
+        with contextlib.suppress(OSError):
+            shutil.rmtree(self.path)
+
+
+@contextlib.contextmanager
+def writing_errors(what: str) -> Iterator[None]:
+    """Turn what the operating system refuses into `CannotWrite`, with a hint."""
+    try:
+        yield
+    except OSError as error:
+        hints = {
+            errno.ENOSPC: "free some space, or choose another disk",
+            errno.EDQUOT: "the quota of this user is used up",
+            errno.EACCES: "choose a directory that this user may write to",
+            errno.EPERM: "choose a directory that this user may write to",
+            errno.EROFS: "choose a directory that this user may write to",
+        }
+        raise CannotWrite(
+            f"{error.filename or what}: {error.strerror or error}", hint=hints.get(error.errno or 0, "")
+        ) from error
+
+
+def flush_directory(path: str) -> None:
+    """Force the names in a directory to the disk."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _flush_file_system(path: str) -> None:
+    """Force everything to the disk: one call, where an fsync for each of thousands of files takes minutes."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        if ctypes.CDLL(None, use_errno=True).syncfs(fd):
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code), path)
+    finally:
+        os.close(fd)
+
+
+def _exchange(one: str, other: str, *, aside: str) -> None:
+    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if function is not None and not function(
+        _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
+    ):
+        return
+    # file systems without it: for an instant there is no map, but never half of one
+    os.rename(other, aside)
+    os.rename(one, other)
+
+
+def _boot_id() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
