@@ -15,6 +15,7 @@ from shmmap.client.client import Client, connect
 from shmmap.client.map_listing import CellInfo, MapListing
 
 if TYPE_CHECKING:
+    from shmmap.client.event_stream import EventStream, Missed
     from shmmap.client.points_around import PointsAround
     from shmmap.client.retention import Departed, Retention, RetentionPolicy
     from shmmap.client.window import MapWindow
@@ -26,8 +27,10 @@ __all__ = [
     "CellSet",
     "Client",
     "Departed",
+    "EventStream",
     "MapListing",
     "MapWindow",
+    "Missed",
     "PendingLayer",
     "PointsAround",
     "Retention",
@@ -38,7 +41,9 @@ __all__ = [
 
 _LATER: Final = {
     "Departed": "retention",
+    "EventStream": "event_stream",
     "MapWindow": "window",
+    "Missed": "event_stream",
     "PointsAround": "points_around",
     "Retention": "retention",
     "RetentionPolicy": "retention",

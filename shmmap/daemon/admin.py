@@ -9,6 +9,7 @@ from typing import Final
 
 from shmmap import __version__
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.event_log import EventLog
 from shmmap.daemon.operator_pins import OperatorPins
 from shmmap.daemon.pin_survey import Pinned
 from shmmap.daemon.residency import Resident
@@ -18,6 +19,7 @@ from shmmap.errors import BadRequest, UnknownCell
 from shmmap.layers.registry import kinds
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
+from shmmap.protocol.events import Recent
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Admin"]
@@ -37,12 +39,16 @@ class Admin:
         statistics: StatisticsWriter,
         *,
         epoch: int,
+        event_log: EventLog,
+        events_path: str = "",
     ) -> None:
         self._config = config
         self._store = store
         self._sessions = sessions
         self._statistics = statistics
         self._epoch = epoch
+        self._event_log = event_log
+        self._events_path = events_path
         self.pins = OperatorPins(store)
         self._kinds = tuple(kind.describe() for kind in kinds())
         self._bounds_of: Catalogue | None = None
@@ -70,6 +76,7 @@ class Admin:
             layers=self._kinds,
             budget_bytes=self._store.books.budget_bytes,
             pid=os.getpid(),
+            events=self._events_path,
         )
 
     def _bounds(self) -> tuple[float, float, float, float] | None:
@@ -87,6 +94,8 @@ class Admin:
         """Answer one request."""
         if isinstance(message, messages.Metadata):
             return self._metadata(message)
+        if isinstance(message, Recent):
+            return self._event_log.page(message)
         if isinstance(message, messages.Show):
             return self._show(message)
         if isinstance(message, messages.Evict):

@@ -52,6 +52,7 @@ class Wanted:
     area: Area | None = None
     keys: tuple[Key, ...] = ()
     outstanding: set[Key] = field(default_factory=set)
+    began_s: float = 0.0
     deadline_s: float = 0.0
 
 
@@ -107,7 +108,7 @@ class CellRequests:
         """All cells that touch an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        session.asked_about(*area.center)
+        session.asked_about(area)
         layers = canonical_layers(message.layers)
         indices = self._at_height(self._store.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
@@ -132,7 +133,7 @@ class CellRequests:
         """Cells that touch an area, minus those the client holds."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        session.asked_about(*area.center)
+        session.asked_about(area)
         layers = canonical_layers(message.layers)
         found = self._store.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._cannot_exceed_quota(session):
@@ -195,7 +196,7 @@ class CellRequests:
             self._statistics.add("misses", len(cold))
             self._load(wanted, cold, area, now_s)
             if wait_s and wanted.outstanding:
-                wanted.deadline_s = now_s + wait_s
+                wanted.began_s, wanted.deadline_s = now_s, now_s + wait_s
                 self._wait(wanted)
                 return
         self._answer(wanted, now_s)
@@ -257,6 +258,7 @@ class CellRequests:
                 )
                 wanted.refused[key] = ("over_budget", message)
                 self._statistics.add("refused_quota")
+                store.events.pressure.refused(store.wire_id(key.cell_id), layer, "quota", self._now_s())
 
     def _refresh(self, session: Session) -> None:
         """Ask the kernel which segments the session really still uses."""
@@ -349,6 +351,8 @@ class CellRequests:
                 self._answer_cold(wanted, index, layer, answer, now_s)
         self._reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
         self._hand_out(wanted.session, answer, now_s)
+        if wanted.deadline_s:
+            self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
 
     def _reply(
         self,

@@ -7,15 +7,27 @@ It beats from the serving loop itself, so that whoever is hung does not beat.
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
+from itertools import islice
 from typing import Final
 
+from shmmap.daemon.event_log import EventLog
+from shmmap.daemon.pin_census import PinCensus
+from shmmap.daemon.recent_counts import RecentCounts
+from shmmap.daemon.session_rows import client_row
+from shmmap.daemon.sessions import Sessions
 from shmmap.daemon.store import Store
+from shmmap.statistics.client_rows import MAX_CLIENTS
+from shmmap.statistics.counters import SPANS, WINDOWED
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["BEAT_S", "Heartbeat"]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
+PROBES_A_BEAT: Final = 16
+"""Segments whose pins are looked at: about half a millisecond."""
+EVENT_BEAT_S: Final = 1.0
+"""How often listeners are told the last event's number, so that a missed one does not stay unnoticed."""
 USED_ROWS_A_BEAT: Final = 64
 """Rows of the statistics whose hits are brought up to date at a beat: about half a millisecond."""
 
@@ -25,8 +37,10 @@ class Heartbeat:
 
     Parameters
     ----------
-    sessions, waiting
-        Whose lengths are the numbers of clients and of requests that wait for loads.
+    sessions
+        The clients.
+    waiting
+        Whose length is the number of requests that wait for loads.
     on_beat
         Called after each beat.
     """
@@ -35,8 +49,9 @@ class Heartbeat:
         self,
         store: Store,
         statistics: StatisticsWriter,
+        event_log: EventLog,
         *,
-        sessions: Sized,
+        sessions: Sessions,
         waiting: Sized,
         on_beat: Callable[[], None],
     ) -> None:
@@ -45,6 +60,10 @@ class Heartbeat:
         self._sessions = sessions
         self._waiting = waiting
         self._on_beat = on_beat
+        self._event_log = event_log
+        self._pins = PinCensus(store.reclaimer.everything, store.reclaimer.is_pinned)
+        self._recent = RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
+        self._looked_s = self._told_s = float("-inf")
         self._last_s = 0.0
         self.next_s = 0.0
 
@@ -55,7 +74,7 @@ class Heartbeat:
             self.next_s = min(self.next_s, self._last_s + CHANGE_BEAT_S)
         if now_s >= self.next_s:
             self._last_s, self.next_s = now_s, now_s + BEAT_S
-            self._beat()
+            self._beat(now_s)
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
@@ -77,9 +96,30 @@ class Heartbeat:
         set_value("budget_bytes", books.budget_bytes)
         set_value("evictions", self._store.reclaimer.evicted_count)
         set_value("map_cells", len(self._store.catalogue))
+        set_value("events_published", self._event_log.last)
 
-    def _beat(self) -> None:
+    def _look_around(self, now_s: float) -> None:
+        """What takes longer, and need not be done at each of many beats while cells load."""
+        self._looked_s = now_s
+        self._pins.look(PROBES_A_BEAT)
+        self._statistics.set("bytes_pinned", self._pins.pinned_bytes)
+        self._statistics.set("segments_pinned", self._pins.pinned_count)
+        values = self._statistics.values
+        self._recent.look(values, now_s)
+        for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
+            for name, count in zip(WINDOWED, growth, strict=True):
+                values[f"{name}_{span}"] = count
+        clients = islice(self._sessions, MAX_CLIENTS)
+        self._statistics.show_clients([client_row(session) for session in clients])
+        self._store.events.pressure.turn(now_s)
+        if now_s - self._told_s >= EVENT_BEAT_S:
+            self._told_s = now_s
+            self._event_log.beat()
+
+    def _beat(self, now_s: float) -> None:
         self.measure()
+        if now_s - self._looked_s >= BEAT_S:
+            self._look_around(now_s)
         self._store.books.overhead_bytes = self._statistics.size_bytes
         self._store.show_used(USED_ROWS_A_BEAT)
         self._statistics.beat()

@@ -43,9 +43,12 @@ from shmmap.daemon.activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.budget import choose_budget
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.event_log import EventLog, nowhere
+from shmmap.daemon.event_socket import EventSocket, events_path
 from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import Leftovers
+from shmmap.daemon.listening import bind_socket
 from shmmap.daemon.logs import set_up_logging
 from shmmap.daemon.pin_support import Rung
 from shmmap.daemon.pin_watch import PinWatch
@@ -70,6 +73,7 @@ from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
+from shmmap.protocol.events import Epoch
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import segment_prefix
@@ -191,6 +195,7 @@ class _Life:
         self._gid = gid
         self._privileges = Privileges(config.admin_group)
         self._epoch = secrets.randbits(63) | 1
+        self._event_log = EventLog(self._epoch)
         self._directory = directory
         self._catalogue = catalogue
         self._identity = DaemonIdentity(
@@ -224,6 +229,7 @@ class _Life:
         self._statistics.reserve = grow_statistics
         reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction], pins)
         self._statistics.set("pin_source", list(Rung).index(pins.rung))
+        self._statistics.set("last_reload_unix_ns", time.time_ns())
         pool = WorkerPool(
             config.loaders(),
             directory.path,
@@ -244,6 +250,7 @@ class _Life:
             mode=mode,
             gid=gid,
             on_settled=lambda key: self._running.cells.settled(key),
+            event_log=self._event_log,
         )
         leftovers = Leftovers(directory, config.instance, self._store, reclaimer, mode=mode, gid=gid)
         leftovers.take_over(time.monotonic())
@@ -274,7 +281,16 @@ class _Life:
         self._owns_socket = activated is None
         quota = self._config.session_quota
         budget = self._store.books.budget_bytes
-        admin = Admin(self._config, self._store, self._sessions, self._statistics, epoch=self._epoch)
+        events = EventSocket(context, self._event_log.beat)
+        admin = Admin(
+            self._config,
+            self._store,
+            self._sessions,
+            self._statistics,
+            epoch=self._epoch,
+            event_log=self._event_log,
+            events_path=events_path(self._socket_path),
+        )
         self._pins = admin.pins
         server = self._server = Server(
             socket,
@@ -284,6 +300,7 @@ class _Life:
             admin,
             reloader,
             self._privileges,
+            self._event_log,
             epoch=self._epoch,
             quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
             on_beat=self._beat,
@@ -293,9 +310,13 @@ class _Life:
                 server.watch(fd, lambda: self._on_signals(signals))
                 if activated is not None:
                     socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
-                self._bind(socket)
+                bind_socket(socket, self._socket_path, self._gid, own=self._owns_socket)
                 step("daemon.bind")
                 server.guard()
+                bind_socket(events.socket, events_path(self._socket_path), self._gid)
+                server.watch(events.fd, events.drain)
+                self._event_log.send = events.send
+                self._tell_epoch("started")
                 self._store.loads.pool.start_one()
                 _log.info(
                     "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
@@ -309,27 +330,21 @@ class _Life:
                 server.run()
         finally:
             manager.stopping("keeping memory for the next start" if signals.keep else "freeing memory")
+            self._tell_epoch("stopping")
+            self._event_log.send = nowhere
+            events.close()
             socket.close()
             context.term()
             reloader.close()
             if self._owns_socket:
                 Path(self._socket_path).unlink(missing_ok=True)
+            Path(events_path(self._socket_path)).unlink(missing_ok=True)
 
-    def _bind(self, socket: zmq.Socket[bytes]) -> None:
-        # libzmq makes the socket file with the umask's mode; nobody may connect before it is right
-        mask = os.umask(0o117 if self._gid >= 0 else 0o177)
-        try:
-            socket.bind(f"ipc://{self._socket_path}")
-        except zmq.ZMQError as error:
-            raise ConfigError(
-                f"cannot listen at {self._socket_path}: {error}",
-                key="endpoint",
-                hint="choose another --endpoint",
-            ) from error
-        finally:
-            os.umask(mask)
-        if self._gid >= 0 and self._owns_socket:
-            os.chown(self._socket_path, -1, self._gid)
+    def _tell_epoch(self, what: str) -> None:
+        catalogue = self._store.catalogue
+        self._event_log.publish(
+            Epoch, what, catalogue.map_version, len(catalogue), self._store.books.resident_count
+        )
 
     def _beat(self) -> None:
         self._manager.beat(time.monotonic(), self._status)
@@ -408,7 +423,7 @@ class _Life:
         del number, frame
         directory, instance = self._directory, self._config.instance
         names = [directory.path + name for name in _names_of(directory, instance)]
-        own_socket = [self._socket_path] if self._owns_socket else []
+        own_socket = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]
         locks = (f"{directory.path}{segment_prefix(instance)}lock", _lock_path(self._socket_path))
         for path in (*names, *own_socket, *locks):
             with contextlib.suppress(OSError):

@@ -53,6 +53,9 @@ class Shelf(Protocol):
     def estimate_of(self, key: Key) -> int:
         """Bytes to reserve before loading a key."""
 
+    def failed(self, key: Key, failure: Failure, now_s: float) -> None:
+        """Hear that a load ended without a segment."""
+
 
 class Loading:
     """Carries out the loads that the books queue.
@@ -295,7 +298,9 @@ class Loading:
         if self._shelf.job(load, 0) is None:
             self.abandon(load)
             return
-        self.books.failed(load, Failure(code, message, stamp, now_s + delay_s, delay_s))
+        failure = Failure(code, message, stamp, now_s + delay_s, delay_s)
+        self.books.failed(load, failure)
+        self._shelf.failed(load.key, failure, now_s)
         self._on_settled(load.key)
 
     def abandon(self, load: Load) -> None:

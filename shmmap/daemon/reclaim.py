@@ -54,6 +54,10 @@ def _nothing(resident: Resident) -> None:
     del resident
 
 
+def _nothing_more(resident: Resident, why: str) -> None:
+    del resident, why
+
+
 class Reclaimer:
     """Carries out what the books decide about memory.
 
@@ -67,7 +71,8 @@ class Reclaimer:
     freed_count, evicted_count
         Segments whose memory went back to the kernel; segments retired to make room.
     on_retired, on_freed
-        Called with a segment that left service, and with one whose memory went back.
+        Called with a segment that left service and why (``room``, ``request``, ``map``,
+        ``superseded``), and with one whose memory went back.
     wake_s
         When `free` is worth calling again although nothing changed (hand-out grace ends).
     """
@@ -87,7 +92,7 @@ class Reclaimer:
         self._policy = policy
         self._pinned_until_s: dict[str, float] = {}
         self._by_key: dict[Key, Zombie] = {}
-        self.on_retired: Callable[[Resident], None] = _nothing
+        self.on_retired: Callable[[Resident, str], None] = _nothing_more
         self.on_freed: Callable[[Resident], None] = _nothing
         self.freed_count = 0
         self.evicted_count = 0
@@ -104,11 +109,11 @@ class Reclaimer:
             return bool(resident.sessions)
         return self.pins.is_used(self._on_disk(resident))
 
-    def retire(self, resident: Resident, now_s: float) -> bool:
+    def retire(self, resident: Resident, now_s: float, why: str = "request") -> bool:
         """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
         found = self._directory.rename(resident.name, zombie_name(resident.name))
         zombie = self._books.retire(resident)
-        self.on_retired(resident)
+        self.on_retired(resident, why)
         if not found:
             self._forget(zombie)
             return True
@@ -118,7 +123,7 @@ class Reclaimer:
         """The books moved an old version to the zombies; do the same with its name."""
         found = self._directory.rename(old.name, zombie_name(old.name))
         zombie = self._books.zombies[old.name]
-        self.on_retired(old)
+        self.on_retired(old, "superseded")
         if found:
             self._watch(zombie, now_s)
         else:
@@ -251,7 +256,7 @@ class Reclaimer:
                 self.pins.tell_once(resident.name)
                 continue
             missing -= resident.nbytes
-            self.retire(resident, now_s)
+            self.retire(resident, now_s, "room")
             self.evicted_count += 1
             if missing <= 0:
                 return Outcome.PENDING

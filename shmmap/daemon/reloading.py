@@ -62,7 +62,7 @@ class Reloader:
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
-    def collect(self, apply: Callable[[Catalogue], None]) -> None:
+    def collect(self, apply: Callable[[Catalogue], None], failed: Callable[[ShmmapError], None]) -> None:
         """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
         os.eventfd_read(self.fd)
         if self._thread is None:
@@ -75,6 +75,7 @@ class Reloader:
             apply(result)
         elif result is not None:
             _log.error("the map could not be read again, the old state stays: %s", result)
+            failed(result)
         if result is not None:
             for answer in asked:
                 answer(result)

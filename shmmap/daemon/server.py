@@ -20,9 +20,11 @@ import zmq
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.cells import CellRequests
 from shmmap.daemon.crowd_control import CrowdControl
+from shmmap.daemon.event_log import EventLog
 from shmmap.daemon.hearing import Heard, Hearing, peer_of
 from shmmap.daemon.heartbeat import BEAT_S, Heartbeat
 from shmmap.daemon.listen_gate import ListenGate
+from shmmap.daemon.map_events import tell_reload, tell_reload_failed
 from shmmap.daemon.pin_survey import Pinned, PinSurvey
 from shmmap.daemon.privileges import Privileges
 from shmmap.daemon.reloading import Reloader
@@ -32,7 +34,7 @@ from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ProtocolMismatch, ShmmapError
 from shmmap.origin.catalogue import Catalogue, compare
-from shmmap.protocol import messages
+from shmmap.protocol import events, messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -76,6 +78,7 @@ class Server:
         admin: Admin,
         reloader: Reloader,
         privileges: Privileges,
+        event_log: EventLog,
         *,
         epoch: int,
         quota_bytes: int,
@@ -88,6 +91,7 @@ class Server:
         self._admin = admin
         self._reloader = reloader
         self._privileges = privileges
+        self._event_log = event_log
         self._epoll = select.epoll()
         self._events: dict[int, Callable[[], None]] = {}
         self._stopping = False
@@ -95,8 +99,10 @@ class Server:
         self.cells = CellRequests(
             store, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
         )
-        self._heartbeat = Heartbeat(store, statistics, sessions=sessions, waiting=self.cells, on_beat=on_beat)
-        self.watch(reloader.fd, lambda: reloader.collect(self._change_map))
+        self._heartbeat = Heartbeat(
+            store, statistics, event_log, sessions=sessions, waiting=self.cells, on_beat=on_beat
+        )
+        self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
         self._replies = Replies(socket, statistics)
         self._hearing = Hearing(socket, sessions, statistics, self._refuse_unread)
         self._survey = PinSurvey(store.reclaimer, sessions)
@@ -211,6 +217,7 @@ class Server:
             self._handle(heard)
             now_s = time.monotonic()
             self._hearing.served(heard, now_s - start_s)
+            self._statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s, more = now_s, True
 
     def _handle(self, heard: Heard) -> None:
@@ -302,6 +309,7 @@ class Server:
             session = self._sessions.open(identity, peer, message.client, now_s)
             session.fd = _descriptor(frame)
             self._statistics.add("sessions_opened")
+            self._event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
             if session.pidfd >= 0:
                 self.watch(session.pidfd, lambda: self.end_session(session))
         self._send(session, encode(self._admin.welcome(session, message)))
@@ -314,6 +322,9 @@ class Server:
     def end_session(self, session: Session) -> None:
         """A client's process ended, or it said goodbye: what it held may be free now."""
         held = session.residents()
+        self._event_log.publish(
+            events.Left, session.slot, session.peer.pid, session.client, session.held_bytes
+        )
         self.cells.forget(session)
         if session.pidfd >= 0:
             self.unwatch(session.pidfd)
@@ -350,13 +361,16 @@ class Server:
         old, now_s = self._store.catalogue, time.monotonic()
         self.cells.renumber(lambda index: catalogue.find(old.id(index)), old.id)
         change = self._store.replace_catalogue(catalogue, now_s)
-        self._statistics.add("reloads")
+        tell_reload(self._event_log, self._statistics, self._store, change)
         _log.info(
             "map read again: %d cells changed, %d added, %d removed",
             len(change.changed), len(change.added), len(change.removed),
         )  # fmt: skip
         for problem in catalogue.problems:
             _log.warning("%s", problem)
+
+    def _keep_map(self, error: ShmmapError) -> None:
+        tell_reload_failed(self._event_log, self._statistics, self._store, error)
 
     # --- replies --------------------------------------------------------------------------------------
 

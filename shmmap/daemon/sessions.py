@@ -14,6 +14,7 @@ from typing import Final
 
 from shmmap.daemon.residency import Resident
 from shmmap.errors import NoSession
+from shmmap.geometry import Area
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
@@ -47,9 +48,9 @@ class Session:
 
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
     naming holders.  Safety never depends on it, pins are the kernel's word.  ``says_where`` tells
-    an ``intent`` that the client stated from one that was guessed from the area it asked for.
-    ``fd`` is the connection's descriptor (libzmq's own: never closed here), ``unread_bytes`` what was
-    sent since the client is known to have read everything.
+    an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
+    asked for.  ``fd`` is the connection's descriptor (libzmq's own: never closed here),
+    ``unread_bytes`` what was sent since the client is known to have read everything.
     """
 
     slot: int
@@ -62,15 +63,17 @@ class Session:
     held_bytes: int = 0
     intent: Intent | None = None
     says_where: bool = False
+    area: Area | None = None
     requests: int = 0
     last_request_s: float = 0.0
     fd: int = -1
     unread_bytes: int = 0
 
-    def asked_about(self, x: float, y: float) -> None:
-        """The session asked for an area about (x, y): that is where it is, unless it says."""
+    def asked_about(self, area: Area) -> None:
+        """The session asked for an area: in the middle of it is where it is, unless it says."""
+        self.area = area
         if not self.says_where:
-            self.intent = Intent(x, y)
+            self.intent = Intent(*area.center)
 
     def hold(self, residents: Iterable[Resident]) -> None:
         """The session was handed these segments."""

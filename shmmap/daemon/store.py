@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon import jobs
+from shmmap.daemon.cell_events import CellEvents
+from shmmap.daemon.event_log import EventLog
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.daemon.loading import Loading
 from shmmap.daemon.name_watch import NameWatch
 from shmmap.daemon.reclaim import Reclaimer
-from shmmap.daemon.residency import Key, Load, Residency, Resident, Slot
+from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident, Slot
 from shmmap.daemon.workers import WorkerPool
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
@@ -57,9 +59,13 @@ class Store:
         Access of published segments; ``gid`` -1 leaves the group alone.
     on_settled
         Called with a key when its load ended, in whichever way.
+    event_log
+        Told what happens to cells.
 
     Attributes
     ----------
+    events
+        Tells what happens to cells.
     loads
         What is being loaded.
     names
@@ -91,6 +97,7 @@ class Store:
         mode: int,
         gid: int,
         on_settled: Callable[[Key], None],
+        event_log: EventLog,
     ) -> None:
         self.catalogue = catalogue
         self.books = residency
@@ -110,6 +117,7 @@ class Store:
         self._mode = mode
         self._gid = gid
         self._on_settled = on_settled
+        self.events = CellEvents(event_log, residency, statistics, self.wire_id)
         self._indices: dict[str, int] = {}
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
@@ -144,6 +152,7 @@ class Store:
             resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
             if resident is not None:
                 self._enter(resident, index)
+                self.events.revived(resident)
         return resident
 
     def want(self, index: int, layer: str, priority: float, now_s: float) -> Slot:
@@ -156,6 +165,8 @@ class Store:
             and not self.loads.may_retry(key, slot.failure, now_s)
         ):
             return slot
+        if slot.load is None and slot.failure is not None:
+            self.events.retried(key, slot.failure)
         self.books.want(key, self.estimate(index, layer), priority)
         return slot
 
@@ -218,6 +229,7 @@ class Store:
                 self._remember({self.catalogue.id(cell)}, ())
                 self.catalogue.set_stamp(cell, stamp)
                 self._chill(cell)
+                self.events.changed(self.catalogue.id(cell), self.catalogue.version(cell))
         version = self.layers.version(index, load.key.layer)
         name = new_segment_name(self._instance)
         try:
@@ -250,8 +262,8 @@ class Store:
             self.reclaimer.superseded(old, now_s)
         step("daemon.catalogue")
         self._enter(resident, index)
-        self._statistics.add("loads_finished")
-        self._statistics.add("bytes_loaded", nbytes)
+        took_ns = int((now_s - load.started_s) * 1e9)
+        self.events.loaded(resident, took_ns, replaces=old.version if old is not None else 0)
         for warning in done.warnings:
             _log.info("%s: %s", load.key.cell_id, warning)
         if done.dropped:
@@ -279,12 +291,16 @@ class Store:
         self._statistics.add("adoptions_failed")
         _log.warning("%s of an earlier daemon is not used: %s", resident.name, why)
         if self.books.resident_named(resident.name) is resident:
-            self.reclaimer.retire(resident, now_s)
+            self.reclaimer.retire(resident, now_s, "damaged")
 
     def estimate_of(self, key: Key) -> int:
         """Bytes to reserve before loading a key."""
         index = self.index_of(key.cell_id)
         return self.estimate(index, key.layer) if index is not None else 0
+
+    def failed(self, key: Key, failure: Failure, now_s: float) -> None:
+        """Hear that a load ended without a segment."""
+        self.events.failed(key, failure, now_s)
 
     def _lies_on_disk(self, index: int, stamp: Stamp) -> bool:
         try:
@@ -314,8 +330,9 @@ class Store:
         self._indices[self.wire_id(resident.key.cell_id)] = index
         self._show(resident, "resident" if current else "stale")
 
-    def _leave(self, resident: Resident) -> None:
+    def _leave(self, resident: Resident, why: str) -> None:
         """A resident was retired: nobody finds it any more, its bytes still show."""
+        self.events.retired(resident, why)
         self.used.discard(resident)
         index = self.index_of(resident.key.cell_id)
         warm = self.warm.get(resident.key.layer, {})
@@ -389,9 +406,9 @@ class Store:
         if warm.pop(index, None) is not None:
             self.versions[resident.key.layer][index] = 0
 
-    def evict(self, resident: Resident, now_s: float) -> bool:
+    def evict(self, resident: Resident, now_s: float, why: str = "request") -> bool:
         """Retire on request; True if nobody has it mapped."""
-        return self.reclaimer.retire(resident, now_s)
+        return self.reclaimer.retire(resident, now_s, why)
 
     def hear_of_names(self, now_s: float) -> None:
         """Names vanished from the directory: what somebody else removed is handed out no more."""
@@ -429,11 +446,11 @@ class Store:
                 self.reclaimer.never_revive(zombie.resident.key)
         for resident in list(self.books.residents()):
             if resident.key.cell_id in gone:
-                self.evict(resident, now_s)
+                self.evict(resident, now_s, "map")
                 continue
             index = self.index_of(resident.key.cell_id)
             if index is None or resident.key.cell_id in moved:
-                self.evict(resident, now_s)
+                self.evict(resident, now_s, "map")
                 self.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
             self._chill_one(resident, index)

@@ -13,6 +13,7 @@ from typing import Final, TypeAlias
 import msgspec
 
 from shmmap import geometry
+from shmmap.protocol.events import EventPage, Recent
 
 __all__ = [
     "PROTOCOL_VERSION",
@@ -279,6 +280,7 @@ Request: TypeAlias = (
     | Pin
     | Unpin
     | Shutdown
+    | Recent
     | Bye
 )
 
@@ -290,7 +292,8 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
     """Answer to `Hello`.
 
     ``session`` is the slot the client locks in every segment it opens.  Cell ids in replies are
-    relative to ``id_prefix`` and segment names to ``segment_prefix``.
+    relative to ``id_prefix`` and segment names to ``segment_prefix``.  ``events`` is the path of the
+    socket that events leave by; empty where there is none.
     """
 
     request: int
@@ -311,6 +314,7 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
     layers: tuple[str, ...]
     budget_bytes: int
     pid: int = 0
+    events: str = ""
 
 
 class Handle(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -545,5 +549,6 @@ Reply: TypeAlias = (
     | Evicted
     | Pinned
     | Stopping
+    | EventPage
     | ErrorReply
 )

@@ -5,21 +5,34 @@ from __future__ import annotations
 
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["COUNTERS", "COUNTER_NAMES", "Counter"]
+__all__ = ["COUNTERS", "COUNTER_NAMES", "HISTOGRAMS", "SPANS", "WINDOWED", "Counter"]
 
 
 class Counter(NamedTuple):
     """One number the daemon keeps.
 
     ``kind`` is ``counter`` for what only grows during one life of the daemon and ``gauge`` for a
-    present amount.  ``unit`` is empty for plain counts.
+    present amount; a ``histogram`` counts durations (`shmmap.statistics.histogram`).  ``unit`` is
+    empty for plain counts.
     """
 
     name: str
-    kind: Literal["counter", "gauge"]
+    kind: Literal["counter", "gauge", "histogram"]
     unit: str
     help: str
 
+
+SPANS: Final = {"10s": 10, "1min": 60, "10min": 600}
+"""Spans over which some counters are also told, by suffix, in seconds."""
+
+WINDOWED: Final = {
+    "hits": "Cells answered from memory",
+    "misses": "Cells that had to be loaded first",
+    "evictions": "Segments retired to make room or on request",
+    "loads_after_eviction": "Loads of cells that had been evicted to make room",
+    "refused_over_budget": "Cells refused because the budget is full",
+}
+"""Counters of which the last 10 s, 1 min and 10 min are told: whether the cache is large enough."""
 
 COUNTERS: Final = (
     Counter("requests", "counter", "", "Requests received, well-formed or not"),
@@ -63,6 +76,23 @@ COUNTERS: Final = (
         "How the use of a segment is known: 0 leases, 1 locks of clients, 2 what sessions say",
     ),
     Counter("map_cells", "gauge", "", "Cells in the map's catalogue"),
+    Counter("reloads_failed", "counter", "", "Times the map's catalogue could not be read again"),
+    Counter("last_reload_unix_ns", "gauge", "ns", "When the catalogue was last read, wall clock"),
+    Counter("last_reload_failed", "gauge", "", "1 if the last attempt to read the catalogue again failed"),
+    Counter("loads_after_eviction", "counter", "", WINDOWED["loads_after_eviction"]),
+    Counter("segments_pinned", "gauge", "", "Segments somebody maps, as last probed"),
+    Counter("events_published", "counter", "", "Events of this life of the daemon"),
+    *(
+        Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")
+        for name, text in WINDOWED.items()
+        for span in SPANS
+    ),
 )
 
 COUNTER_NAMES: Final = tuple(counter.name for counter in COUNTERS)
+
+HISTOGRAMS: Final = (
+    Counter("request", "histogram", "ns", "Serving loop's time for one request, waiting for loads left out"),
+    Counter("wait", "histogram", "ns", "From a request that had to wait for loads to its answer"),
+    Counter("load", "histogram", "ns", "From handing a load to a worker to its published segment"),
+)

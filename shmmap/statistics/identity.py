@@ -12,7 +12,15 @@ from typing import Final, Literal, TypeAlias
 
 from shmmap.errors import SegmentCorrupt
 
-__all__ = ["DaemonIdentity", "DaemonState", "judge", "pid_namespace", "process_state", "start_time_ticks"]
+__all__ = [
+    "DaemonIdentity",
+    "DaemonState",
+    "WriterProcess",
+    "judge",
+    "pid_namespace",
+    "process_state",
+    "start_time_ticks",
+]
 
 DaemonState: TypeAlias = Literal["healthy", "stopped", "hung", "dead"]
 
@@ -139,6 +147,60 @@ def process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", "
     if int(found[19]) != start_ticks or found[0] in "ZXx":
         return "dead"
     return "stopped" if found[0] in "Tt" else "running"
+
+
+class WriterProcess:
+    """The process that writes the statistics, watched through one descriptor of ``/proc/PID/stat``.
+
+    The descriptor goes on meaning that very process when its id is used again, and reading it takes a
+    third of the time that opening it does.
+    """
+
+    def __init__(self, identity: DaemonIdentity) -> None:
+        self._identity = identity
+        self._fd = -1
+        self._elsewhere = identity.pid_namespace not in (0, pid_namespace())
+        if self._elsewhere:
+            return  # its pid means another process here: only the beat tells
+        try:
+            fd = os.open(f"/proc/{identity.pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:
+            return
+        found = _read_stat(fd)
+        if (
+            found is not None
+            and int(found[found.rindex(b")") + 2 :].split()[19]) == identity.start_time_ticks
+        ):
+            self._fd = fd
+        else:
+            os.close(fd)
+
+    def state(self, beat_age_s: float) -> DaemonState:
+        """Return how the daemon is, given the age of its last beat in seconds."""
+        if self._fd < 0:
+            return judge(self._identity, beat_age_s)
+        found = _read_stat(self._fd)
+        if found is None:
+            return "dead"
+        letter = found[found.rindex(b")") + 2]
+        if letter in b"ZXx":
+            return "dead"
+        if letter in b"Tt":
+            return "stopped"
+        return "healthy" if beat_age_s <= HUNG_AFTER_S else "hung"
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+def _read_stat(fd: int) -> bytes | None:
+    try:
+        return os.pread(fd, 1024, 0)
+    except ProcessLookupError:
+        return None
 
 
 def judge(identity: DaemonIdentity, beat_age_s: float) -> DaemonState:

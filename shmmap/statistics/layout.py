@@ -10,10 +10,12 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from shmmap.errors import SegmentCorrupt
+from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS
 from shmmap.statistics.counters import Counter
+from shmmap.statistics.histogram import BUCKETS
 
 __all__ = [
     "CELL_STATES",
@@ -33,22 +35,26 @@ __all__ = [
 ]
 
 MAGIC: Final = b"SHMSTAT\x01"
-LAYOUT_VERSION: Final = (1, 0)
+LAYOUT_VERSION: Final = (1, 1)
 BYTE_ORDER: Final = 0x01020304
 PAGE_BYTES: Final = 4096
 MAX_ROWS: Final = 1 << 17  # 32 MiB of rows; more cells than that are counted, not listed
 
 START: Final = struct.Struct("<8sHHI12I")
+EXTENSION: Final = struct.Struct("<5I40xI")
+DESCRIPTIONS_OFFSET: Final = START.size + EXTENSION.size
 DESCRIPTION: Final = struct.Struct("<32s16sB111s")
 IDENTITY: Final = struct.Struct("<QII")
 IDENTITY_BYTES: Final = 16384
 STATE: Final = struct.Struct("<QqqIIII")
+CRC_BYTES: Final = 4
 CRC: Final = struct.Struct("<I4x")
+TAIL: Final = struct.Struct("<II")
 TABLE: Final = struct.Struct("<Q")
 ROW: Final = struct.Struct("<QQQ4dQqq16sBBHHH40s104sI")
 ROW_BYTES: Final = 256
 
-KINDS: Final = ("counter", "gauge")
+KINDS: Final[tuple[Literal["counter", "gauge", "histogram"], ...]] = ("counter", "gauge", "histogram")
 CELL_STATES: Final = ("free", "resident", "stale", "zombie")
 ID_BYTES: Final = 104
 LAYER_BYTES: Final = 40
@@ -114,10 +120,20 @@ class Header(NamedTuple):
     rows_offset: int
     row_bytes: int
     max_rows: int
+    histograms: tuple[Counter, ...] = ()
+    bucket_count: int = 0
+    clients_offset: int = 0
+    client_row_bytes: int = 0
+    max_clients: int = 0
+
+    @property
+    def descriptions_end(self) -> int:
+        """Where the part that never changes ends, in a segment of this version."""
+        return DESCRIPTIONS_OFFSET + (len(self.counters) + len(self.histograms)) * DESCRIPTION.size
 
 
 class State(NamedTuple):
-    """What one beat wrote."""
+    """What one beat wrote; ``histograms`` holds sum and counts of each, one after the other."""
 
     sequence: int
     beat_monotonic_ns: int
@@ -125,18 +141,23 @@ class State(NamedTuple):
     rows_used: int
     rows_missing: int
     values: tuple[int, ...]
+    clients_used: int = 0
+    histograms: Sequence[int] = ()
 
 
 def _up(value: int, step: int) -> int:
     return -(-value // step) * step
 
 
-def plan(counters: Sequence[Counter]) -> Header:
-    """Lay out a segment for these counters."""
-    identity_offset = _up(START.size + len(counters) * DESCRIPTION.size, 64)
+def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Header:
+    """Lay out a segment for these counters and histograms."""
+    described = DESCRIPTIONS_OFFSET + (len(counters) + len(histograms)) * DESCRIPTION.size
+    identity_offset = _up(described, 64)
     state_offset = identity_offset + 2 * IDENTITY_BYTES
-    state_bytes = _up(STATE.size + 8 * len(counters) + CRC.size, 64)
+    counters_end = STATE.size + 8 * len(counters) + CRC.size
+    state_bytes = _up(counters_end + TAIL.size + 8 * len(histograms) * (1 + BUCKETS) + CRC.size, 64)
     table_offset = state_offset + 2 * state_bytes
+    clients_offset = _up(table_offset + 64, PAGE_BYTES)
     return Header(
         counters=tuple(counters),
         identity_offset=identity_offset,
@@ -144,23 +165,42 @@ def plan(counters: Sequence[Counter]) -> Header:
         state_offset=state_offset,
         state_bytes=state_bytes,
         table_offset=table_offset,
-        rows_offset=_up(table_offset + 64, PAGE_BYTES),
+        rows_offset=_up(clients_offset + MAX_CLIENTS * CLIENT_ROW_BYTES, PAGE_BYTES),
         row_bytes=ROW_BYTES,
         max_rows=MAX_ROWS,
+        histograms=tuple(histograms),
+        bucket_count=BUCKETS,
+        clients_offset=clients_offset,
+        client_row_bytes=CLIENT_ROW_BYTES,
+        max_clients=MAX_CLIENTS,
+    )
+
+
+def _pack_descriptions(counters: Sequence[Counter]) -> bytes:
+    return b"".join(
+        DESCRIPTION.pack(c.name.encode(), c.unit.encode(), KINDS.index(c.kind), c.help.encode())
+        for c in counters
     )
 
 
 def pack_header(header: Header) -> bytes:
-    """Return the bytes that never change: offsets and descriptions of the counters."""
-    described = b"".join(
-        DESCRIPTION.pack(c.name.encode(), c.unit.encode(), KINDS.index(c.kind), c.help.encode())
-        for c in header.counters
-    )
+    """Return the bytes that never change: offsets, and descriptions of counters and histograms."""
+    counters, histograms = _pack_descriptions(header.counters), _pack_descriptions(header.histograms)
     start = START.pack(
-        MAGIC, *LAYOUT_VERSION, BYTE_ORDER, START.size, len(header.counters), DESCRIPTION.size,
-        *header[1:], 0,
+        MAGIC, *LAYOUT_VERSION, BYTE_ORDER, DESCRIPTIONS_OFFSET, len(header.counters), DESCRIPTION.size,
+        *header[1:9], 0,
     )[:-4]  # fmt: skip
-    return start + struct.pack("<I", zlib.crc32(described, zlib.crc32(start))) + described
+    extension = EXTENSION.pack(len(header.histograms), *header[10:], 0)[:-4]
+    return b"".join(
+        (
+            start,
+            struct.pack("<I", zlib.crc32(counters, zlib.crc32(start))),
+            extension,
+            struct.pack("<I", zlib.crc32(histograms, zlib.crc32(extension))),
+            counters,
+            histograms,
+        )
+    )
 
 
 def unpack_header(data: bytes) -> Header:
@@ -188,18 +228,42 @@ def unpack_header(data: bytes) -> Header:
         raise SegmentCorrupt("the statistics' counter table lies outside the segment")
     if crc != zlib.crc32(data[at:end], zlib.crc32(data[: START.size - 4])):
         raise SegmentCorrupt("the statistics' header checksum does not match")
-    counters = []
+    counters = _unpack_descriptions(data, at, count, row)
+    header = Header(counters, *places)
+    if at < START.size + EXTENSION.size:  # layout 1.0
+        return header
+    histogram_count, buckets, clients_at, client_row, max_clients, crc = EXTENSION.unpack_from(
+        data, START.size
+    )
+    last = end + histogram_count * row
+    if last > len(data):
+        raise SegmentCorrupt("the statistics' histogram table lies outside the segment")
+    if crc != zlib.crc32(
+        data[end:last], zlib.crc32(data[START.size : START.size + EXTENSION.size - CRC_BYTES])
+    ):
+        raise SegmentCorrupt("the checksum of the statistics' second header does not match")
+    return header._replace(
+        histograms=_unpack_descriptions(data, end, histogram_count, row),
+        bucket_count=buckets,
+        clients_offset=clients_at,
+        client_row_bytes=client_row,
+        max_clients=max_clients,
+    )
+
+
+def _unpack_descriptions(data: bytes, at: int, count: int, step: int) -> tuple[Counter, ...]:
+    found = []
     for index in range(count):
-        name, unit, kind, text = DESCRIPTION.unpack_from(data, at + index * row)
-        counters.append(
+        name, unit, kind, text = DESCRIPTION.unpack_from(data, at + index * step)
+        found.append(
             Counter(
                 name.rstrip(b"\0").decode(),
-                "gauge" if kind else "counter",
+                KINDS[kind] if kind < len(KINDS) else "gauge",
                 unit.rstrip(b"\0").decode(),
                 text.rstrip(b"\0").decode(),
             )
         )
-    return Header(tuple(counters), *places)
+    return tuple(found)
 
 
 def pack_identity(sequence: int, payload: bytes, size: int) -> bytes:
@@ -233,18 +297,36 @@ def pack_state(state: State, packer: struct.Struct) -> bytes:
         state.sequence, state.beat_monotonic_ns, state.beat_unix_ns,
         state.rows_used, state.rows_missing, len(state.values), 0,
     ) + packer.pack(*state.values)  # fmt: skip
-    return body + CRC.pack(zlib.crc32(body))
+    tail = TAIL.pack(state.clients_used, len(state.histograms)) + struct.pack(
+        f"<{len(state.histograms)}q", *state.histograms
+    )
+    whole = b"".join((body, CRC.pack(zlib.crc32(body)), tail))
+    return whole + CRC.pack(zlib.crc32(whole))
 
 
-def unpack_state(data: bytes) -> State | None:
-    """Return a state block; None if it was never written or is torn."""
+def unpack_state(data: bytes, *, extended: bool = True) -> State | None:
+    """Return a state block; None if it was never written or is torn.
+
+    ``extended`` is false for segments of layout 1.0, which end with the counters.
+    """
     sequence, beat, unix, used, missing, count, _ = STATE.unpack_from(data)
     end = STATE.size + 8 * count
-    if not sequence or end + CRC.size > len(data):
+    tail = end + CRC.size
+    if not sequence or tail > len(data):
         return None
     if CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
         return None
-    return State(sequence, beat, unix, used, missing, struct.unpack_from(f"<{count}q", data, STATE.size))
+    values = struct.unpack_from(f"<{count}q", data, STATE.size)
+    if not extended:
+        return State(sequence, beat, unix, used, missing, values)
+    if tail + TAIL.size > len(data):
+        return None
+    clients, many = TAIL.unpack_from(data, tail)
+    end = tail + TAIL.size + 8 * many
+    if end + CRC.size > len(data) or CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
+        return None
+    histograms = memoryview(data)[tail + TAIL.size : end].cast("q")  # hundreds; most readers need none
+    return State(sequence, beat, unix, used, missing, values, clients, histograms)
 
 
 def _fit(text: str, limit: int, *, keep_end: bool) -> tuple[bytes, bool]:

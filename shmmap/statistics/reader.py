@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
 from functools import cached_property
+from types import TracebackType
 from typing import Literal
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.names import statistics_name
+from shmmap.statistics.client_rows import ClientRow, unpack_client
 from shmmap.statistics.counters import Counter
-from shmmap.statistics.identity import DaemonIdentity, DaemonState, judge
+from shmmap.statistics.histogram import Histogram
+from shmmap.statistics.identity import DaemonIdentity, DaemonState, WriterProcess
 from shmmap.statistics.layout import (
+    IDENTITY,
     TABLE,
     CellRow,
     Header,
@@ -27,46 +30,88 @@ from shmmap.statistics.layout import (
     unpack_state,
 )
 
-__all__ = ["Snapshot", "read_statistics"]
+__all__ = ["Snapshot", "StatisticsReader", "read_statistics"]
 
 _ATTEMPTS = 100
 _TABLE_ATTEMPTS = 16
+_HEADER_BYTES = 16384
 _DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108  as shmmap.segment.directory, which would load numpy
 
 
-@dataclass(frozen=True)
 class Snapshot:
     """The statistics at one moment.
 
     Attributes
     ----------
-    state
+    state : str
         ``healthy``; ``stopped`` (SIGSTOP, a debugger); ``hung`` (runs, but has not beaten for 5 s);
         ``dead`` (the process is gone and left its segment); ``absent`` (no segment: never started,
         or stopped cleanly).  All but ``absent`` come with an identity.
-    identity
+    identity : DaemonIdentity or None
         Who wrote the statistics; None when absent.
-    counters
-        Values by name.
-    descriptions
-        What the counters mean, in the daemon's order.
-    beat_age_s
+    beat_age_s : float
         Seconds since the daemon last wrote; infinite when absent.
-    rows_missing
+    beat_monotonic_ns : int
+        When that was, CLOCK_MONOTONIC.
+    rows_missing : int
         Cells the table had no room for.
-    size_bytes
-        Size of the segment.
+    size_bytes : int
+        Memory of the segment.
     """
 
-    state: DaemonState | Literal["absent"]
-    identity: DaemonIdentity | None
-    counters: dict[str, int]
-    descriptions: tuple[Counter, ...]
-    beat_age_s: float
-    rows_missing: int
-    size_bytes: int
-    _rows: bytes
-    _row_bytes: int
+    def __init__(
+        self,
+        state: DaemonState | Literal["absent"],
+        identity: DaemonIdentity | None,
+        header: Header | None = None,
+        values: State | None = None,
+        *,
+        beat_age_s: float = float("inf"),
+        size_bytes: int = 0,
+        rows: bytes = b"",
+        clients: bytes = b"",
+    ) -> None:
+        self.state: DaemonState | Literal["absent"] = state
+        self.identity = identity
+        self.beat_age_s = beat_age_s
+        self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
+        self.rows_missing = values.rows_missing if values is not None else 0
+        self.size_bytes = size_bytes
+        self._header = header
+        self._values = values
+        self._rows = rows
+        self._clients = clients
+
+    @cached_property
+    def counters(self) -> dict[str, int]:
+        """Values by name."""
+        if self._header is None or self._values is None:
+            return {}
+        names = (counter.name for counter in self._header.counters)
+        return dict(zip(names, self._values.values, strict=False))
+
+    @property
+    def descriptions(self) -> tuple[Counter, ...]:
+        """What the counters mean, in the daemon's order."""
+        return self._header.counters if self._header is not None else ()
+
+    @property
+    def histogram_descriptions(self) -> tuple[Counter, ...]:
+        """What the histograms mean, in the daemon's order."""
+        return self._header.histograms if self._header is not None else ()
+
+    @cached_property
+    def histograms(self) -> dict[str, Histogram]:
+        """Durations by name."""
+        if self._header is None or self._values is None:
+            return {}
+        step = 1 + self._header.bucket_count
+        values = self._values.histograms
+        return {
+            description.name: Histogram.of(values[index * step : (index + 1) * step])
+            for index, description in enumerate(self._header.histograms)
+            if (index + 1) * step <= len(values)
+        }
 
     @cached_property
     def cells(self) -> list[CellRow]:
@@ -75,22 +120,131 @@ class Snapshot:
         A row the daemon was changing at that very moment (it was stopped in mid-write) is left out.
         """
         found = []
-        rows = memoryview(self._rows)
-        for at in range(0, len(rows) - self._row_bytes + 1, self._row_bytes):
+        for data in _pieces(self._rows, self._header.row_bytes if self._header is not None else 0):
             try:
-                row = unpack_row(rows[at : at + self._row_bytes])
+                row = unpack_row(data)
             except SegmentCorrupt:
                 continue
             if row is not None:
                 found.append(row)
         return sorted(found, key=lambda row: (row.id, row.layer, row.version))
 
+    @cached_property
+    def clients(self) -> list[ClientRow]:
+        """The clients there is room for in the table, in the order they came."""
+        found = []
+        for data in _pieces(self._clients, self._header.client_row_bytes if self._header is not None else 0):
+            try:
+                row = unpack_client(data)
+            except SegmentCorrupt:
+                continue
+            if row is not None:
+                found.append(row)
+        return found
 
-_ABSENT = Snapshot("absent", None, {}, (), float("inf"), 0, 0, b"", 256)
+
+def _pieces(data: bytes, step: int) -> list[memoryview]:
+    view = memoryview(data)
+    return [view[at : at + step] for at in range(0, len(view) - step + 1, step)] if step else []
+
+
+class StatisticsReader:
+    """Keeps an instance's statistics open, for who looks at them again and again.
+
+    Parameters
+    ----------
+    instance, shm_dir
+        Which daemon, and the directory of its segments.  It need not run yet: the segment is opened
+        when it is there, and anew when another daemon replaced it.
+    """
+
+    def __init__(self, instance: str = "default", shm_dir: str = _DEFAULT_SHM_DIR) -> None:
+        self._path = f"{shm_dir.rstrip('/')}{statistics_name(instance)}"
+        self._fd = -1
+        self._header: Header | None = None
+        self._identity_heads: list[bytes] = []
+        self._identity: DaemonIdentity | None = None
+        self._process: WriterProcess | None = None
+
+    def __enter__(self) -> StatisticsReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the descriptors back."""
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+        self._header = None
+        self._identity_heads = []
+
+    def snapshot(self, *, tables: bool = True) -> Snapshot:
+        """Read the statistics as they are now.
+
+        Parameters
+        ----------
+        tables
+            Copy the rows of cells and clients too; without, a snapshot takes some microseconds.
+
+        Raises
+        ------
+        NotPermitted
+            This user may not read the segment.
+        SegmentCorrupt
+            It is damaged or of another major layout version.
+        """
+        status = os.fstat(self._fd) if self._fd >= 0 else None
+        if status is not None and not status.st_nlink:  # its daemon ended, or another one has replaced it
+            self.close()
+            status = None
+        if status is None:
+            try:
+                self._fd = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+            except FileNotFoundError:
+                return Snapshot("absent", None)
+            except PermissionError as error:
+                raise NotPermitted(
+                    f"statistics {self._path}: this user may not read them", hint="join the daemon's group"
+                ) from error
+            status = os.fstat(self._fd)
+        header = self._header
+        if header is None:
+            header = self._header = _read_header(self._fd, status.st_size)
+        identity, process = self._who(header)
+        state = _newest_state(self._fd, header)
+        age_s = (time.monotonic_ns() - state.beat_monotonic_ns) * 1e-9
+        return Snapshot(
+            process.state(age_s),
+            identity,
+            header,
+            state,
+            beat_age_s=max(age_s, 0.0),
+            size_bytes=status.st_blocks * 512,
+            rows=_rows(self._fd, header, state.rows_used) if tables else b"",
+            clients=_clients(self._fd, header, state.clients_used) if tables else b"",
+        )
+
+    def _who(self, header: Header) -> tuple[DaemonIdentity, WriterProcess]:
+        places = header.identity_offset, header.identity_offset + header.identity_bytes
+        heads = [os.pread(self._fd, IDENTITY.size, place) for place in places]
+        if self._identity is None or self._process is None or heads != self._identity_heads:
+            identity = DaemonIdentity.from_bytes(_newest_identity(self._fd, header))
+            if self._process is not None:
+                self._process.close()
+            self._identity, self._process = identity, WriterProcess(identity)
+            self._identity_heads = heads
+        return self._identity, self._process
 
 
 def read_statistics(instance: str = "default", shm_dir: str = _DEFAULT_SHM_DIR) -> Snapshot:
-    """Read what the instance's daemon tells.
+    """Read once what the instance's daemon tells.
 
     Parameters
     ----------
@@ -104,61 +258,58 @@ def read_statistics(instance: str = "default", shm_dir: str = _DEFAULT_SHM_DIR) 
     SegmentCorrupt
         It is damaged or of another major layout version.
     """
-    path = f"{shm_dir.rstrip('/')}{statistics_name(instance)}"
-    try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
-    except FileNotFoundError:
-        return _ABSENT
-    except PermissionError as error:
-        raise NotPermitted(
-            f"statistics {path}: this user may not read them", hint="join the daemon's group"
-        ) from error
-    try:
-        return _read(fd)
-    finally:
-        os.close(fd)
+    with StatisticsReader(instance, shm_dir) as reader:
+        return reader.snapshot()
 
 
-def _read(fd: int) -> Snapshot:
-    size = os.fstat(fd).st_size
-    header = unpack_header(os.pread(fd, 65536, 0))
+_last_header: tuple[bytes, Header] | None = None
+"""Bytes and meaning of the last header: it is the same for all daemons of one version."""
+
+
+def _read_header(fd: int, size: int) -> Header:
+    global _last_header
+    data = os.pread(fd, _HEADER_BYTES, 0)
+    if _last_header is not None and data.startswith(_last_header[0]):
+        header = _last_header[1]
+    else:
+        data += os.pread(fd, 65536, len(data))
+        header = unpack_header(data)
+        _last_header = data[: header.descriptions_end], header
     if header.rows_offset > size or header.row_bytes < 256:
         raise SegmentCorrupt(f"the statistics claim {header.rows_offset} bytes and more, there are {size}")
-    identity = DaemonIdentity.from_bytes(_newest_identity(fd, header))
-    state = _newest_state(fd, header)
-    age = (time.monotonic_ns() - state.beat_monotonic_ns) * 1e-9
-    return Snapshot(
-        state=judge(identity, age),
-        identity=identity,
-        counters={c.name: v for c, v in zip(header.counters, state.values, strict=False)},
-        descriptions=header.counters,
-        beat_age_s=max(age, 0.0),
-        rows_missing=state.rows_missing,
-        size_bytes=size,
-        _rows=_rows(fd, header, state.rows_used),
-        _row_bytes=header.row_bytes,
-    )
+    return header
 
 
 def _newest_identity(fd: int, header: Header) -> bytes:
     # the writer fills the older of the two blocks, so one of them is whole at any instant; both
     # look torn only if the writer came round twice while we read
     for _ in range(_ATTEMPTS):
-        both = os.pread(fd, 2 * header.identity_bytes, header.identity_offset)
-        halves = both[: header.identity_bytes], both[header.identity_bytes :]
-        found = [block for block in map(unpack_identity, halves) if block is not None]
+        found = []
+        for place in (header.identity_offset, header.identity_offset + header.identity_bytes):
+            data = os.pread(fd, 2048, place)  # enough for ordinary paths
+            length = IDENTITY.unpack_from(data)[1] if len(data) >= IDENTITY.size else 0
+            if IDENTITY.size + length > len(data):
+                data = os.pread(fd, min(IDENTITY.size + length, header.identity_bytes), place)
+            block = unpack_identity(data) if len(data) >= IDENTITY.size else None
+            if block is not None:
+                found.append(block)
         if found:
             return max(found)[1]
     raise SegmentCorrupt("the statistics' identity is damaged")
 
 
 def _newest_state(fd: int, header: Header) -> State:
+    size, extended = header.state_bytes, header.bucket_count > 0
     for _ in range(_ATTEMPTS):
-        both = os.pread(fd, 2 * header.state_bytes, header.state_offset)
-        halves = both[: header.state_bytes], both[header.state_bytes :]
-        found = [block for block in map(unpack_state, halves) if block is not None]
-        if found:
-            return max(found)
+        both = os.pread(fd, 2 * size, header.state_offset)
+        halves = both[:size], both[size:]
+        # the newer one is whole unless the writer is at it: look at the other one only then
+        if halves[0][:8][::-1] < halves[1][:8][::-1]:
+            halves = halves[::-1]
+        for half in halves:
+            state = unpack_state(half, extended=extended)
+            if state is not None:
+                return state
     raise SegmentCorrupt("the statistics' counters are damaged")
 
 
@@ -172,3 +323,7 @@ def _rows(fd: int, header: Header, used: int) -> bytes:
         if before == os.pread(fd, TABLE.size, header.table_offset) and not TABLE.unpack(before)[0] % 2:
             break
     return rows
+
+
+def _clients(fd: int, header: Header, used: int) -> bytes:
+    return os.pread(fd, min(used, header.max_clients) * header.client_row_bytes, header.clients_offset)

@@ -11,12 +11,14 @@ from __future__ import annotations
 import os
 import struct
 import time
-from collections.abc import Callable, Hashable
-from itertools import islice
+from collections.abc import Callable, Hashable, Sequence
+from itertools import chain, islice
 
 from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import statistics_name
-from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS
+from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
+from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS
+from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
     ROW_BYTES,
@@ -33,6 +35,7 @@ from shmmap.statistics.layout import (
 __all__ = ["StatisticsWriter"]
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
+_CLIENTS_A_PAGE = 16
 
 
 def _always(nbytes: int) -> bool:
@@ -83,7 +86,8 @@ class StatisticsWriter:
         self.reserve: Callable[[int], bool] = _always
         self.name = statistics_name(instance)
         self._directory = directory
-        self._layout = plan(COUNTERS)
+        self._durations = {h.name: [0] * (1 + BUCKETS) for h in HISTOGRAMS}
+        self._layout = plan(COUNTERS, HISTOGRAMS)
         self._packer = struct.Struct(f"<{len(COUNTERS)}q")
         self._sequence = 0
         self._identity_sequence = 0
@@ -92,13 +96,18 @@ class StatisticsWriter:
         self._free: list[int] = []
         self._used = 0
         self._allocated = 0
+        self._clients: list[ClientRow | None] = []
+        self._clients_allocated = _CLIENTS_A_PAGE
+        self._clients_used = 0
         self._changed: dict[Hashable, CellRow] = {}
         self._missing: dict[Hashable, CellRow] = {}  # there was no room for these
         self._removed: list[int] = []
         self._fd = directory.create()
         try:
             # with the first rows, so that a small daemon never grows after it took its budget
-            os.posix_fallocate(self._fd, 0, self._layout.rows_offset + _GROWTH_ROWS * ROW_BYTES)
+            start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
+            os.posix_fallocate(self._fd, 0, start)
+            os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * ROW_BYTES)
             self._allocated = _GROWTH_ROWS
             os.pwrite(self._fd, pack_header(self._layout), 0)
             self.update_identity(identity)
@@ -125,6 +134,32 @@ class StatisticsWriter:
     def add(self, name: str, n: int = 1) -> None:
         """Add to a counter."""
         self.values[name] += n
+
+    def add_duration(self, name: str, duration_ns: int) -> None:
+        """Count a duration in a histogram."""
+        values = self._durations[name]
+        values[0] += duration_ns
+        values[1 + bucket_of(duration_ns)] += 1
+
+    def show_clients(self, rows: Sequence[ClientRow]) -> None:
+        """Show these clients, from the next beat on; at most 256, and as many as there is room for."""
+        self._clients_used = count = min(len(rows), self._room_for_clients(min(len(rows), MAX_CLIENTS)))
+        self._clients += [None] * (count - len(self._clients))
+        for index in range(count):
+            if self._clients[index] != rows[index]:
+                self._clients[index] = rows[index]
+                place = self._layout.clients_offset + index * CLIENT_ROW_BYTES
+                os.pwrite(self._fd, pack_client(rows[index]), place)
+
+    def _room_for_clients(self, wanted: int) -> int:
+        """Allocate rows as clients come, a page at a time; returns how many there are."""
+        while self._clients_allocated < wanted:
+            nbytes = _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
+            start = self._layout.clients_offset + self._clients_allocated * CLIENT_ROW_BYTES
+            if not self._allocate(start, nbytes):
+                break
+            self._clients_allocated += _CLIENTS_A_PAGE
+        return self._clients_allocated
 
     def cell_changed(self, key: Hashable, row: CellRow) -> None:
         """Show ``row`` under ``key`` from one of the next beats on; it is read only then."""
@@ -168,6 +203,8 @@ class StatisticsWriter:
             self._used,
             len(self._missing),
             tuple(self.values.values()),
+            self._clients_used,
+            tuple(chain.from_iterable(self._durations.values())),
         )
         block = self._layout.state_offset + self._sequence % 2 * self._layout.state_bytes
         os.pwrite(self._fd, pack_state(state, self._packer), block)
@@ -220,17 +257,22 @@ class StatisticsWriter:
         rows = min(self._allocated + _GROWTH_ROWS, self._layout.max_rows)
         if rows == self._allocated:
             return False
-        nbytes = (rows - self._allocated) * ROW_BYTES
+        start = self._layout.rows_offset + self._allocated * ROW_BYTES
+        if not self._allocate(start, (rows - self._allocated) * ROW_BYTES):
+            return False
+        self._allocated = rows
+        return True
+
+    def _allocate(self, start: int, nbytes: int) -> bool:
+        """Have memory where nothing is yet, if the budget and the file system allow."""
         if not self.reserve(nbytes):
             return False
-        start = self._layout.rows_offset + self._allocated * ROW_BYTES
         try:
             os.posix_fallocate(self._fd, start, nbytes)
         except OSError as error:
             if is_full(error):
                 return False
             raise
-        self._allocated = rows
         return True
 
     @property

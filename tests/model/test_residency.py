@@ -77,7 +77,7 @@ class Machine(RuleBasedStateMachine):
         self.reclaimer = Reclaimer(self.books, self.directory, self.sessions, POLICIES[policy])
         self.retired: list[str] = []
         self.freed: list[str] = []
-        self.reclaimer.on_retired = lambda resident: self.retired.append(resident.name)
+        self.reclaimer.on_retired = lambda resident, _why: self.retired.append(resident.name)
         self.reclaimer.on_freed = lambda resident: self.freed.append(resident.name)
         self.now_s = 100.0
         self.versions = dict.fromkeys(KEYS, 1)

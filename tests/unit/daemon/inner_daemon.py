@@ -17,6 +17,7 @@ from typing import Any
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.cells import CellRequests
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.event_log import EventLog
 from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Key, Residency
@@ -75,10 +76,11 @@ class InnerDaemon:
             unwatch=self._poll.unregister,
         )
         self.settled: list[Key] = []
+        self.event_log = EventLog(EPOCH)
         self.store = Store(
             catalogue, self.books, self.reclaimer, self.pool, self.directory, self.statistics,
             instance="inner", epoch=EPOCH, id_prefix=catalogue.id_prefix, mode=0o400, gid=-1,
-            on_settled=self._on_settled,
+            on_settled=self._on_settled, event_log=self.event_log,
         )  # fmt: skip
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
@@ -92,7 +94,9 @@ class InnerDaemon:
             clock=self.now_s,
         )
         config = DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir)
-        self.admin = Admin(config, self.store, self.sessions, self.statistics, epoch=EPOCH)
+        self.admin = Admin(
+            config, self.store, self.sessions, self.statistics, epoch=EPOCH, event_log=self.event_log
+        )
 
     def _on_settled(self, key: Key) -> None:
         self.settled.append(key)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.sessions import Peer, Session, Sessions, command_of, predicted_path
 from shmmap.errors import NoSession
+from shmmap.geometry import Circle
 from shmmap.protocol.messages import Intent
 
 
@@ -141,10 +142,10 @@ def test_where_a_client_is() -> None:
     sessions.open(b"2", Peer(), "", 0.0)
     assert sessions.poses() == []
     for at in ((1.0, 2.0), (300.0, 4.0)):
-        session.asked_about(*at)
+        session.asked_about(Circle(*at, 5.0))
         assert sessions.poses() == [at]
     session.intent, session.says_where = Intent(7.0, 8.0), True
-    session.asked_about(1.0, 1.0)
+    session.asked_about(Circle(1.0, 1.0, 5.0))
     assert sessions.poses() == [(7.0, 8.0)]
 
 

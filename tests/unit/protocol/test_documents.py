@@ -11,11 +11,15 @@ import msgspec
 import pytest
 
 from shmmap import errors
+from shmmap.protocol import events
 from shmmap.protocol import messages as m
 from shmmap.segment import layout
 from shmmap.statistics import layout as statistics_layout
+from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
 
 PROTOCOL = files("shmmap.protocol").joinpath("PROTOCOL.md").read_text(encoding="utf-8")
+REQUESTS = PROTOCOL[: PROTOCOL.index("\n## Replies\n")]
+EVENTS = PROTOCOL[PROTOCOL.index("\n## Events\n") :]
 LAYOUT = files("shmmap.segment").joinpath("LAYOUT.md").read_text(encoding="utf-8")
 STATISTICS = files("shmmap.statistics").joinpath("STATISTICS.md").read_text(encoding="utf-8")
 
@@ -50,7 +54,7 @@ def defaults_of(kind: type[msgspec.Struct]) -> dict[str, bool]:
 
 @pytest.mark.parametrize("kind", get_args(m.Request), ids=lambda kind: kind.__name__)
 def test_requests(kind: Any) -> None:
-    (row,) = re.findall(rf"^\| `{tag_of(kind)}` \|(.*)\|.*\|$", PROTOCOL, re.MULTILINE)
+    (row,) = re.findall(rf"^\| `{tag_of(kind)}` \|(.*)\|.*\|$", REQUESTS, re.MULTILINE)
     elements = re.findall(r"`([^`]*)`", row)
     assert [name for element in elements for name in names_in(element)] == field_names(kind)
     optional = defaults_of(kind)
@@ -65,6 +69,13 @@ def test_replies(kind: Any) -> None:
     elements = re.findall(r"`([^`]*)`", paragraph)
     found = [name for element in elements for name in names_in(element)]
     assert found[: len(field_names(kind))] == field_names(kind)
+
+
+@pytest.mark.parametrize("kind", get_args(events.Event), ids=lambda kind: kind.__name__)
+def test_events(kind: Any) -> None:
+    (row,) = re.findall(rf"^\| `{tag_of(kind)}` \|([^|]*)\|[^|]*\|$", EVENTS, re.MULTILINE)
+    elements = re.findall(r"`([^`]*)`", row)
+    assert ["seq", "epoch", "unix_ns", *(name for e in elements for name in names_in(e))] == field_names(kind)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +149,13 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
         (LAYOUT, [layout.FIXED.size + layout.LATTICE.size, layout.COLUMN.size, layout.PUBLISH.size]),
         (
             STATISTICS,
-            [statistics_layout.START.size, statistics_layout.STATE.size, statistics_layout.ROW_BYTES],
+            [
+                statistics_layout.START.size,
+                statistics_layout.EXTENSION.size,
+                statistics_layout.STATE.size,
+                statistics_layout.ROW_BYTES,
+                CLIENT_ROW_BYTES,
+            ],
         ),
     ],
     ids=["segment", "statistics"],

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from shmmap.protocol import events as e
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import decode_reply, decode_request, encode, encode_cells, encode_handle
 from tests.support.message_pack import pack, unpack
@@ -92,6 +93,7 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
     (m.Pin(12, ("a",), ("points",)), ["pin", 12, ["a"], ["points"]], "94a370696e0c91a16191a6706f696e7473"),
     (m.Unpin(13, ("a",)), ["unpin", 13, ["a"]], "93a5756e70696e0d91a161"),
     (m.Shutdown(14), ["shutdown", 14], "92a873687574646f776e0e"),
+    (e.Recent(15, 1, 2, 3), ["recent", 15, 1, 2, 3], "95a6726563656e740f010203"),
 ]
 REPLIES: list[tuple[Any, list[Any], str]] = [
     (
@@ -114,6 +116,7 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ("points",),
             6,
             7,
+            "/r/default.events.sock",
         ),
         [
             "welcome",
@@ -135,11 +138,13 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ["points"],
             6,
             7,
+            "/r/default.events.sock",
         ],
         (
-            "dc0013a777656c636f6d65010100a5302e312e30a764656661756c74030405a22f6da36d6170a82f"
+            "dc0014a777656c636f6d65010100a5302e312e30a764656661756c74030405a22f6da36d6170a82f"
             "6465762f73686da32f6d2fb02f73686d6d61702e64656661756c742e0294cb0000000000000000cb"
             "3ff0000000000000cb4000000000000000cb400800000000000091a6706f696e74730607"
+            "b62f722f64656661756c742e6576656e74732e736f636b"
         ),
     ),
     (
@@ -248,6 +253,11 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
     ),
     (m.Stopping(14), ["stopping", 14], "92a873746f7070696e670e"),
     (
+        e.EventPage(15, 3, 1, 2, (msgspec.Raw(bytes.fromhex("94a462656174010305")),)),
+        ["events", 15, 3, 1, 2, [["beat", 1, 3, 5]]],
+        "96a66576656e74730f0301029194a462656174010305",
+    ),
+    (
         m.ErrorReply(11, "no_session", "m", "h"),
         ["error", 11, "no_session", "m", "h"],
         "95a56572726f720baa6e6f5f73657373696f6ea16da168",
@@ -302,6 +312,7 @@ def test_replies_of_a_later_minor_version_are_read(message: object, elements: li
         (["selected", 1, ["a"]], m.Selected(1, ("a",), ("points",), None, None)),
         (["release", 1], m.Release(1, None)),
         (["evict", 1], m.Evict(1, None)),
+        (["recent", 1], e.Recent(1, 0, 0, 500)),
         (["pin", 1], m.Pin(1, (), ("points",))),
         (["unpin", 1], m.Unpin(1, None)),
         (

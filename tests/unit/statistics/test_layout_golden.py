@@ -9,29 +9,47 @@ import pytest
 
 from shmmap.errors import SegmentCorrupt
 from shmmap.statistics import layout
-from shmmap.statistics.counters import COUNTERS, Counter
+from shmmap.statistics.client_rows import ClientRow, Window, pack_client, unpack_client
+from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, Counter
 from shmmap.statistics.layout import CellRow, State
 
 TWO = (
     Counter("requests", "counter", "", "Requests received"),
     Counter("bytes", "gauge", "bytes", "Bytes held"),
 )
+LOAD = (Counter("load", "histogram", "ns", "How long"),)
 GOLDEN_START = (
-    "53484d5354415401 0100 0000 04030201"  # magic, 1.0, byte order
-    "40000000 02000000 a0000000"  # descriptions at 64: 2 of 160 bytes
-    "80010000 00400000"  # identity at 384, 16384 bytes each
-    "80810000 40000000"  # state at 33152, 64 bytes each
-    "00820000 00900000 00010000 00000200"  # table 33280, rows at 36864 of 256, at most 131072
-    "fedf4f8f"
+    "53484d5354415401 0100 0100 04030201"  # magic, 1.1, byte order
+    "80000000 02000000 a0000000"  # descriptions at 128: 2 of 160 bytes
+    "80020000 00400000"  # identity at 640, 16384 bytes each
+    "80820000 80040000"  # state at 33408, 1152 bytes each
+    "808b0000 00900100 00010000 00000200"  # table 35712, rows at 102400 of 256, at most 131072
+    "d79bbe15"
+    "01000000 82000000 00900000 00010000 00010000"  # 1 histogram of 130; clients at 36864, 256 of 256
+    + "00" * 40
+    + "9787d479"
 )
 GOLDEN_FIRST = "7265717565737473" + "00" * 40 + "00" + "5265717565737473207265636569766564" + "00" * 94
 GOLDEN_SECOND = (
     "6279746573" + "00" * 27 + "6279746573" + "00" * 11 + "01" + "42797465732068656c64" + "00" * 101
 )
+GOLDEN_THIRD = "6c6f6164" + "00" * 28 + "6e73" + "00" * 14 + "02" + "486f77206c6f6e67" + "00" * 103
 GOLDEN_STATE = (
     "0300000000000000 0500000000000000 0700000000000000 02000000 01000000 02000000 00000000"
     "0b00000000000000 f3ffffffffffffff 4b3f656d 00000000"
+    "04000000 02000000 1100000000000000 1300000000000000 b924b90000000000"
 )
+GOLDEN_CLIENT = (
+    "0807060504030201 4d000000 ffffffff"  # session, pid, uid
+    "0300000000000000 0010000000000000 0900000000000000 0600000000000000"  # cells, bytes, requests, last
+    "000000000000f83f 00000000000004c0 000000000000e03f"  # pose, heading
+    "000000000000f03f 0000000000000040 0000000000004440 0000000000804440"  # window
+    "02 03 0000 00000000 76c3a9" + "00" * 45 + "707974686f6e33" + "00" * 9 + "00" * 76 + "f84f0e29"
+)
+CLIENT = ClientRow(
+    0x0102030405060708, 77, -1, 3, 4096, 9, 6, "vé", "python3",
+    (1.5, -2.5), 0.5, Window("square", 1.0, 2.0, 40.0, 41.0),
+)  # fmt: skip
 GOLDEN_IDENTITY = "02000000000000000600000092abc882706964003100"
 GOLDEN_ROW = (
     "0807060504030201 0020000000000000 6400000000000000"  # version, bytes, points
@@ -48,15 +66,42 @@ ROW = CellRow(
 
 
 def test_header() -> None:
-    packed = layout.pack_header(layout.plan(TWO))
-    assert packed == bytes.fromhex(GOLDEN_START + GOLDEN_FIRST + GOLDEN_SECOND)
-    assert layout.unpack_header(packed) == layout.plan(TWO)
+    packed = layout.pack_header(layout.plan(TWO, LOAD))
+    assert packed == bytes.fromhex(GOLDEN_START + GOLDEN_FIRST + GOLDEN_SECOND + GOLDEN_THIRD)
+    assert layout.unpack_header(packed) == layout.plan(TWO, LOAD)
+
+
+def test_a_header_of_layout_1_0_is_read() -> None:
+    """It ends with the counters; no histograms, no clients."""
+    old = bytes.fromhex(
+        "53484d5354415401 0100 0000 04030201 40000000 02000000 a0000000 80010000 00400000"
+        "80810000 40000000 00820000 00900000 00010000 00000200 fedf4f8f" + GOLDEN_FIRST + GOLDEN_SECOND
+    )
+    header = layout.unpack_header(old + bytes(64))
+    assert header == layout.Header(TWO, 384, 16384, 33152, 64, 33280, 36864, 256, 131072)
+    state = bytes.fromhex(GOLDEN_STATE)[:64]
+    assert layout.unpack_state(state, extended=False) == State(3, 5, 7, 2, 1, (11, -13))
 
 
 def test_state() -> None:
-    state = State(3, 5, 7, 2, 1, (11, -13))
+    state = State(3, 5, 7, 2, 1, (11, -13), 4, (17, 19))
     assert layout.pack_state(state, struct.Struct("<2q")) == bytes.fromhex(GOLDEN_STATE)
-    assert layout.unpack_state(bytes.fromhex(GOLDEN_STATE)) == state
+    seen = layout.unpack_state(bytes.fromhex(GOLDEN_STATE))
+    assert seen is not None
+    assert seen._replace(histograms=tuple(seen.histograms)) == state
+
+
+def test_client() -> None:
+    assert pack_client(CLIENT) == bytes.fromhex(GOLDEN_CLIENT)
+    assert unpack_client(bytes.fromhex(GOLDEN_CLIENT)) == CLIENT
+    assert unpack_client(pack_client(None)) is None
+    bare = ClientRow(1, 0, -1, 0, 0, 0, 0, "ä" * 30, "c" * 20)
+    assert unpack_client(pack_client(bare)) == bare._replace(client="ä" * 24, command="c" * 16)
+    for at in range(256):
+        torn = bytearray.fromhex(GOLDEN_CLIENT)
+        torn[at] ^= 1
+        with pytest.raises(SegmentCorrupt):
+            unpack_client(bytes(torn))
 
 
 def test_identity() -> None:
@@ -78,15 +123,15 @@ def test_a_torn_row_is_noticed() -> None:
 
 
 def test_a_torn_state_is_noticed() -> None:
-    for at in range(60):
+    for at in [*range(60), *range(64, 92)]:
         torn = bytearray.fromhex(GOLDEN_STATE)
         torn[at] ^= 1
         assert layout.unpack_state(bytes(torn)) is None
 
 
 def test_a_damaged_header_is_refused() -> None:
-    for at in [*range(64), *range(64, 384, 7)]:
-        damaged = bytearray.fromhex(GOLDEN_START + GOLDEN_FIRST + GOLDEN_SECOND)
+    for at in [*range(128), *range(128, 608, 7)]:
+        damaged = bytearray.fromhex(GOLDEN_START + GOLDEN_FIRST + GOLDEN_SECOND + GOLDEN_THIRD)
         damaged[at] ^= 1
         with pytest.raises(SegmentCorrupt):
             layout.unpack_header(bytes(damaged))
@@ -119,5 +164,6 @@ def test_ids_that_are_no_utf8_survive() -> None:
 
 
 def test_every_counter_fits_its_description() -> None:
-    assert len({c.name for c in COUNTERS}) == len(COUNTERS)
-    assert layout.unpack_header(layout.pack_header(layout.plan(COUNTERS))).counters == COUNTERS
+    assert len({c.name for c in (*COUNTERS, *HISTOGRAMS)}) == len(COUNTERS) + len(HISTOGRAMS)
+    header = layout.unpack_header(layout.pack_header(layout.plan(COUNTERS, HISTOGRAMS)))
+    assert (header.counters, header.histograms) == (COUNTERS, HISTOGRAMS)

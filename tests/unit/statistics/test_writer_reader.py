@@ -18,10 +18,12 @@ import pytest
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics import identity as identity_module
-from shmmap.statistics.counters import COUNTERS
-from shmmap.statistics.identity import DaemonIdentity, judge, pid_namespace, start_time_ticks
+from shmmap.statistics.client_rows import ClientRow
+from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
+from shmmap.statistics.histogram import bucket_of
+from shmmap.statistics.identity import DaemonIdentity, WriterProcess, judge, pid_namespace, start_time_ticks
 from shmmap.statistics.layout import CellRow
-from shmmap.statistics.reader import read_statistics
+from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 
 BOX = (0.0, 0.0, 20.0, 20.0)
@@ -103,6 +105,61 @@ def test_rows_change_move_and_go(shm: ShmDirectory, writer: StatisticsWriter) ->
     writer.beat(max_rows=1000)
     assert writer.size_bytes == size  # the rows that were freed are used again
     assert len(read_statistics("unit", shm.path).cells) == 300 - 1 + 1 + 250
+
+
+def test_durations_come_back(shm: ShmDirectory, writer: StatisticsWriter) -> None:
+    for duration in (0, 1500, 2_000_000, 2_100_000, 10**15):
+        writer.add_duration("load", duration)
+    writer.beat()
+    seen = read_statistics("unit", shm.path)
+    assert seen.histogram_descriptions == HISTOGRAMS
+    load = seen.histograms["load"]
+    assert (load.total, load.sum_ns) == (5, 10**15 + 4_101_500)
+    for duration in (0, 1500, 2_100_000, 10**15):
+        assert load.counts[bucket_of(duration)] > 0
+    assert seen.histograms["request"].total == 0
+
+
+def client(number: int) -> ClientRow:
+    return ClientRow(number + 1, 100 + number, 0, number, 0, 0, 0, f"client {number}", "python3")
+
+
+def test_clients_come_and_go(shm: ShmDirectory, writer: StatisticsWriter) -> None:
+    for count in (0, 3, 40, 2, 300):
+        writer.show_clients([client(number) for number in range(count)])
+        writer.beat()
+        assert read_statistics("unit", shm.path).clients == [client(n) for n in range(min(count, 256))]
+    changed = [client(number)._replace(requests=7) for number in range(2)]
+    writer.show_clients(changed)
+    writer.beat()
+    assert read_statistics("unit", shm.path).clients == changed
+
+
+def test_no_room_for_clients(shm: ShmDirectory, writer: StatisticsWriter) -> None:
+    writer.reserve = lambda _: False
+    writer.show_clients([client(number) for number in range(20)])
+    writer.beat()
+    assert len(read_statistics("unit", shm.path).clients) == 16
+
+
+def test_one_reader_follows_lives_of_the_daemon(shm: ShmDirectory, identity: DaemonIdentity) -> None:
+    with StatisticsReader("unit", shm.path) as reader:
+        assert reader.snapshot().state == "absent"
+        first = StatisticsWriter(shm, "unit", identity)
+        assert reader.snapshot().identity == identity
+        first.add("requests", 5)
+        first.update_identity(replace(identity, map_version=8))
+        first.beat()
+        seen = reader.snapshot(tables=False)
+        assert seen.identity is not None
+        assert (seen.counters["requests"], seen.identity.map_version) == (5, 8)
+        second = StatisticsWriter(shm, "unit", replace(identity, epoch=9))
+        seen = reader.snapshot()
+        assert seen.identity is not None
+        assert (seen.counters["requests"], seen.identity.epoch) == (0, 9)
+        first.close()
+        second.close()
+        assert reader.snapshot().state == "absent"
 
 
 def test_a_beat_writes_a_bounded_number_of_rows(shm: ShmDirectory, writer: StatisticsWriter) -> None:
@@ -214,7 +271,7 @@ def test_garbage_is_refused(shm: ShmDirectory) -> None:
             read_statistics("unit", shm.path)
 
 
-@pytest.mark.parametrize("keep", [65, 3000, 20_000, 36_000, 40_000])
+@pytest.mark.parametrize("keep", [65, 3000, 20_000, 36_000, 50_000, 100_000])
 def test_cut_short_is_refused(shm: ShmDirectory, writer: StatisticsWriter, keep: int) -> None:
     path = Path(shm.path, "shmmap.unit.statistics")
     whole = path.read_bytes()
@@ -305,20 +362,26 @@ def test_states_of_a_real_process(identity: DaemonIdentity) -> None:
         assert process.stdout is not None
         process.stdout.readline()
         other = replace(identity, pid=process.pid, start_time_ticks=start_time_ticks(process.pid))
+        watched = WriterProcess(other)
+        assert watched.state(0.1) == "healthy"
+        assert WriterProcess(replace(other, start_time_ticks=1)).state(0.1) == "dead"
+        assert WriterProcess(replace(other, pid_namespace=1)).state(0.1) == "healthy"
         assert judge(other, 0.1) == "healthy"
+        assert watched.state(identity_module.HUNG_AFTER_S + 1) == "hung"
         assert judge(other, identity_module.HUNG_AFTER_S + 1) == "hung"
         assert judge(replace(other, start_time_ticks=1), 0.1) == "dead"  # the id was used again
         process.send_signal(signal.SIGSTOP)
         os.waitpid(process.pid, os.WUNTRACED)
-        assert judge(other, 0.1) == "stopped"
+        assert judge(other, 0.1) == watched.state(0.1) == "stopped"
         elsewhere = replace(other, pid_namespace=1)
         assert judge(elsewhere, 0.1) == "healthy"  # its pid means nothing here: the beat decides
         assert judge(elsewhere, 100.0) == "hung"
         process.kill()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        assert judge(other, 0.1) == "dead"  # not yet waited for: a zombie
+        assert judge(other, 0.1) == watched.state(0.1) == "dead"  # not yet waited for: a zombie
         process.wait()
-        assert judge(other, 0.1) == "dead"
+        assert judge(other, 0.1) == watched.state(0.1) == "dead"
+        watched.close()
 
 
 def test_reading_loads_neither_numpy_nor_anything_heavy() -> None:

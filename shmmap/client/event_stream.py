@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Following what happens in the daemon, without missing anything unnoticed.
+
+Events arrive on a SUB socket, numbered.  Whatever is missing between two of them is asked for on the
+request socket, where the daemon remembers the last few thousand; what it does not remember any more
+is reported as `Missed`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import weakref
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Final, TypeAlias
+
+import msgspec
+import zmq
+
+from shmmap.client.connection import Connection
+from shmmap.client.discovery import candidates
+from shmmap.errors import NoAnswer, ProtocolMismatch
+from shmmap.protocol.events import Beat, Event, EventPage, Recent, decode_event
+
+__all__ = ["EventStream", "Missed"]
+
+_TIMEOUT_S: Final = 5.0
+_CONNECT_S: Final = 0.9
+_QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
+_RECONNECT_MS: Final = 20
+_RECONNECT_MAX_MS: Final = 500
+
+
+class Missed(msgspec.Struct, frozen=True):
+    """Events that are lost: numbers ``first`` to ``last`` of ``epoch``.
+
+    What they told has to be found out otherwise, by asking for cells or metadata again.
+    """
+
+    epoch: int
+    first: int
+    last: int
+
+
+Happening: TypeAlias = Event | Missed
+
+
+class EventStream:
+    """What happens in the daemon, in order; not thread-safe.
+
+    Iterating waits for ever; `next` waits as long as one likes.  When the daemon is restarted the stream
+    goes on with the new epoch's events from the first one.
+
+    Parameters
+    ----------
+    endpoint
+        Request socket of the daemon, a path or an ``ipc://`` URL; None looks in the usual places.
+    since
+        Begin with what happened in the last so many seconds, as far as the daemon remembers; None begins now.
+    name
+        How this client appears in the daemon's lists.
+    timeout
+        Seconds that a question to the daemon may take.
+
+    Attributes
+    ----------
+    epoch : int
+        The daemon's present life.
+    heard_s : float
+        When the daemon was last heard of, `time.monotonic`; it says something every second.
+
+    Raises
+    ------
+    DaemonUnreachable, ProtocolMismatch
+        As `shmmap.connect`; a daemon older than protocol 1.1 publishes no events.
+    """
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        since: float | None = None,
+        name: str = "",
+        timeout: float = _TIMEOUT_S,
+    ) -> None:
+        self._timeout_s = timeout
+        self._connection = Connection(candidates(endpoint), name=name, timeout_s=min(timeout, _CONNECT_S))
+        try:
+            path = _events_path(self._connection)
+        except ProtocolMismatch:
+            self._connection.close()
+            raise
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
+        self._finalizer = weakref.finalize(self, _shut, self._socket, context, os.getpid())
+        self._socket.connect(f"ipc://{path}")
+        self._socket.subscribe(b"")
+        self._ready: deque[Happening] = deque()
+        self.epoch = self._connection.welcome.epoch
+        self.heard_s = time.monotonic()
+        try:
+            self._begin(since)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> EventStream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the subscription."""
+        self._finalizer()
+        self._connection.close()
+
+    def __iter__(self) -> Iterator[Happening]:
+        while True:
+            happening = self.next(None)
+            if happening is not None:
+                yield happening
+
+    def next(self, timeout: float | None = None) -> Happening | None:
+        """Return the next event, or `Missed`; None when nothing happened within ``timeout`` seconds.
+
+        None waits for ever, 0 takes what is there.
+        """
+        deadline_s = None if timeout is None else time.monotonic() + timeout
+        while not self._ready:
+            left_ms = None if deadline_s is None else max(0, int((deadline_s - time.monotonic()) * 1000))
+            if not self._socket.poll(left_ms):
+                return None
+            self._hear(self._socket.recv())
+        return self._ready.popleft()
+
+    @property
+    def path(self) -> str:
+        """Where the daemon takes requests."""
+        return self._connection.path
+
+    # --- numbers ----------------------------------------------------------------------------------
+
+    def _begin(self, since: float | None) -> None:
+        self._expected = 1
+        page = self._ask(Recent(0, limit=0))
+        self.epoch, self._expected = page.epoch, page.next
+        if since is not None:
+            started_ns = time.time_ns() - int(since * 1e9)
+            self._catch_up(after=0, since_ns=max(started_ns, 0))
+
+    def _hear(self, data: bytes) -> None:
+        self.heard_s = time.monotonic()
+        event = decode_event(data)
+        if event is None:  # a kind that this version does not know: its number counts
+            head = msgspec.msgpack.decode(data)
+            number, epoch = int(head[1]), int(head[2])
+        else:
+            number, epoch = event.seq, event.epoch
+        if epoch != self.epoch:
+            self.epoch, self._expected = epoch, 1
+        if isinstance(event, Beat):
+            if number >= self._expected:
+                self._try_to_catch_up()
+        elif number == self._expected:
+            self._expected += 1
+            if event is not None:
+                self._ready.append(event)
+        elif number > self._expected:
+            self._try_to_catch_up()
+
+    def _try_to_catch_up(self) -> None:
+        """Fetch what is missing; a daemon that does not answer now has more to say when it is back."""
+        with contextlib.suppress(NoAnswer):
+            self._catch_up(after=self._expected - 1)
+
+    def _catch_up(self, *, after: int, since_ns: int = 0) -> None:
+        """Fetch what the daemon remembers after this number."""
+        while True:
+            page = self._ask(Recent(0, after=after, since_unix_ns=since_ns))
+            if page.epoch != self.epoch:
+                # it was restarted just now: nobody will ever tell the rest of the old epoch
+                self.epoch, after = page.epoch, 0
+                since_ns = 0
+                continue
+            if page.first > after + 1 and not since_ns:
+                self._ready.append(Missed(page.epoch, after + 1, page.first - 1))
+                after = page.first - 1
+            for data in page.events:
+                event = decode_event(data)
+                if event is not None:
+                    after = event.seq
+                    self._ready.append(event)
+                else:
+                    after = int(msgspec.msgpack.decode(data)[1])
+            if not page.events:
+                self._expected = page.next
+                return
+
+    def _ask(self, message: Recent) -> EventPage:
+        message.request = self._connection.new_request()
+        return self._connection.ask(message, EventPage, timeout_s=self._timeout_s)
+
+
+def _events_path(connection: Connection) -> str:
+    path = connection.welcome.events
+    if not path:
+        raise ProtocolMismatch("this daemon publishes no events", hint="update it")
+    # in another mount namespace the directory has another name than the daemon knows
+    beside = Path(connection.path).parent / Path(path).name
+    return str(beside) if beside.exists() else path
+
+
+def _shut(socket: zmq.Socket[bytes], context: zmq.Context[zmq.Socket[bytes]], pid: int) -> None:
+    if os.getpid() == pid:  # in a forked child they are the parent's
+        socket.close(linger=0)
+        context.term()

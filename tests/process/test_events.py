@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The event stream: everything that happens is told, in order, and nothing is missed unnoticed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import zmq
+
+from shmmap import EventStream, Missed
+from shmmap.protocol import events as e
+from tests.process.conftest import DaemonFactory
+from tests.process.test_reload import change
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap
+from tests.support.message_pack import unpack
+from tests.support.raw_client import RawClient
+
+Connect = Callable[..., RawClient]
+Listen = Callable[..., EventStream]
+
+
+@pytest.fixture
+def listen(daemon: DaemonFactory) -> Iterator[Listen]:
+    """Open event streams, closed before the daemon is judged."""
+    opened: list[EventStream] = []
+
+    def factory(to: DaemonProcess, **options: Any) -> EventStream:
+        stream = EventStream(to.endpoint, timeout=30.0, **options)
+        opened.append(stream)
+        return stream
+
+    yield factory
+    for stream in opened:
+        stream.close()
+
+
+def until(stream: EventStream, last: Callable[[Any], bool]) -> list[Any]:
+    """Take events up to the one that ``last`` says yes to."""
+    found: list[Any] = []
+    while not found or not last(found[-1]):
+        happening = stream.next(60.0)
+        assert happening is not None, f"nothing after {found}"
+        found.append(happening)
+    return found
+
+
+def kinds(found: list[Any]) -> list[str]:
+    return [type(happening).__name__.lower() for happening in found]
+
+
+def test_what_happens_is_told_in_order(
+    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    stream = listen(one, since=60)
+    client = connect(one, name="driver")
+    loaded = client.selected(["0_0.pcd"]).cells[0]
+    change(divided_map, "0_0.pcd", 5)
+    divided_map.remove_cell("20_20.pcd")
+    divided_map.write_metadata()
+    client.ask("reload")
+    (divided_map.pcd_dir / "0_-20.pcd").write_bytes(b"this is no point cloud")
+    client.selected(["0_-20.pcd"])
+    newer = client.selected(["0_0.pcd"]).cells[0]
+    client.ask("evict", ["0_0.pcd"])
+    client.socket.send(bytes.fromhex("92a36279650b"))  # bye
+    found = until(stream, lambda h: isinstance(h, e.Left))
+    assert kinds(found) == [
+        "epoch", "joined", "joined", "loaded", "reloaded", "changed", "changed", "failed",
+        "loaded", "evicted", "left",
+    ]  # fmt: skip
+    started, _, joined, first, reloaded, changed, removed, failed, second, evicted, left = found
+    assert (started.what, started.cells, started.adopted) == ("started", 36, 0)
+    assert (joined.pid, joined.client, left.client) == (os.getpid(), "driver", "driver")
+    assert (first.id, first.version, first.points) == ("0_0.pcd", loaded.version, 500)
+    assert (reloaded.changed, reloaded.removed, reloaded.told, reloaded.error) == (1, 1, 2, "")
+    assert (changed.id, changed.version, changed.how) == ("0_0.pcd", newer.version, "changed")
+    assert (removed.id, removed.version, removed.how) == ("20_20.pcd", 0, "removed")
+    assert (failed.id, failed.code) == ("0_-20.pcd", "load_failed")
+    assert (second.version, second.replaces, second.again) == (newer.version, loaded.version, False)
+    assert (evicted.version, evicted.why) == (newer.version, "request")
+    assert [h.seq for h in found] == list(range(1, 12))
+    assert {h.epoch for h in found} == {client.epoch} == {stream.epoch}
+
+
+@pytest.mark.parametrize(("quota", "code"), [("0.9", "quota"), ("4M", "over_budget")])
+def test_retries_and_pressure(
+    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap, quota: str, code: str
+) -> None:
+    one = daemon(divided_map.root, "--budget", "1M", environment={"SHMMAP_SESSION_QUOTA": quota})
+    client, stream = connect(one), listen(one)
+    (divided_map.pcd_dir / "0_0.pcd").write_bytes(b"this is no point cloud")
+    client.selected(["0_0.pcd"])
+    change(divided_map, "0_0.pcd", 5)
+    client.selected(["0_0.pcd"])
+    found = until(stream, lambda h: isinstance(h, e.Loaded))
+    assert kinds(found)[-4:] == ["failed", "retried", "changed", "loaded"]
+    change(divided_map, "0_0.pcd", 6, 80_000)  # larger than the budget
+    client.ask("reload")
+    client.selected(["0_0.pcd"])
+    pressure = until(stream, lambda h: isinstance(h, e.Pressure))[-1]
+    assert (pressure.id, pressure.code, pressure.budget_bytes) == ("0_0.pcd", code, 1 << 20)
+    assert pressure.refused >= 1
+
+
+def test_the_stream_goes_on_in_the_next_life(
+    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    stream = listen(one)
+    connect(one, name="first").selected(["0_0.pcd"])
+    until(stream, lambda h: isinstance(h, e.Loaded))
+    before = stream.epoch
+    one.kill()
+    one.start()
+    connect(one, name="second").selected(["0_-20.pcd"])
+    found = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "0_-20.pcd")
+    after = [h for h in found if h.epoch != before]
+    assert [h.seq for h in after] == list(range(1, len(after) + 1))
+    assert isinstance(after[0], e.Epoch)
+    assert stream.epoch == after[0].epoch
+    assert one.stop() == 0
+    assert until(stream, lambda h: isinstance(h, e.Epoch))[-1].what == "stopping"
+
+
+def test_a_gap_is_noticed_and_closed(
+    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+) -> None:
+    """More happens than any queue holds while the listener does not read; what is too old is `Missed`."""
+    one = daemon(divided_map.root)
+    client, stream = connect(one), listen(one)
+    client.selected(["0_0.pcd"])
+    for _ in range(3000):  # two events each: the daemon remembers 4096
+        client.ask("evict", ["0_0.pcd"])
+        client.selected(["0_0.pcd"])
+    client.ask("evict", None)
+    client.selected(["20_20.pcd"])
+    found = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "20_20.pcd")
+    expected = None
+    missed = 0
+    for happening in found:
+        first = happening.first if isinstance(happening, Missed) else happening.seq
+        assert expected is None or first == expected
+        expected = (happening.last if isinstance(happening, Missed) else happening.seq) + 1
+        missed += isinstance(happening, Missed)
+    assert missed <= 1
+    assert len(found) >= 4096
+
+
+_STOPPED = """
+import sys, zmq
+socket = zmq.Context().socket(zmq.SUB)
+socket.setsockopt(zmq.RCVHWM, 1)
+socket.connect("ipc://" + sys.argv[1])
+socket.subscribe(b"")
+socket.recv()
+print("up", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_stopped_listener_delays_nobody(
+    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    client, stream = connect(one), listen(one)
+    path = f"{one.runtime_dir}/{one.instance}.events.sock"
+    with subprocess.Popen(
+        [sys.executable, "-c", _STOPPED, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as listener:
+        assert listener.stdout is not None
+        assert listener.stdout.readline() == b"up\n"
+        listener.send_signal(signal.SIGSTOP)
+        os.waitpid(listener.pid, os.WUNTRACED)
+        for _ in range(1500):  # far more than its queue
+            client.ask("evict", ["0_0.pcd"])
+            client.selected(["0_0.pcd"])
+        client.selected(["20_20.pcd"])
+        found = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "20_20.pcd")
+        assert not [h for h in found if isinstance(h, Missed)]
+        listener.kill()
+
+
+def test_a_client_written_from_the_document(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Subscribe first, then ask what there was: no event is told twice or missed."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with context, context.socket(zmq.SUB) as socket:
+        socket.connect(f"ipc://{client.hello()[19]}")
+        socket.subscribe(b"")
+        beat: Any = unpack(socket.recv())
+        assert beat[0] == "beat"
+        page = client.ask("recent")
+        assert (page[2], page[3], page[4]) == (client.epoch, 1, beat[1] + 1)
+        assert [event[0] for event in page[5]] == ["epoch", "joined"]
+        assert client.ask("recent", 1)[5] == page[5][1:]
+        assert client.ask("recent", 0, 2**62)[5] == []
+        assert client.ask("recent", 0, 0, 1)[5] == page[5][:1]
+        client.selected(["0_0.pcd"])
+        told: Any = unpack(socket.recv())
+        while told[0] == "beat":
+            told = unpack(socket.recv())
+        assert told[:2] == ["loaded", page[4]]
+
+
+def test_permissions_are_those_of_requests(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    paths = [one.endpoint, f"{one.runtime_dir}/{one.instance}.events.sock"]
+    modes = [os.stat(path) for path in paths]
+    assert len({(stat.S_IMODE(m.st_mode), m.st_uid, m.st_gid) for m in modes}) == 1
+    assert one.stop() == 0
+    assert not [path for path in paths if os.path.exists(path)]

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events, byte by byte, and what becomes of those that a later version sends."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import pytest
+
+from shmmap.errors import ProtocolMismatch
+from shmmap.protocol import events as e
+from tests.support.message_pack import pack, unpack
+
+EVENTS: list[tuple[Any, list[Any], str]] = [
+    (
+        e.Epoch(1, 2, 3, "started", 4, 5, 6),
+        ["epoch", 1, 2, 3, "started", 4, 5, 6],
+        "98a565706f6368010203a773746172746564040506",
+    ),
+    (
+        e.Loaded(1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8),
+        ["loaded", 1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8],
+        "9ca66c6f61646564010203a161a6706f696e747304050607c308",
+    ),
+    (
+        e.Changed(1, 2, 3, "a", 4, "changed"),
+        ["changed", 1, 2, 3, "a", 4, "changed"],
+        "97a76368616e676564010203a16104a76368616e676564",
+    ),
+    (
+        e.Evicted(1, 2, 3, "a", "points", 4, 5, "room"),
+        ["evicted", 1, 2, 3, "a", "points", 4, 5, "room"],
+        "99a765766963746564010203a161a6706f696e74730405a4726f6f6d",
+    ),
+    (
+        e.Failed(1, 2, 3, "a", "points", "load_failed", "no", 0.5),
+        ["failed", 1, 2, 3, "a", "points", "load_failed", "no", 0.5],
+        "99a66661696c6564010203a161a6706f696e7473ab6c6f61645f6661696c6564a26e6fcb3fe0000000000000",
+    ),
+    (
+        e.Retried(1, 2, 3, "a", "points", "load_failed"),
+        ["retried", 1, 2, 3, "a", "points", "load_failed"],
+        "97a772657472696564010203a161a6706f696e7473ab6c6f61645f6661696c6564",
+    ),
+    (
+        e.Pressure(1, 2, 3, "a", "points", "over_budget", 4, 5, 6, 7, 8),
+        ["pressure", 1, 2, 3, "a", "points", "over_budget", 4, 5, 6, 7, 8],
+        "9ca87072657373757265010203a161a6706f696e7473ab6f7665725f6275646765740405060708",
+    ),
+    (
+        e.Reloaded(1, 2, 3, 4, 5, 6, 7, 8, "no"),
+        ["reload", 1, 2, 3, 4, 5, 6, 7, 8, "no"],
+        "9aa672656c6f61640102030405060708a26e6f",
+    ),
+    (
+        e.Joined(1, 2, 3, 4, 5, 6, "c"),
+        ["joined", 1, 2, 3, 4, 5, 6, "c"],
+        "98a66a6f696e6564010203040506a163",
+    ),
+    (e.Left(1, 2, 3, 4, 5, "c", 6), ["left", 1, 2, 3, 4, 5, "c", 6], "98a46c6566740102030405a16306"),
+    (e.Beat(1, 2, 3), ["beat", 1, 2, 3], "94a462656174010203"),
+]
+
+
+def test_every_kind_is_here() -> None:
+    assert {type(event) for event, _, _ in EVENTS} == set(get_args(e.Event))
+
+
+@pytest.mark.parametrize(("event", "elements", "golden"), EVENTS, ids=lambda v: type(v).__name__)
+def test_golden_bytes(event: e.Event, elements: list[Any], golden: str) -> None:
+    data = bytes.fromhex(golden)
+    assert e.encode_event(event) == data == pack(elements)
+    assert unpack(data) == elements
+    assert e.decode_event(data) == event
+    assert e.decode_event(pack([*elements, "something new"])) == event
+
+
+def test_a_kind_of_a_later_version_is_left_out() -> None:
+    assert e.decode_event(pack(["danced", 1, 2, 3, "a"])) is None
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\x93", pack("text"), pack([1, 2, 3, 4]), pack(["beat"])])
+def test_garbage_is_refused(data: bytes) -> None:
+    with pytest.raises(ProtocolMismatch):
+        e.decode_event(data)
