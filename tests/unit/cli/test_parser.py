@@ -15,7 +15,7 @@ from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
 
 CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evict"]
 CONTRACT += ["pin", "unpin", "stop"]
-CONTRACT += ["config", "unit"]
+CONTRACT += ["config", "unit", "doctor"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
 CONTRACT += ["divide"]
 

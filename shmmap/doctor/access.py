@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who gets in: the group, the socket, and the daemon itself into the map's directory."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import stat
+import time
+from typing import Final
+
+from shmmap.doctor.finding import Finding, fail, ok, warn
+from shmmap.doctor.patient import Patient
+from shmmap.errors import DaemonUnreachable, NoAnswer, NoSocket, ProtocolMismatch, SocketPermission
+
+__all__ = ["check_group", "check_map_access", "check_socket"]
+
+ANSWER_S: Final = 2.0
+_UNITS: Final = "/etc/systemd/system"
+
+
+def _account(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def _group(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def _groups(uid: int) -> set[int]:
+    """Groups of an account as its next login has them."""
+    try:
+        entry = pwd.getpwuid(uid)
+    except KeyError:
+        return set()
+    return set(os.getgrouplist(entry.pw_name, entry.pw_gid))
+
+
+def check_group(patient: Patient) -> Finding:
+    """Is who asks a member of the group that may connect?"""
+    name = "group"
+    gid = -1
+    if patient.config.group.isdigit():
+        gid = int(patient.config.group)
+    elif patient.config.group:
+        try:
+            gid = grp.getgrnam(patient.config.group).gr_gid
+        except KeyError:
+            return fail(
+                name,
+                f"there is no group {patient.config.group!r}",
+                f"groupadd --system {patient.config.group}",
+            )
+    else:
+        try:
+            status = os.stat(patient.socket)
+            gid = status.st_gid if status.st_mode & stat.S_IWGRP else -1
+        except OSError:
+            pass
+    if gid < 0:
+        return ok(name, "none is set: only the daemon's own user may connect")
+    group, account = _group(gid), _account(patient.uid)
+    if patient.uid in (0, patient.runs_as):
+        return ok(name, f"members of {group} may connect; {account} may anyway")
+    if gid in (os.getegid(), *os.getgroups()):
+        return ok(name, f"{account} is a member of {group}")
+    if gid in _groups(patient.uid):
+        return warn(
+            name,
+            f"{account} joined {group}, this session is older",
+            "log in again, or `newgrp " + group + "`",
+        )
+    return fail(
+        name, f"{account} is no member of {group}", f"sudo usermod -aG {group} {account}, then log in again"
+    )
+
+
+def check_socket(patient: Patient) -> Finding:
+    """Does the daemon answer, and who could ask it?"""
+    from shmmap.client.discovery import check_socket as connect
+
+    name, path = "socket", patient.socket
+    try:
+        connect(path, time.monotonic() + ANSWER_S)
+    except NoSocket as error:
+        return warn(name, error.message, "start it: `systemctl start shmmapd` or `shmmap serve MAP`")
+    except SocketPermission as error:
+        return fail(name, f"{error.message}: {_access(path)}", error.hint)
+    except (NoAnswer, DaemonUnreachable, ProtocolMismatch) as error:
+        return fail(name, error.message, error.hint)
+    try:
+        open_to_all = os.stat(path).st_mode & stat.S_IWOTH
+        above = os.stat(os.path.dirname(path)).st_mode & stat.S_IXOTH
+    except OSError as error:
+        return warn(name, f"{path}: {error.strerror}", "is it being restarted?")
+    fact = f"{path} answers: {_access(path)}"
+    if open_to_all and above:
+        return warn(name, fact, f"every account may connect: chmod o-rwx {path}")
+    return ok(name, fact)
+
+
+def _access(path: str) -> str:
+    try:
+        status = os.stat(path)
+    except OSError:
+        return "its directory is closed to this user"
+    return f"{stat.filemode(status.st_mode)} {_account(status.st_uid)}:{_group(status.st_gid)}"
+
+
+def check_map_access(patient: Patient) -> Finding:
+    """Can the daemon read the map, wherever it lies?"""
+    name, path = "map", patient.map_path
+    if not path:
+        return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
+    if patient.alive:
+        return ok(name, f"{path} is being served")
+    if not os.path.exists(path):
+        try:
+            os.stat(path)
+        except PermissionError:
+            return warn(name, f"{path}: this user may not look there", "run it with sudo")
+        except OSError:
+            return fail(name, f"there is no map at {path}", "set map_path")
+    uid = patient.runs_as
+    if uid != patient.uid and _hidden_from_service(patient, path):
+        return fail(
+            name,
+            f"{path} lies where the service sees nothing (ProtectHome=, PrivateTmp=)",
+            f"sudo shmmap unit install --map {path}, or see drop-ins/maps-in-home.conf",
+        )
+    shown = uid != patient.uid and _shown_to_service(patient, path)
+    closed = _closed_to(uid, path, parents=not shown)
+    if closed:
+        return fail(
+            name,
+            f"{_account(uid)} may not read {closed}",
+            f"chmod -R a+rX {path}, and a+x on what is above it",
+        )
+    return ok(name, f"{path} can be read by {_account(uid)}")
+
+
+def _drop_ins(patient: Patient) -> str:
+    directory = patient.machine.path(f"{_UNITS}/shmmapd.service.d")
+    try:
+        return "\n".join(one.read_text(errors="replace") for one in sorted(directory.glob("*.conf")))
+    except OSError:
+        return ""
+
+
+def _shown_to_service(patient: Patient, path: str) -> bool:
+    shown = [
+        word.split(":")[0].strip('"')
+        for line in _drop_ins(patient).splitlines()
+        if line.startswith(("BindReadOnlyPaths=", "BindPaths="))
+        for word in line.split("=", 1)[1].split()
+    ]
+    return any(path == place or path.startswith(place.rstrip("/") + "/") for place in shown)
+
+
+def _hidden_from_service(patient: Patient, path: str) -> bool:
+    from shmmap.service.program import is_hidden
+
+    if not patient.machine.path(f"{_UNITS}/shmmapd.service").exists():
+        return False
+    return is_hidden(os.path.realpath(path)) and not _shown_to_service(patient, path)
+
+
+def _closed_to(uid: int, path: str, *, parents: bool) -> str:
+    """First directory or file on the way to ``path`` that an account may not pass or read; or empty."""
+    if uid == 0:
+        return ""
+    groups = _groups(uid)
+    real = os.path.realpath(path)
+    above = [os.path.dirname(real)]
+    while above[-1] != "/":
+        above.append(os.path.dirname(above[-1]))
+    wanted = [(place, 1) for place in reversed(above)] if parents else []
+    try:
+        wanted.append((real, 5 if os.path.isdir(real) else 4))
+        if os.path.isdir(real):
+            wanted += [(entry.path, 5 if entry.is_dir() else 4) for entry in os.scandir(real)]
+        for place, bits in wanted:
+            status = os.stat(place)
+            shift = 6 if status.st_uid == uid else 3 if status.st_gid in groups else 0
+            if (status.st_mode >> shift) & bits != bits:
+                return place
+    except OSError as error:
+        return str(error.filename or path)
+    return ""

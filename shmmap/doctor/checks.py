@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All checks, in the order in which they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from shmmap.doctor.access import check_group, check_map_access, check_socket
+from shmmap.doctor.finding import Finding
+from shmmap.doctor.kernel import check_descriptors, check_leases
+from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
+from shmmap.doctor.memory import check_container, check_huge_pages, check_memory_limit, check_shared_memory
+from shmmap.doctor.patient import Patient
+
+__all__ = ["CHECKS", "diagnose"]
+
+CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
+    check_daemon,
+    check_socket,
+    check_group,
+    check_map_access,
+    check_reload,
+    check_shared_memory,
+    check_memory_limit,
+    check_container,
+    check_huge_pages,
+    check_leases,
+    check_descriptors,
+    check_leftovers,
+    check_logind,
+)
+
+
+def diagnose(patient: Patient) -> list[Finding]:
+    """Carry out every check."""
+    return [check(patient) for check in CHECKS]

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What outlives a daemon or does not: leftovers, the session manager, reloads, upgrades."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import re
+import time
+from typing import Final
+
+import shmmap
+from shmmap.doctor.finding import Finding, fail, ok, warn
+from shmmap.doctor.memory import size_text
+from shmmap.doctor.patient import Machine, Patient
+from shmmap.errors import ShmmapError
+from shmmap.statistics.reader import read_statistics
+
+__all__ = ["check_daemon", "check_leftovers", "check_logind", "check_reload"]
+
+SYSTEM_UIDS: Final = 999
+"""logind spares the accounts below (SYS_UID_MAX, as Debian, Ubuntu, Fedora and systemd itself have it)."""
+
+_SEGMENT: Final = re.compile(r"shmmap\.([A-Za-z0-9_-]{1,64})\.[0-9a-f]{16}(\.zombie)?")
+
+
+def check_daemon(patient: Patient) -> Finding:
+    """How is the daemon?"""
+    name = "daemon"
+    if patient.seen is None:
+        return warn(name, patient.unreadable, "join its group, or run it with sudo")
+    identity, state = patient.seen.identity, patient.seen.state
+    instance = patient.config.instance
+    if identity is None:
+        return warn(
+            name, f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`"
+        )
+    fact = f"instance {instance}, pid {identity.pid}, is {state}"
+    if state == "dead":
+        return fail(
+            name, f"{fact}: it ended without cleaning up", "start it again: it takes over what is left"
+        )
+    if state == "stopped":
+        return fail(name, fact, f"continue it: kill -CONT {identity.pid}")
+    if state == "hung":
+        return fail(
+            name, fact, "the watchdog ends it under systemd; elsewhere kill -ABRT " + str(identity.pid)
+        )
+    if identity.library_version != shmmap.__version__:
+        return warn(
+            name,
+            f"{fact}; it is version {identity.library_version}, installed is {shmmap.__version__}",
+            "restart it (cells stay in memory): systemctl restart shmmapd",
+        )
+    return ok(name, fact)
+
+
+def check_leftovers(patient: Patient) -> Finding:
+    """Is memory held by segments that no daemon looks after?"""
+    name = "leftovers"
+    found: dict[str, tuple[int, int]] = {}
+    try:
+        with os.scandir(patient.machine.path(patient.shm_dir)) as entries:
+            for entry in entries:
+                if match := _SEGMENT.fullmatch(entry.name):
+                    count, nbytes = found.get(match[1], (0, 0))
+                    found[match[1]] = (count + 1, nbytes + entry.stat(follow_symlinks=False).st_blocks * 512)
+    except OSError as error:
+        return warn(name, f"{patient.shm_dir}: {error.strerror}", "run it with sudo")
+    orphans = {name: held for name, held in found.items() if not _looked_after(patient, name)}
+    if not orphans:
+        return ok(name, "every segment belongs to a daemon that lives" if found else "none")
+    listed = ", ".join(
+        f"{one}: {count} segments, {size_text(n)}" for one, (count, n) in sorted(orphans.items())
+    )
+    return warn(
+        name,
+        f"no daemon looks after {listed}",
+        "start that instance: it serves or frees them; or `rm " + patient.shm_dir + "/shmmap.INSTANCE.*`",
+    )
+
+
+def _looked_after(patient: Patient, instance: str) -> bool:
+    if instance == patient.config.instance:
+        return patient.alive or patient.seen is None
+    try:
+        return read_statistics(instance, patient.shm_dir).state not in ("dead", "absent")
+    except (ShmmapError, OSError):
+        return True  # not ours to judge
+
+
+def _logind_setting(machine: Machine, key: str) -> str:
+    """Value of a key of logind.conf(5): drop-ins come after the file, in the order of their names."""
+    drop_ins: dict[str, str] = {}
+    for place in ("/usr/lib", "/usr/local/lib", "/run", "/etc"):  # a later one hides an equal name
+        directory = f"{place}/systemd/logind.conf.d"
+        drop_ins |= {path.name: f"{directory}/{path.name}" for path in machine.path(directory).glob("*.conf")}
+    texts = [machine.text("/etc/systemd/logind.conf")]
+    texts += [machine.text(drop_ins[name]) for name in sorted(drop_ins)]
+    value = ""
+    for text in texts:
+        for match in re.finditer(rf"^\s*{key}\s*=\s*(\S*)", text, re.MULTILINE):
+            value = match[1]
+    return value
+
+
+def check_logind(patient: Patient) -> Finding:
+    """Will the session manager delete the segments at logout?"""
+    name, machine, uid = "logout", patient.machine, patient.runs_as
+    if uid <= SYSTEM_UIDS:
+        return ok(name, "the daemon's is a system account: logind leaves its segments alone")
+    if not machine.path("/run/systemd/system").exists():
+        return ok(name, "no systemd here: nothing is deleted at logout")
+    if _logind_setting(machine, "RemoveIPC").lower() in ("no", "0", "false", "off"):
+        return ok(name, "logind has RemoveIPC=no: segments outlive sessions")
+    try:
+        account = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        account = str(uid)
+    if machine.path(f"/var/lib/systemd/linger/{account}").exists():
+        return ok(name, f"{account} lingers: segments outlive sessions")
+    return warn(
+        name,
+        f"logind deletes the segments of {account} a few seconds after the last logout",
+        f"loginctl enable-linger {account}, or install the system service",
+    )
+
+
+def check_reload(patient: Patient) -> Finding:
+    """Did the map's last reading succeed?"""
+    name = "reload"
+    if not patient.alive or patient.seen is None:
+        return ok(name, "no daemon runs")
+    count = patient.seen.counters
+    at_ns = count.get("last_reload_unix_ns", 0)
+    fact = f"read again {count.get('reloads', 0)} times"
+    if at_ns:
+        fact += f", last {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at_ns * 1e-9))}"
+    if count.get("last_reload_failed", 0):
+        return fail(
+            name,
+            f"{fact}; the last attempt failed, the old state of the map is served",
+            "`shmmap reload` says why",
+        )
+    return ok(name, fact)

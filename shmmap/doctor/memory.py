@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared memory: is there enough, is it a tmpfs, what else limits it, how large are its pages."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import PurePosixPath
+from typing import Final, NamedTuple
+
+from shmmap.doctor.finding import Finding, fail, ok, warn
+from shmmap.doctor.patient import Machine, Patient
+
+__all__ = ["check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory", "size_text"]
+
+CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
+OVERHEAD_BYTES: Final = 512 << 20
+"""The daemon and its loaders beside the segments; a loader that reads a compressed cell is the largest."""
+
+
+class _Mount(NamedTuple):
+    point: str
+    kind: str
+    options: tuple[str, ...]
+
+
+def size_text(nbytes: float) -> str:
+    """Return bytes for a reader; powers of 1024, as the budget."""
+    for unit, size in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if nbytes >= size:
+            return f"{nbytes / size:.1f} {unit}".replace(".0 ", " ")
+    return f"{nbytes:.0f} B"
+
+
+def _mount_of(machine: Machine, path: str) -> _Mount:
+    found = _Mount("/", "unknown", ())
+    for line in machine.text("/proc/self/mounts").splitlines():
+        _, point, kind, options, *_ = line.split()
+        point = re.sub(r"\\([0-7]{3})", lambda m: chr(int(m[1], 8)), point)
+        inside = PurePosixPath(path).is_relative_to(point)
+        if inside and len(point) >= len(found.point):
+            found = _Mount(point, kind, tuple(options.split(",")))
+    return found
+
+
+def check_shared_memory(patient: Patient) -> Finding:
+    """Is the file system large enough for the budget?"""
+    name, path = "shared memory", patient.shm_dir
+    try:
+        state = os.statvfs(patient.machine.path(path))
+    except OSError as error:
+        return fail(name, f"{path}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
+    mount = _mount_of(patient.machine, path)
+    if mount.kind not in ("tmpfs", "ramfs", "unknown"):
+        return fail(
+            name,
+            f"{path} is on {mount.kind}: every segment would go to a disk",
+            "name a directory on a tmpfs",
+        )
+    if not state.f_blocks:
+        return ok(name, f"{path}: {mount.kind} without a limit")
+    size, free = state.f_blocks * state.f_frsize, state.f_bavail * state.f_frsize
+    used = 0
+    if patient.alive and patient.seen is not None:
+        count = patient.seen.counters
+        used = sum(count.get(f"bytes_{kind}", 0) for kind in ("resident", "zombie", "statistics"))
+    budget = patient.budget_bytes
+    fact = f"{path}: {size_text(size)}, {size_text(free)} free"
+    if not budget:
+        return ok(name, f"{fact}; the budget is chosen at start")
+    fact += f"; budget {size_text(budget)}, of which {size_text(used)} are in use"
+    enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={_enough(budget)} {mount.point}`"
+    if budget > free + used:
+        return fail(name, fact, enlarge)
+    if budget > 0.95 * size:
+        return warn(name, fact, f"nothing is left for others: {enlarge}")
+    return ok(name, fact)
+
+
+def _enough(budget: int) -> str:
+    return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
+
+
+def check_container(patient: Patient) -> Finding:
+    """Does a container see enough shared memory?"""
+    name = "container"
+    machine = patient.machine
+    marks = ("/.dockerenv", "/run/.containerenv")
+    contained = any(machine.path(mark).exists() for mark in marks) or bool(
+        machine.text("/run/systemd/container")
+    )
+    if not contained:
+        return ok(name, "this is no container")
+    try:
+        state = os.statvfs(machine.path(patient.shm_dir))
+    except OSError as error:
+        return fail(name, f"{patient.shm_dir}: {error.strerror}", "mount the host's with --ipc=host")
+    size = state.f_blocks * state.f_frsize
+    if 0 < size <= CONTAINER_DEFAULT_BYTES:
+        return warn(
+            name,
+            f"a container whose {patient.shm_dir} has {size_text(size)}, the default",
+            "a daemon inside needs --shm-size=8g; clients of a daemon outside need --ipc=host",
+        )
+    return ok(name, f"a container with {size_text(size)} of shared memory")
+
+
+def _cgroup_limit(machine: Machine, pid: int) -> int:
+    """Smallest memory limit on the way up from the process's cgroup, 0 for none."""
+    limits = []
+    for line in machine.text(f"/proc/{pid or 'self'}/cgroup").splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            places = ["/sys/fs/cgroup", "/sys/fs/cgroup/unified"]
+        elif "memory" in controllers.split(","):
+            places = ["/sys/fs/cgroup/memory"]
+        else:
+            continue
+        here = PurePosixPath(path)
+        for place in places:
+            for above in (here, *here.parents):
+                for file in ("memory.max", "memory.limit_in_bytes"):
+                    text = machine.text(f"{place}{above}/{file}").strip()
+                    limits += [int(text)] if text.isdigit() and int(text) < 1 << 60 else []
+    return min(limits, default=0)
+
+
+def check_memory_limit(patient: Patient) -> Finding:
+    """Would the cgroup's limit kill the daemon before its budget is full?"""
+    name = "memory limit"
+    limit, budget = _cgroup_limit(patient.machine, patient.pid), patient.budget_bytes
+    if not limit:
+        return ok(name, "the control group sets none")
+    chosen = size_text(budget) if budget else "chosen at start"
+    fact = f"the control group allows {size_text(limit)}; budget {chosen}"
+    if budget and budget + OVERHEAD_BYTES > limit:
+        return fail(
+            name,
+            fact,
+            "crossing it kills the daemon (segments are charged to it): lower the budget to"
+            f" {size_text(max(limit - OVERHEAD_BYTES, 1 << 20))}, or raise MemoryMax=",
+        )
+    return ok(name, fact)
+
+
+def check_huge_pages(patient: Patient) -> Finding:
+    """Are segments on huge pages?"""
+    name = "huge pages"
+    mount = _mount_of(patient.machine, patient.shm_dir)
+    huge = next((option for option in mount.options if option.startswith("huge=")), "")
+    switch = patient.machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled")
+    chosen = re.search(r"\[(\w+)\]", switch)
+    forced = chosen[1] if chosen else ""
+    if forced == "deny":
+        return ok(name, "off: the kernel denies them for shared memory")
+    if huge not in ("", "huge=never") or forced == "force":
+        return ok(name, f"on: {mount.point} has {huge or 'shmem_enabled=force'}")
+    return ok(
+        name,
+        f"off for {mount.point}",
+        "cells well above 2 MiB load and read faster with them: see drop-ins/huge-pages.conf",
+    )

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is examined: a machine, the daemon's settings on it, and what its daemon tells."""
+
+from __future__ import annotations
+
+import os
+import pwd
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shmmap.daemon.config import DaemonConfig
+from shmmap.errors import ShmmapError
+from shmmap.statistics.reader import Snapshot, read_statistics
+
+__all__ = ["Machine", "Patient", "examine"]
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Files of the machine; a test's machine lies in a directory."""
+
+    root: Path = Path("/")
+
+    def path(self, name: str) -> Path:
+        """Where an absolute name of the machine is found."""
+        return self.root / name.lstrip("/")
+
+    def text(self, name: str) -> str:
+        """Content of a file; empty when there is none or it cannot be read."""
+        try:
+            return self.path(name).read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return ""
+
+
+@dataclass(frozen=True)
+class Patient:
+    """What the checks look at.
+
+    Attributes
+    ----------
+    machine
+        The machine's files.
+    config, file
+        The daemon's settings, and the file they are from (empty: none).
+    socket
+        Path of the request socket.
+    seen
+        The daemon's statistics; None where they cannot be read, and ``unreadable`` says why.
+    uid
+        The account that asks.
+    """
+
+    machine: Machine
+    config: DaemonConfig
+    file: str
+    socket: str
+    seen: Snapshot | None
+    unreadable: str = ""
+    uid: int = field(default_factory=os.geteuid)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the daemon's process lives."""
+        return self.seen is not None and self.seen.state in ("healthy", "stopped", "hung")
+
+    @property
+    def shm_dir(self) -> str:
+        """Where the segments are."""
+        told = self.seen.identity.shm_dir if self.seen is not None and self.seen.identity else ""
+        return told if self.alive and told else self.config.shm_dir
+
+    @property
+    def map_path(self) -> str:
+        """The map that is served, or would be."""
+        told = self.seen.identity.map_path if self.seen is not None and self.seen.identity else ""
+        return told if self.alive and told else self.config.map_path
+
+    @property
+    def budget_bytes(self) -> int:
+        """The budget in force; the configured one (0: chosen at start) where no daemon runs."""
+        if self.alive and self.seen is not None:
+            return self.seen.counters.get("budget_bytes", 0)
+        return self.config.budget_bytes
+
+    @property
+    def pid(self) -> int:
+        """The daemon's process, 0 where none lives or it is in another pid namespace."""
+        if not self.alive or self.seen is None or self.seen.identity is None:
+            return 0
+        pid = self.seen.identity.pid
+        return pid if self.machine.path(f"/proc/{pid}").exists() else 0
+
+    @property
+    def runs_as(self) -> int:
+        """Account of the daemon: the living one's, else the installed service's, else who asks."""
+        if self.pid:
+            return self.machine.path(f"/proc/{self.pid}").stat().st_uid
+        if self.file.startswith("/etc/") and self.machine.path(_UNIT).exists():
+            try:
+                return pwd.getpwnam("shmmap").pw_uid
+            except KeyError:
+                return self.uid
+        return self.uid
+
+
+_UNIT = "/etc/systemd/system/shmmapd.service"
+
+
+def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Patient:
+    """Look at the machine and at what the instance's daemon tells."""
+    try:
+        seen, unreadable = read_statistics(config.instance, config.shm_dir), ""
+    except (ShmmapError, OSError) as error:
+        seen, unreadable = None, str(error)
+    if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
+        path = seen.identity.endpoint
+    else:
+        path = _socket(config)
+    return Patient(machine or Machine(), config, file, path, seen, unreadable)
+
+
+def _socket(config: DaemonConfig) -> str:
+    from shmmap.protocol.endpoint import runtime_dirs, socket_path
+
+    if config.endpoint or config.runtime_dir:
+        return config.socket()
+    places = [socket_path(place, config.instance) for place in runtime_dirs()]
+    return next((place for place in places if os.path.exists(place)), places[-1])

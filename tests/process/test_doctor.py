@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`shmmap doctor` beside real daemons: well, stopped, killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from typing import Any
+
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.divided_map import DividedMap
+
+
+def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
+    """Exit code, and the findings by name."""
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "shmmap.cli", "doctor", "--json", "--instance", one.instance,
+            "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir, *words,
+        ],
+        env={**{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.stdout, done.stderr
+    told = json.loads(done.stdout)
+    found = {finding["name"]: finding for finding in told["findings"]}
+    states = [finding["state"] for finding in told["findings"]]
+    assert told["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
+    return done.returncode, found
+
+
+def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    code, found = doctor(one)
+    assert code == 0, found
+    well = ("daemon", "socket", "map", "shared memory", "pins", "descriptors", "leftovers", "reload")
+    assert {name: found[name]["state"] for name in well} == dict.fromkeys(well, "ok")
+    assert f"pid {one.pid}" in found["daemon"]["fact"]
+    assert "answers" in found["socket"]["fact"]
+
+    one.send(signal.SIGSTOP)
+    os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
+    code, found = doctor(one)
+    assert (code, found["daemon"]["state"], found["socket"]["state"]) == (1, "fail", "fail")
+    assert f"kill -CONT {one.pid}" in found["daemon"]["advice"]
+    one.send(signal.SIGCONT)
+
+    one.kill()
+    code, found = doctor(one)
+    assert (code, found["daemon"]["state"]) == (1, "fail")
+    assert "gone" in found["socket"]["fact"]
+    one.start()
+    assert doctor(one)[0] == 0
+
+
+def test_a_configuration_with_a_mistake(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    one: DaemonProcess = daemon(divided_map.root, start=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap.cli", "doctor", "--config", one.runtime_dir + "/none.toml"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 78
+    assert "none.toml" in done.stderr

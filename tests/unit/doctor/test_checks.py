@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each check: machines that are well and machines that are not, made of files in a directory."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+import shmmap
+from shmmap.daemon.config import DaemonConfig
+from shmmap.doctor import access, kernel, lifetime, memory
+from shmmap.doctor.checks import CHECKS, diagnose
+from shmmap.doctor.finding import Finding, worst
+from shmmap.doctor.patient import Machine, Patient, examine
+from shmmap.statistics.identity import DaemonIdentity
+from shmmap.statistics.reader import Snapshot
+from tests.support.divided_map import make_map
+
+USER = 61005
+IDENTITY = DaemonIdentity(
+    pid=4242, start_time_ticks=1, pid_namespace=1, epoch=1, instance="default",
+    endpoint="/run/shmmap/default.sock", map_path="/maps/town", map_version=1, shm_dir="/dev/shm",
+    id_prefix="", library_version=shmmap.__version__, started_unix_ns=1, frame_id="map",
+)  # fmt: skip
+
+
+def told(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
+    identity = dataclasses.replace(IDENTITY, library_version=version)
+    if state == "absent":
+        return Snapshot("absent", None, {}, (), float("inf"), 0, 0, b"", 256)
+    return Snapshot(state, identity, counters, (), 0.1, 0, 0, b"", 256)  # type: ignore[arg-type]
+
+
+class Ward:
+    """Makes patients; files of their machine are given by name."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def file(self, name: str, text: str) -> None:
+        path = self.root / name.lstrip("/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    def patient(
+        self, seen: Snapshot | None = None, *, uid: int = USER, file: str = "", **settings: object
+    ) -> Patient:
+        (self.root / "dev/shm").mkdir(parents=True, exist_ok=True)
+        config = DaemonConfig(**settings)  # type: ignore[arg-type]
+        return Patient(Machine(self.root), config, file, config.endpoint, seen or told("absent"), uid=uid)
+
+
+@pytest.fixture
+def ward(tmp_path: Path) -> Ward:
+    return Ward(tmp_path / "machine")
+
+
+def test_the_worst_of_several() -> None:
+    assert worst([]) == "ok"
+    assert worst([Finding("a", "warn", ""), Finding("b", "ok", "")]) == "warn"
+    assert worst([Finding("a", "warn", ""), Finding("b", "fail", ""), Finding("c", "ok", "")]) == "fail"
+
+
+def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
+    """Whatever this machine is like: one finding each, and advice with everything that is not well."""
+    config = DaemonConfig(endpoint=str(tmp_path / "none.sock"), instance="nobody-has-this-name")
+    findings = diagnose(examine(config, ""))
+    assert len({one.name for one in findings}) == len(findings) == len(CHECKS)
+    for one in findings:
+        assert one.fact
+        assert one.advice or one.state == "ok", one
+
+
+# --- memory ---
+
+
+@pytest.mark.parametrize(("budget", "state"), [(0, "ok"), (1 << 20, "ok"), (1 << 60, "fail")])
+def test_a_budget_against_the_file_system(ward: Ward, budget: int, state: str) -> None:
+    found = memory.check_shared_memory(ward.patient(budget_bytes=budget))
+    assert found.state == state
+    assert ("remount,size=" in found.advice) == (state == "fail")
+
+
+def test_what_the_daemon_uses_already_is_no_shortage(ward: Ward) -> None:
+    here = os.statvfs(ward.patient().machine.path("/dev/shm"))
+    free = here.f_bavail * here.f_frsize
+    seen = told(budget_bytes=free + (1 << 30), bytes_resident=1 << 31)
+    assert memory.check_shared_memory(ward.patient(seen)).state != "fail"
+    seen = told(budget_bytes=free + (1 << 31), bytes_resident=1 << 20)
+    assert memory.check_shared_memory(ward.patient(seen)).state == "fail"
+
+
+def test_a_directory_that_is_no_tmpfs(ward: Ward) -> None:
+    ward.file("/proc/self/mounts", "/dev/vda / ext4 rw 0 0\ntmpfs /dev/shm tmpfs rw 0 0\n")
+    (ward.root / "var/my maps").mkdir(parents=True)
+    assert memory.check_shared_memory(ward.patient()).state == "ok"
+    found = memory.check_shared_memory(ward.patient(shm_dir="/var/my maps"))
+    assert (found.state, "ext4" in found.fact) == ("fail", True)
+    ward.file("/proc/self/mounts", "/dev/vda / ext4 rw 0 0\ntmpfs /var/my\\040maps tmpfs rw 0 0\n")
+    assert memory.check_shared_memory(ward.patient(shm_dir="/var/my maps")).state == "ok"
+    assert memory.check_shared_memory(ward.patient(shm_dir="/no/such")).state == "fail"
+
+
+@pytest.mark.parametrize(
+    ("line", "file", "limit", "budget", "state"),
+    [
+        ("0::/a/b", "/sys/fs/cgroup/a/memory.max", "max", 1 << 30, "ok"),
+        ("0::/a/b", "/sys/fs/cgroup/a/memory.max", str(1 << 30), 1 << 30, "fail"),
+        ("0::/a/b", "/sys/fs/cgroup/a/b/memory.max", str(4 << 30), 1 << 30, "ok"),
+        ("0::/a/b", "/sys/fs/cgroup/a/b/memory.max", str(1 << 30), 0, "ok"),
+        ("4:memory:/x", "/sys/fs/cgroup/memory/x/memory.limit_in_bytes", str(1 << 30), 1 << 30, "fail"),
+        ("4:memory:/x", "/sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712", 1 << 30, "ok"),
+        ("3:cpu:/x", "/sys/fs/cgroup/memory/x/memory.limit_in_bytes", str(1 << 20), 1 << 30, "ok"),
+    ],
+)
+def test_limits_of_the_control_group(
+    ward: Ward, line: str, file: str, limit: str, budget: int, state: str
+) -> None:
+    ward.file("/proc/self/cgroup", line + "\n")
+    ward.file(file, limit + "\n")
+    found = memory.check_memory_limit(ward.patient(budget_bytes=budget))
+    assert found.state == state
+    assert ("lower the budget" in found.advice) == (state == "fail")
+
+
+def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert memory.check_container(ward.patient()).fact == "this is no container"
+    ward.file("/run/systemd/container", "podman\n")
+    assert memory.check_container(ward.patient()).state == "ok"
+    monkeypatch.setattr(memory, "CONTAINER_DEFAULT_BYTES", 1 << 60)
+    found = memory.check_container(ward.patient())
+    assert (found.state, "--shm-size" in found.advice, "--ipc=host" in found.advice) == ("warn", True, True)
+
+
+@pytest.mark.parametrize(
+    ("options", "switch", "fact"),
+    [
+        ("rw,huge=within_size", "always within_size advise [never] deny force", "on:"),
+        ("rw,huge=never", "always within_size advise [never] deny force", "off for"),
+        ("rw", "", "off for"),
+        ("rw", "always within_size advise never deny [force]", "on:"),
+        ("rw,huge=always", "always within_size advise never [deny] force", "off: the kernel"),
+    ],
+)
+def test_huge_pages(ward: Ward, options: str, switch: str, fact: str) -> None:
+    ward.file("/proc/self/mounts", f"tmpfs /dev/shm tmpfs {options} 0 0\n")
+    ward.file("/sys/kernel/mm/transparent_hugepage/shmem_enabled", switch)
+    found = memory.check_huge_pages(ward.patient())
+    assert (found.state, found.fact.startswith(fact)) == ("ok", True)
+
+
+# --- kernel ---
+
+
+def test_pins_on_a_real_tmpfs() -> None:
+    patient = Patient(Machine(), DaemonConfig(), "", "", told("absent"))
+    assert kernel.check_leases(patient).state == "ok"
+    missing = Patient(Machine(), DaemonConfig(shm_dir="/no/such/directory"), "", "", told("absent"))
+    assert kernel.check_leases(missing).state == "fail"
+
+
+@pytest.mark.parametrize(("hard", "state"), [("1024", "warn"), ("65536", "ok"), ("unlimited", "ok")])
+def test_descriptors_of_the_daemon(ward: Ward, hard: str, state: str) -> None:
+    ward.file(
+        "/proc/4242/limits", f"Limit  Soft Limit  Hard Limit\nMax open files   1024    {hard}    files\n"
+    )
+    found = kernel.check_descriptors(ward.patient(told()))
+    assert found.state == state
+    assert "pid 4242" in found.fact
+
+
+# --- access ---
+
+
+def test_groups(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert access.check_group(ward.patient(endpoint="/no/socket")).state == "ok"
+    assert access.check_group(ward.patient(group="no such group")).state == "fail"
+    mine, other = str(os.getegid()), "61999"
+    monkeypatch.setattr(os, "getgroups", list)
+    assert access.check_group(ward.patient(group=other, uid=0)).state == "ok"
+    ward.file("/proc/4242/status", "")
+    someone = ward.patient(told(), group=other, uid=USER + 1)
+    assert access.check_group(someone).state == "fail"
+    assert "usermod -aG 61999" in access.check_group(someone).advice
+    assert access.check_group(dataclasses.replace(someone, config=DaemonConfig(group=mine))).state == "ok"
+    monkeypatch.setattr(access, "_groups", lambda _: {61999})
+    found = access.check_group(someone)
+    assert (found.state, "log in again" in found.advice) == ("warn", True)
+
+
+def test_sockets(tmp_path: Path, ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "ANSWER_S", 0.05)
+    path = tmp_path / "s"
+    assert access.check_socket(ward.patient(endpoint=str(path))).state == "warn"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        assert "gone" in access.check_socket(ward.patient(endpoint=str(path))).fact
+        listener.listen()
+        assert "does not answer" in access.check_socket(ward.patient(endpoint=str(path))).fact
+
+
+def test_maps(tmp_path: Path, ward: Ward) -> None:
+    made = make_map(tmp_path / "map", columns=2, rows=1, points=3)
+    path = str(made.root)
+    assert access.check_map_access(ward.patient()).state == "warn"
+    assert access.check_map_access(ward.patient(map_path=str(tmp_path / "none"))).state == "fail"
+    assert access.check_map_access(ward.patient(told(), map_path=path)).fact == "/maps/town is being served"
+    assert access.check_map_access(ward.patient(map_path=path, uid=0)).state == "ok"
+    made.root.chmod(0o750)
+    found = access.check_map_access(ward.patient(map_path=path))
+    assert found.state == "fail"
+    assert "chmod" in found.advice
+
+
+def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service sees it if and only if a drop-in shows it; what lies above does not matter then."""
+    home = tmp_path / "home"
+    made = make_map(home / "alice" / "map", columns=2, rows=1, points=3)
+    (home / "alice").chmod(0o700)
+    monkeypatch.setattr("shmmap.service.program._HIDDEN", (str(home),))
+    ward.file("/etc/systemd/system/shmmapd.service", "")
+    monkeypatch.setattr(Patient, "runs_as", USER)
+    patient = ward.patient(map_path=str(made.root), file="/etc/shmmap/shmmap.toml", uid=0)
+    found = access.check_map_access(patient)
+    assert (found.state, "unit install --map" in found.advice) == ("fail", True)
+    ward.file(
+        "/etc/systemd/system/shmmapd.service.d/x.conf", f"[Service]\nBindReadOnlyPaths={home}/alice/map\n"
+    )
+    assert access.check_map_access(patient).state == "ok"
+    (made.root / "pointcloud_map.pcd").chmod(0o700)
+    assert access.check_map_access(patient).state == "fail"
+
+
+# --- lifetime ---
+
+
+@pytest.mark.parametrize(
+    ("seen", "state"),
+    [
+        (told(), "ok"),
+        (told("absent"), "warn"),
+        (told("dead"), "fail"),
+        (told("stopped"), "fail"),
+        (told("hung"), "fail"),
+        (told(version="0.0.0"), "warn"),
+    ],
+)
+def test_the_daemon(ward: Ward, seen: Snapshot, state: str) -> None:
+    assert lifetime.check_daemon(ward.patient(seen)).state == state
+
+
+def test_statistics_of_others(ward: Ward) -> None:
+    patient = dataclasses.replace(ward.patient(), seen=None, unreadable="no")
+    assert lifetime.check_daemon(patient).state == "warn"
+
+
+def test_leftovers(ward: Ward) -> None:
+    assert lifetime.check_leftovers(ward.patient()).fact == "none"
+    ward.file("/dev/shm/shmmap.default.0123456789abcdef", "x" * 5000)
+    ward.file("/dev/shm/shmmap.default.statistics", "x")
+    ward.file("/dev/shm/shmmap.default.lock", "x")
+    found = lifetime.check_leftovers(ward.patient())
+    assert (found.state, "default: 1 segments, 8 KiB" in found.fact) == ("warn", True)
+    assert lifetime.check_leftovers(ward.patient(told())).state == "ok"
+    ward.file("/dev/shm/shmmap.no-such-instance.0123456789abcdef.zombie", "x")
+    found = lifetime.check_leftovers(ward.patient(told()))
+    assert (found.state, "no-such-instance" in found.fact) == ("warn", True)
+
+
+@pytest.mark.parametrize(
+    ("files", "state"),
+    [
+        ({}, "warn"),
+        ({"/etc/systemd/logind.conf": "[Login]\n#RemoveIPC=no\n"}, "warn"),
+        ({"/etc/systemd/logind.conf": "[Login]\nRemoveIPC=no\n"}, "ok"),
+        ({"/usr/lib/systemd/logind.conf.d/a.conf": "[Login]\nRemoveIPC = no\n"}, "ok"),
+        (
+            {
+                "/etc/systemd/logind.conf": "[Login]\nRemoveIPC=no\n",
+                "/etc/systemd/logind.conf.d/z.conf": "[Login]\nRemoveIPC=yes\n",
+            },
+            "warn",
+        ),
+        (
+            {
+                "/usr/lib/systemd/logind.conf.d/a.conf": "[Login]\nRemoveIPC=yes\n",
+                "/etc/systemd/logind.conf.d/a.conf": "[Login]\nRemoveIPC=no\n",
+            },
+            "ok",
+        ),
+        ({f"/var/lib/systemd/linger/{USER}": ""}, "ok"),
+    ],
+)
+def test_logind(ward: Ward, files: dict[str, str], state: str) -> None:
+    (ward.root / "run/systemd/system").mkdir(parents=True)
+    for name, text in files.items():
+        ward.file(name, text)
+    assert lifetime.check_logind(ward.patient()).state == state
+    assert lifetime.check_logind(ward.patient(uid=995)).state == "ok"
+
+
+def test_logind_without_systemd(ward: Ward) -> None:
+    assert lifetime.check_logind(ward.patient()).state == "ok"
+
+
+def test_reloads(ward: Ward) -> None:
+    assert lifetime.check_reload(ward.patient()).state == "ok"
+    assert lifetime.check_reload(ward.patient(told(reloads=3))).fact == "read again 3 times"
+    found = lifetime.check_reload(ward.patient(told(last_reload_failed=1, last_reload_unix_ns=1)))
+    assert (found.state, "shmmap reload" in found.advice) == ("fail", True)
