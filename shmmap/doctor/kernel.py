@@ -3,59 +3,48 @@
 
 from __future__ import annotations
 
-import os
 import re
 import resource
 from typing import Final
 
+from shmmap.daemon.pin_support import probe_pins
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Patient
+from shmmap.errors import ConfigError
+from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["check_descriptors", "check_leases"]
+__all__ = ["check_descriptors", "check_pins"]
 
 FEW_DESCRIPTORS: Final = 4096
 _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
-def check_leases(patient: Patient) -> Finding:
+def check_pins(patient: Patient) -> Finding:
     """Can the kernel tell who uses a segment, and name them?"""
-    from shmmap.errors import ConfigError
-    from shmmap.segment.directory import ShmDirectory
-    from shmmap.segment.pins import holders, leases_work, lock_slot
-
     name = "pins"
     try:
         directory = ShmDirectory(patient.shm_dir)
     except ConfigError as error:
         if patient.alive:
-            return ok(name, "the daemon runs, so it was granted leases")
+            return ok(name, "tried by the daemon when it started: see `shmmap status`")
         return fail(name, error.message, error.hint)
     try:
-        fd = directory.create()
-        try:
-            if not leases_work(fd):
-                return fail(
-                    name,
-                    f"{patient.shm_dir}: no leases, nobody could tell what is in use",
-                    "name a directory on a tmpfs with shm_dir",
-                )
-            lock_slot(fd, 1)
-            other = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
-            try:
-                named = holders(other) == [1]
-            finally:
-                os.close(other)
-        finally:
-            os.close(fd)
-    except OSError as error:
-        return fail(name, f"{patient.shm_dir}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
+        found = probe_pins(directory)
     finally:
         directory.close()
-    if not named:
+    if not found.leases:
         return warn(
-            name, "leases work, open-file locks do not: holders stay unnamed", "use another file system"
+            name,
+            f"{patient.shm_dir}: no leases, so who uses a segment is known from {found.rung.value} only",
+            "name a directory on a tmpfs with shm_dir",
         )
-    return ok(name, "leases and open-file locks work: the kernel tells who uses a segment")
+    if not (found.locks and found.close_events and found.process_ends):
+        return warn(
+            name,
+            f"leases work; locks: {found.locks}, inotify: {found.close_events}, pidfds: {found.process_ends}",
+            "holders may stay unnamed, or memory be freed late: use a newer kernel",
+        )
+    return ok(name, "leases and locks work: the kernel tells who uses a segment")
 
 
 def check_descriptors(patient: Patient) -> Finding:

@@ -156,11 +156,14 @@ def test_huge_pages(ward: Ward, options: str, switch: str, fact: str) -> None:
 # --- kernel ---
 
 
-def test_pins_on_a_real_tmpfs() -> None:
+def test_pins_on_a_real_tmpfs(monkeypatch: pytest.MonkeyPatch) -> None:
     patient = Patient(Machine(), DaemonConfig(), "", "", told("absent"))
-    assert kernel.check_leases(patient).state == "ok"
+    assert kernel.check_pins(patient).state == "ok"
+    monkeypatch.setenv("SHMMAP_TEST_PINS", "locks")
+    found = kernel.check_pins(patient)
+    assert (found.state, "locks of clients" in found.fact) == ("warn", True)
     missing = Patient(Machine(), DaemonConfig(shm_dir="/no/such/directory"), "", "", told("absent"))
-    assert kernel.check_leases(missing).state == "fail"
+    assert kernel.check_pins(missing).state == "fail"
 
 
 @pytest.mark.parametrize(("hard", "state"), [("1024", "warn"), ("65536", "ok"), ("unlimited", "ok")])
