@@ -7,6 +7,7 @@ import dataclasses
 import os
 import socket
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -28,11 +29,17 @@ IDENTITY = DaemonIdentity(
 )  # fmt: skip
 
 
+class Told(Snapshot):
+    """Statistics with these counters."""
+
+    def __init__(self, state: str, version: str, told: dict[str, int]) -> None:
+        identity = None if state == "absent" else dataclasses.replace(IDENTITY, library_version=version)
+        super().__init__(cast("Any", state), identity)
+        self.__dict__["counters"] = told
+
+
 def told(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
-    identity = dataclasses.replace(IDENTITY, library_version=version)
-    if state == "absent":
-        return Snapshot("absent", None, {}, (), float("inf"), 0, 0, b"", 256)
-    return Snapshot(state, identity, counters, (), 0.1, 0, 0, b"", 256)  # type: ignore[arg-type]
+    return Told(state, version, counters)
 
 
 class Ward:
