@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell, LayerTable, build_layer
 
 __all__ = ["VoxelCell", "cell_from_layer", "voxel_cell"]
+
+_COLUMNS: Final = ("table", "mean", "inverse_covariance", "scatter", "count")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

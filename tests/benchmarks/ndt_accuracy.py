@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How close alignments come: real scans, simulated ones, the generated city, large coordinates.
+
+    SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.ndt_accuracy [--seeds 50] [--threads 1]
+
+Real scans are each started from the true pose disturbed by 0.3 m and 1 degree, once per seed.  Bars: at
+least 99% within 0.1 m and 0.2 degrees, median at most 3 cm in Autoware's mode and 2 cm in fine
+mode, at 0.5 m and 6000 points; the city: fine at most half of Autoware's error; simulated scans: not worse.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose, voxel_cell
+from shmmap_clients.scans.scan_file import read_scan
+
+from tests.benchmarks.ndt_clouds import data_dir, real_pair, sampled, synthetic
+
+MODES = {"autoware": Settings(), "fine": Settings(mode="coarse_fine")}
+Matrix = NDArray[np.float64]
+
+
+def tum_poses(path: Path) -> Matrix:
+    """Poses of a TUM file, (N, 4, 4)."""
+    rows = np.loadtxt(path)
+    x, y, z, w = rows[:, 4:8].T
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1)
+    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1)
+    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1)
+    poses[:, :3, 3] = rows[:, 1:4]
+    return poses
+
+
+def errors(T: Matrix, truth: Matrix) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    off = np.linalg.inv(truth) @ T
+    angle = np.arccos(np.clip((np.trace(off[:3, :3]) - 1) / 2, -1, 1))
+    return float(np.linalg.norm(off[:3, 3])), float(np.degrees(angle))
+
+
+def disturbance(rng: np.random.Generator, metres: float, degrees: float) -> Matrix:
+    """A step of that length in a random direction, and a turn of that angle about a random axis."""
+    step, axis = rng.normal(size=3), rng.normal(size=3)
+    step *= metres / np.linalg.norm(step)
+    axis *= np.radians(degrees) / np.linalg.norm(axis)
+    return matrix_from_pose(np.concatenate([step, axis]))
+
+
+def report(name: str, found: NDArray[np.float64]) -> None:
+    """Print the share within the bar and the spread of (N, 2) metres and degrees."""
+    good = ((found[:, 0] <= 0.1) & (found[:, 1] <= 0.2)).mean()
+    m, deg = np.median(found, axis=0)
+    worst = found.max(axis=0)
+    print(
+        f"{name:42} {100 * good:6.2f}% within; median {m * 1e3:5.1f} mm {deg:.3f} deg;"
+        f" worst {worst[0] * 1e3:7.1f} mm {worst[1]:.3f} deg"
+    )
+
+
+def drive(
+    name: str, voxel_map: VoxelMap, scans: list[NDArray[np.floating]], truth: Matrix, seeds: int, threads: int
+) -> None:
+    """Align every scan from every disturbed start, in both modes."""
+    for mode, settings in MODES.items():
+        rows = []
+        with NdtMatcher(settings, threads=threads) as matcher:
+            matcher.set_map(matcher.prepare(voxel_map))
+            for index, (scan, T) in enumerate(zip(scans, truth, strict=True)):
+                for seed in range(seeds):
+                    rng = np.random.default_rng([index, seed])
+                    result = matcher.align(scan, T @ disturbance(rng, 0.3, 1.0))
+                    rows.append(errors(result.T_map_base, T))
+        report(f"{name}, {mode}", np.array(rows))
+
+
+def large_coordinates(seeds: int) -> None:
+    """Move pair and city to where Autoware's maps lie, in float64, and compare poses."""
+    shift = np.array([89570.0, 42300.0, 0.0])
+    for pair in (real_pair(), synthetic()):
+        for mode, settings in MODES.items():
+            worst = 0.0
+            with NdtMatcher(settings) as matcher:
+                here = VoxelMap({"map": voxel_cell(pair.target.astype(np.float64), pair.leaf)})
+                there = VoxelMap({"map": voxel_cell(pair.target.astype(np.float64) + shift, pair.leaf)})
+                for seed in range(seeds):
+                    guess = pair.T_guess @ disturbance(np.random.default_rng(seed), 0.3, 1.0)
+                    matcher.set_map(here)
+                    a = matcher.align(pair.source, guess).T_map_base[:3, 3]
+                    guess[:3, 3] += shift
+                    matcher.set_map(there)
+                    b = matcher.align(pair.source, guess).T_map_base[:3, 3] - shift
+                    worst = max(worst, float(np.linalg.norm(a - b)))
+            print(
+                f"moved to (89570, 42300), {pair.name}, {mode}: poses differ by at most {worst * 1e3:.4f} mm"
+            )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    folder = data_dir()
+    print(f"load {os.getloadavg()[0]:.2f}; {args.seeds} seeds")
+    street = VoxelMap({"map": voxel_cell(read_scan(folder / "kitti0005_map" / "map_static_v010.pcd"), 2.0)})
+
+    real = sorted((folder / "kitti0005_scans").glob("scan_*.npz"))
+    truth = tum_poses(folder / "kitti0005_scans" / "poses_heldout_tum.txt")
+    raw = [read_scan(path) for path in real]
+    dense = [sampled(scan, 0.5, 6000) for scan in raw]
+    drive("real scans, 0.5 m, 6000 points", street, dense, truth, args.seeds, args.threads)
+    sparse = [sampled(scan, 3.0, 1500) for scan in raw]
+    drive("real scans, 3 m, 1500 points", street, sparse, truth, args.seeds, args.threads)
+
+    made = sorted((folder / "kitti0005_sim_scans").glob("scan_*.npz"))
+    exact = tum_poses(folder / "kitti0005_sim_scans" / "poses_tum.txt")
+    simulated = [sampled(read_scan(path), 0.5, 6000) for path in made]
+    drive(
+        "simulated scans, 0.5 m, 6000 points",
+        street,
+        simulated,
+        exact,
+        max(1, args.seeds // 10),
+        args.threads,
+    )
+
+    city = synthetic()
+    city_truth = matrix_from_pose(np.array([10.4, 5.2, 1.8, 0.0, 0.0, 0.3]))[None]
+    city_map = VoxelMap({"map": voxel_cell(city.target, 2.0)})
+    drive("generated city, 1500 points", city_map, [city.source], city_truth, args.seeds, args.threads)
+    large_coordinates(min(args.seeds, 10))
+
+
+if __name__ == "__main__":
+    main()
