@@ -52,7 +52,7 @@ def main() -> None:
     )
     for name, target, source, leaf, T_guess in cases:
         for mode in ("single", "coarse_fine"):
-            with NdtMatcher(Settings(mode=mode, neighbors="radius", line_search=False)) as matcher:  # type: ignore[arg-type]
+            with NdtMatcher(Settings(mode=mode, neighbors="radius", line_search=False)) as matcher:
                 matcher.set_map(VoxelMap({"map": voxel_cell(target, leaf)}))
                 truth = matcher.align(source, T_guess).T_map_base
                 for level in (True, False):
