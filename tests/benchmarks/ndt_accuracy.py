@@ -21,7 +21,11 @@ from shmmap_clients.scans.scan_file import read_scan
 
 from tests.benchmarks.ndt_clouds import data_dir, real_pair, sampled, synthetic
 
-MODES = {"autoware": Settings(), "fine": Settings(mode="coarse_fine")}
+MODES = {
+    "autoware": Settings(),
+    "autoware, steady": Settings(steady=True),
+    "fine": Settings(mode="coarse_fine"),
+}
 Matrix = NDArray[np.float64]
 
 
@@ -58,7 +62,7 @@ def report(name: str, found: NDArray[np.float64]) -> None:
     m, deg = np.median(found, axis=0)
     worst = found.max(axis=0)
     print(
-        f"{name:42} {100 * good:6.2f}% within; median {m * 1e3:5.1f} mm {deg:.3f} deg;"
+        f"{name:48} {100 * good:6.2f}% within; median {m * 1e3:5.1f} mm {deg:.3f} deg;"
         f" worst {worst[0] * 1e3:7.1f} mm {worst[1]:.3f} deg"
     )
 

@@ -52,6 +52,8 @@ class Settings:
         covariances: the wide basin of the one and the accuracy of the other.
     fine_epsilon
         Where the fine part stops.
+    steady
+        Steps that never swing, see `StepRule`; default: not in ``"single"``, which equals the originals.
     """
 
     convention: str = "autoware"
@@ -62,6 +64,7 @@ class Settings:
     line_search: bool | None = None
     mode: Mode = "single"
     fine_epsilon: float = 0.002
+    steady: bool | None = None
 
 
 class NdtMatcher:
@@ -265,4 +268,5 @@ def _rule(settings: Settings, convention: Convention, caps: Caps) -> StepRule:
     if caps.iterations is not None:
         iterations = min(iterations, caps.iterations)
     line_search = convention.line_search if settings.line_search is None else settings.line_search
-    return StepRule(convention, epsilon, settings.step_size, iterations, line_search)
+    steady = settings.mode == "coarse_fine" if settings.steady is None else settings.steady
+    return StepRule(convention, epsilon, settings.step_size, iterations, line_search, steady)

@@ -20,6 +20,9 @@ __all__ = ["Ascent", "StepRule", "ascend"]
 # what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
 _SINGULAR: Final = 6 * np.finfo(np.float64).eps
 
+_BACK: Final = -0.5  # cosine between steps below which one goes back on the other
+_FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
+
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
 
 
@@ -37,6 +40,11 @@ class StepRule:
     max_iterations
     line_search
         More-Thuente's instead of a clipped Newton step.
+    steady
+        The originals may swing between two places until iterations are up: where the score is not concave
+        they go back along a step that would lead down, and a step across the peak is answered by the same
+        one back.  Here curvatures count by their magnitude (saddle-free Newton, Dauphin 2014), so that every
+        step leads up, and a step that goes back on the one before halves the longest one.
     """
 
     convention: Convention
@@ -44,6 +52,7 @@ class StepRule:
     max_step: float
     max_iterations: int
     line_search: bool
+    steady: bool = False
 
 
 @dataclass(slots=True)
@@ -70,17 +79,21 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
     """
     sign = rule.convention.pitch_sign
     pose = pose_from_matrix(T_guess)
+    longest, before = rule.max_step, np.zeros(6)
     at = evaluate(pose, sign)
     ascent = Ascent(pose, at, [at], [T_guess])
     while True:
-        step = _newton_step(at)
+        step = _upward_step(at) if rule.steady else _newton_step(at)
         length = float(np.linalg.norm(step))
         if length == 0.0 or length != length:
             ascent.converged = length == 0.0 and at.found > 0
             return ascent
         direction = step / length
-        length, direction, at = _take_step(ascent, at, length, direction, evaluate, rule)
-        step = direction * length
+        if rule.steady:
+            cosine = float(direction @ before)
+            longest = longest / 2 if cosine < _BACK else min(2 * longest, rule.max_step)
+        length, direction, at = _take_step(ascent, at, length, direction, evaluate, rule, longest)
+        before, step = direction, direction * length
         ascent.pose = ascent.pose + step
         ascent.last = at
         ascent.transforms.append(matrix_from_pose(ascent.pose))
@@ -104,6 +117,18 @@ def _newton_step(at: Evaluation) -> NDArray[np.float64]:
     return np.asarray(vt.T @ coefficients, np.float64)
 
 
+def _upward_step(at: Evaluation) -> NDArray[np.float64]:
+    """Return the step to the peak of a paraboloid that curves down by the Hessian's magnitudes."""
+    if not np.isfinite(at.hessian).all():
+        return np.full(6, np.nan)
+    values, vectors = np.linalg.eigh(at.hessian)
+    curvature = np.abs(values)
+    if not curvature.max() > 0:
+        return np.zeros(6)
+    curvature = np.maximum(curvature, curvature.max() * _FLAT)
+    return np.asarray(vectors @ ((vectors.T @ at.gradient) / curvature), np.float64)
+
+
 def _take_step(
     ascent: Ascent,
     at: Evaluation,
@@ -111,6 +136,7 @@ def _take_step(
     direction: NDArray[np.float64],
     evaluate: Evaluate,
     rule: StepRule,
+    longest: float,
 ) -> tuple[float, NDArray[np.float64], Evaluation]:
     """Return the step's length and direction, and the evaluation where it ends."""
     sign = rule.convention.pitch_sign
@@ -129,10 +155,10 @@ def _take_step(
         return -latest.score, -float(latest.gradient @ direction)
 
     if not rule.line_search:
-        length = max(min(length, rule.max_step), shortest)
+        length = max(min(length, longest), shortest)
         phi(length)
         return length, direction, latest
-    length, trials = search_step(length, shortest, rule.max_step, -at.score, slope, phi)
+    length, trials = search_step(length, shortest, longest, -at.score, slope, phi)
     if trials and sign > 0:
         # ndt_omp computes the Hessian anew after a search, and there with the right sign
         latest = evaluate(start + direction * length, -1.0)

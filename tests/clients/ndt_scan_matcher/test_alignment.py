@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
     Caps,
+    Evaluation,
     NdtMatcher,
     Regularization,
     Result,
@@ -16,6 +17,8 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
     pose_from_matrix,
 )
+from shmmap_clients.ndt_scan_matcher.conventions import convention_named
+from shmmap_clients.ndt_scan_matcher.newton import StepRule, ascend
 from shmmap_clients.ndt_scan_matcher.result import covariance_of, oscillations
 from shmmap_clients.ndt_scan_matcher.worst_case import predict_worst_case
 
@@ -88,6 +91,33 @@ def test_autoware_and_fine_arrive(points: NDArray[np.float64], scan: NDArray[np.
     assert not plain.cut
     assert plain.covariance is not None
     assert (np.linalg.eigvalsh(plain.covariance) > 0).all()
+
+
+def test_steady_steps_end_where_the_originals_do(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
+    voxel_map = map_of(points, 2.0)
+    plain = aligned(voxel_map, scan, settings=Settings(epsilon=1e-4))
+    steady = aligned(voxel_map, scan, settings=Settings(epsilon=1e-4, steady=True))
+    assert steady.converged
+    np.testing.assert_allclose(steady.T_map_base, plain.T_map_base, atol=1e-3)
+
+
+def test_steady_steps_do_not_swing() -> None:
+    # far from a peak of this score a Newton step leads away, and at 0.5 m steps past the peak
+    def evaluate(pose: NDArray[np.float64], _sign: float) -> Evaluation:
+        value = float(np.exp(-0.5 * (pose @ pose) / 0.09))
+        hessian = value * (np.outer(pose, pose) / 0.09 - np.eye(6)) / 0.09
+        return Evaluation(value, -value * pose / 0.09, hessian, 0.0, 1, 1, 0, 0)
+
+    guess = np.eye(4)
+    guess[:3, 3] = 0.55, 0.2, -0.1
+    rule = StepRule(convention_named("autoware"), 1e-3, 0.5, 40, False, steady=True)
+    ascent = ascend(guess, evaluate, rule)
+    assert ascent.converged
+    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=2e-3)
+    scores = [at.score for at in ascent.evaluations]
+    assert scores[-1] > 0.999
 
 
 def test_the_same_pose_at_large_coordinates(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:

@@ -56,6 +56,12 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--fine", action="store_true", help="go on with the true covariances: several times more accurate"
     )
+    group.add_argument(
+        "--steady",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="steps that never swing to and fro, unlike the originals' (default: with --fine)",
+    )
     group.add_argument("--backend", default="numba", metavar="NAME", help="numba (default) or numpy")
     group.add_argument("--threads", type=int, default=1, metavar="N", help="results do not depend on it")
     caps = parser.add_argument_group("caps (what exceeds one is left out and reported)")
@@ -77,6 +83,7 @@ def matcher_from(args: argparse.Namespace) -> Any:
         step_size=args.step_size,
         line_search=args.line_search,
         mode="coarse_fine" if args.fine else "single",
+        steady=args.steady,
     )
     given = {
         "source_points": args.max_points,
