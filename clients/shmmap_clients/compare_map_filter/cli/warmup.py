@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap-compare warmup``: compile the kernel now, so that the first scan does not wait for it."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = subparsers.add_parser(
+        "warmup", help="compile the kernel", description="Compile the kernel and keep it in numba's cache."
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import the kernel: it is compiled for its types by that."""
+    import time
+
+    del args
+    begin = time.perf_counter()
+    from shmmap_clients.compare_map_filter import kernel
+
+    print(f"{len(kernel.explain.signatures)} variants ready after {time.perf_counter() - begin:.1f} s")
+    return 0

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop of the program: a scan, the window around its pose, what the map does not explain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from shmmap import BadRequest, MapWindow
+from shmmap_clients.compare_map_filter.filter import CompareMapFilter, Comparison
+from shmmap_clients.scans.scan_sequence import Scan
+
+__all__ = ["ComparedScan", "compare_drive"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComparedScan:
+    """A scan and what came of it.
+
+    Attributes
+    ----------
+    scan, comparison
+        The scan, sensor frame, and which of its points are kept.
+    complete
+        Whether every cell of the window was there.
+    """
+
+    scan: Scan
+    comparison: Comparison
+    complete: bool
+
+
+def compare_drive(
+    scans: Iterable[Scan],
+    window: MapWindow,
+    compare: CompareMapFilter,
+    *,
+    first_wait_s: float,
+    wait_s: float | None,
+) -> Iterator[ComparedScan]:
+    """Compare scan after scan.
+
+    Parameters
+    ----------
+    scans
+        With poses.
+    window
+        Of the rule's layer.
+    first_wait_s, wait_s
+        How long the first scan and each later one may wait for the window's cells; None: not at all.
+
+    Raises
+    ------
+    BadRequest
+        A scan has no pose.
+    ShmmapError
+        The daemon cannot be asked, and no cell was ever there.
+    """
+    patience: float | None = first_wait_s
+    for scan in scans:
+        T = scan.T_map_sensor
+        if T is None:
+            raise BadRequest(f"scan {scan.name} has no pose", hint="give poses with --poses FILE")
+        window.move_to(float(T[0, 3]), float(T[1, 3]), wait=patience)
+        if window.error is not None and not window.cells:
+            raise window.error
+        patience = wait_s
+        comparison = compare.follow(window).apply(scan.xyz, T)
+        yield ComparedScan(scan, comparison, window.complete and window.error is None)
