@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from shmmap.layers.build import build_layer
     from shmmap.layers.contract import LayerKind, LayerTable
     from shmmap.layers.covariance import voxel_covariances
+    from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
     from shmmap.protocol.messages import HeldCell, Intent
 
@@ -127,6 +128,7 @@ __all__ = [
     "build_layer",
     "canonical_layer",
     "connect",
+    "ground_height",
     "read_cloud",
     "voxel_covariances",
     "write_pcd",
@@ -139,6 +141,7 @@ _LAYERS: Final = {
     "LayerTable": "contract",
     "build_layer": "build",
     "canonical_layer": "spec",
+    "ground_height": "ground",
     "voxel_covariances": "covariance",
 }
 _CLIENT: Final = frozenset(

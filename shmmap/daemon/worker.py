@@ -20,7 +20,7 @@ from typing import Final
 
 from shmmap.daemon import jobs
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS
-from shmmap.errors import MapDataError, SegmentCorrupt
+from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
 from shmmap.layers.derive import CellJob, derive
 from shmmap.layers.points import LAYER, build_points
 from shmmap.layers.sources import CellSource, read_segment
@@ -118,7 +118,7 @@ class _Worker:
             step("worker.done")
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
-        except MapDataError as error:
+        except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
             code = "no_space" if is_full(error) else "load_failed"

@@ -115,7 +115,12 @@ class WorkerPool:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+                # one loader, one core: Open3D would start a thread for each
+                env={
+                    "OMP_NUM_THREADS": "1",
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+                },
                 cwd="/",  # nothing is imported from where the daemon happens to run
                 start_new_session=True,
             )  # fmt: skip

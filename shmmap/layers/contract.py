@@ -154,6 +154,16 @@ class PointTable:
     def __len__(self) -> int:
         return len(self.columns["xyz"])
 
+    def finite(self) -> NDArray[np.bool_]:
+        """Which points have finite coordinates, (N,)."""
+        found: NDArray[np.bool_] = np.isfinite(self.xyz).all(axis=1)
+        return found
+
+    def selected(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> LayerTable:
+        """Return the table of some points, every column of them; a mask or row numbers."""
+        columns = {name: np.ascontiguousarray(column[rows]) for name, column in self.columns.items()}
+        return LayerTable(columns, len(columns["xyz"]), {**self.units, "xyz": "m"})
+
 
 @dataclass(slots=True)
 class LayerTable:

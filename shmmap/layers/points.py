@@ -7,8 +7,6 @@ import os
 from collections.abc import Callable
 from typing import Final
 
-import numpy as np
-
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd_reader import Block, PcdReader
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
@@ -122,13 +120,7 @@ def _append(writer: SegmentWriter, block: Block) -> None:
 def _from_arrays(points: PointTable, parameters: Parameters) -> LayerTable:
     """The same from arrays: points that are finite, every column."""
     del parameters
-    finite = np.isfinite(points.xyz).all(axis=1)
-    columns = points.columns if finite.all() else {n: c[finite] for n, c in points.columns.items()}
-    return LayerTable(
-        columns=dict(columns),
-        rows=len(columns["xyz"]),
-        units={**points.units, "xyz": "m"},
-    )
+    return points.selected(points.finite())
 
 
 KIND: Final = LayerKind(

@@ -15,7 +15,18 @@ from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import Final
 
-from shmmap.layers import ndt, points, search, voxel
+from shmmap.layers import (
+    crop,
+    denoise,
+    elevation,
+    ground,
+    ndt,
+    normals,
+    points,
+    sample,
+    search,
+    voxel,
+)  # fmt: skip
 from shmmap.layers.contract import LayerKind
 
 __all__ = ["find_kind", "kinds", "register"]
@@ -25,7 +36,8 @@ _log = logging.getLogger(__name__)
 GROUP: Final = "shmmap.layers"
 
 _own: Final[dict[str, LayerKind]] = {
-    kind.name: kind for kind in (points.KIND, voxel.KIND, ndt.KIND, search.KIND)
+    module.KIND.name: module.KIND
+    for module in (points, voxel, ndt, search, sample, crop, denoise, normals, elevation, ground)
 }
 _registered: Final[dict[str, LayerKind]] = {}
 

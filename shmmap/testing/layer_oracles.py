@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["covariance_of", "voxels_of"]
+__all__ = ["columns_of", "covariance_of", "fitted_height", "inliers_of", "normal_of", "voxels_of"]
 
 
 def voxels_of(xyz: NDArray[Any], leaf: tuple[float, float, float]) -> dict[tuple[int, int, int], list[int]]:
@@ -65,3 +65,58 @@ def covariance_of(
             values[1] = floor
         covariance = vectors @ np.diag(values) @ np.linalg.inv(vectors)
     return covariance, np.linalg.inv(covariance).astype(np.float64)
+
+
+def columns_of(xyz: NDArray[Any], edge: float) -> dict[tuple[int, int], list[int]]:
+    """Which points lie in which column of the global ground grid, by index (x, y)."""
+    found: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
+    for (i, j, _), rows in voxels_of(xyz, (edge, edge, 1e30)).items():
+        found[i, j] += rows
+    return {index: sorted(rows) for index, rows in found.items()}
+
+
+def fitted_height(xyz: NDArray[Any], x: float, y: float, margin_m: float = 1.0) -> float | None:
+    """Autoware's map_height_fitter: the lowest z of points closer than the nearest one's distance + 1 m."""
+    finite = np.asarray(xyz, np.float64)[np.isfinite(xyz).all(axis=1)]
+    if not len(finite):
+        return None
+    distance = np.hypot(finite[:, 0] - x, finite[:, 1] - y)
+    return float(finite[distance < distance.min() + margin_m, 2].min())
+
+
+def _distances(points: NDArray[Any], place: NDArray[Any]) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = np.linalg.norm(points.astype(np.float64) - place.astype(np.float64), axis=1)
+    return found
+
+
+def inliers_of(
+    xyz: NDArray[Any], neighbours: int, std_ratio: float, halo: NDArray[Any] | None = None
+) -> tuple[NDArray[np.float64], float]:
+    """Mean distance of each point to its nearest others, and the threshold: PCL's outlier removal."""
+    around = xyz if halo is None else np.concatenate([xyz, halo])
+    means = np.zeros(len(xyz))
+    for number, point in enumerate(xyz):
+        others = np.sort(np.delete(_distances(around, point), number))[:neighbours]
+        means[number] = others.mean() if len(others) else 0.0
+    spread = means.std(ddof=1) if len(means) > 1 else 0.0
+    return means, float(means.mean() + std_ratio * spread) if len(means) else 0.0
+
+
+def normal_of(
+    xyz: NDArray[Any], number: int, radius: float, neighbours: int
+) -> tuple[NDArray[np.float64], float]:
+    """Normal of a plane through the nearest points within a radius, and how clearly it is one.
+
+    The clearness is the gap between the two least eigenvalues of the covariance over the greatest: where
+    it is near 0 any direction is as good.
+    """
+    distance = _distances(xyz, xyz[number])
+    near = np.argsort(distance, kind="stable")[:neighbours]
+    near = near[distance[near] < radius]
+    if len(near) < 3:
+        return np.array([0.0, 0.0, 1.0]), 1.0
+    points = np.asarray(xyz[near], np.float64) - np.asarray(xyz[number], np.float64)
+    values, vectors = np.linalg.eigh(np.cov(points.T))
+    normal = vectors[:, 0].astype(np.float64)
+    clear = (values[1] - values[0]) / values[2] if values[2] > 0 else 0.0
+    return (normal if normal[2] >= 0 else -normal), float(clear)

@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-CORNERS = (
+__all__ = ["CORNERS", "corner", "surface"]
+
+CORNERS: Final = (
     "origin", "negative", "large_f4", "large_f8", "borders", "empty", "one_point", "duplicates", "not_finite",
     "flat", "far_apart",
 )  # fmt: skip
 
-MOVED: NDArray[Any] = np.array([89570.0, 42300.0, 3.0])
+MOVED: Final[NDArray[Any]] = np.array([89570.0, 42300.0, 3.0])
 
 
 def surface(rng: np.random.Generator, points: int, size_m: float = 20.0) -> NDArray[np.float64]:
@@ -59,13 +60,9 @@ def corner(name: str, points: int = 600) -> Any:
     if name == "flat":
         base[:, 2] = 1.0
         return base.astype(np.float32)
-    assert name == "far_apart"  # no table can cover the box
+    if name != "far_apart":
+        raise KeyError(name)
+    # no table can cover the box
     cloud = base.astype(np.float64)
     cloud[0] = [3e6, -4e6, 2e6]
     return cloud
-
-
-def corners() -> Iterator[tuple[str, NDArray[Any]]]:
-    """All of them by name."""
-    for name in CORNERS:
-        yield name, corner(name)
