@@ -112,6 +112,8 @@ def normal_of(
     """
     distance = _distances(xyz, xyz[number])
     near = np.argsort(distance, kind="stable")[:neighbours]
+    if (np.abs(distance - radius) < 1e-6).any():
+        return np.array([0.0, 0.0, 1.0]), 0.0
     near = near[distance[near] < radius]
     if len(near) < 3:
         return np.array([0.0, 0.0, 1.0]), 1.0
