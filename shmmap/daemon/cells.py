@@ -20,6 +20,7 @@ from shmmap.daemon.reclaim import HAND_OUT_GRACE_S
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.sessions import Session
 from shmmap.daemon.store import Store
+from shmmap.daemon.waiting_list import WaitingList
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, ZRange, distance_to_boxes
 from shmmap.layers.spec import canonical_layers
@@ -97,10 +98,10 @@ class CellRequests:
         self._send = send
         self._now_s = clock
         self._waiting: dict[Key, list[Wanted]] = {}
-        self._by_deadline: list[Wanted] = []
+        self._patient: WaitingList[Wanted] = WaitingList()
 
     def __len__(self) -> int:
-        return len(self._by_deadline)
+        return len(self._patient)
 
     # --- the three verbs ------------------------------------------------------------------------
 
@@ -195,7 +196,7 @@ class CellRequests:
         if cold:
             self._statistics.add("misses", len(cold))
             self._load(wanted, cold, area, now_s)
-            if wait_s and wanted.outstanding:
+            if wait_s and wanted.outstanding and self._patient.has_room(wanted.session):
                 wanted.began_s, wanted.deadline_s = now_s, now_s + wait_s
                 self._wait(wanted)
                 return
@@ -275,7 +276,7 @@ class CellRequests:
             self._store.books.slot(key).waiting += 1
         for key in wanted.outstanding:
             self._waiting.setdefault(key, []).append(wanted)
-        self._by_deadline.append(wanted)
+        self._patient.add(wanted)
 
     def _stop_waiting(self, wanted: Wanted) -> None:
         for key in wanted.keys:
@@ -286,7 +287,7 @@ class CellRequests:
                 waiters.remove(wanted)
                 if not waiters:
                     del self._waiting[key]
-        self._by_deadline.remove(wanted)
+        self._patient.remove(wanted)
 
     def settled(self, key: Key) -> None:
         """A load ended: answer the requests it was the last one for."""
@@ -298,17 +299,17 @@ class CellRequests:
 
     def next_deadline_s(self) -> float:
         """When the next client's patience ends; infinity when nobody waits."""
-        return min((wanted.deadline_s for wanted in self._by_deadline), default=float("inf"))
+        return self._patient.next_deadline_s()
 
     def answer_overdue(self, now_s: float) -> None:
         """Answer those who waited long enough, with what there is."""
-        for wanted in [w for w in self._by_deadline if w.deadline_s <= now_s]:
+        for wanted in self._patient.overdue(now_s):
             self._stop_waiting(wanted)
             self._answer(wanted, now_s)
 
     def forget(self, session: Session) -> None:
         """The session ended: nobody waits for its requests any more."""
-        for wanted in [w for w in self._by_deadline if w.session is session]:
+        for wanted in self._patient.of(session):
             self._stop_waiting(wanted)
 
     def renumber(self, new_index: Callable[[int], int | None], id_of: Callable[[int], str]) -> None:
@@ -316,7 +317,7 @@ class CellRequests:
 
         ``new_index`` maps an old index to the new one, None for a cell that left the map.
         """
-        for wanted in self._by_deadline:
+        for wanted in self._patient:
             cells = []
             for index, layer in wanted.cells:
                 now = new_index(index)
@@ -328,7 +329,7 @@ class CellRequests:
 
     def answer_all(self, now_s: float) -> None:
         """Answer everybody now (the daemon stops)."""
-        for wanted in list(self._by_deadline):
+        for wanted in self._patient:
             self._stop_waiting(wanted)
             self._answer(wanted, now_s)
 

@@ -7,6 +7,7 @@ turn, and everybody who asked meanwhile gets the result of one survey.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -19,6 +20,10 @@ __all__ = ["PinSurvey", "Pinned"]
 
 LOOKS_AT_ONCE: Final = 16
 """Half a millisecond of the serving loop."""
+STEP_S: Final = 0.001
+LONG_STEP_S: Final = 0.003
+SHARE: Final = 0.1
+"""Part of the loop's time that steps get when they take long (somebody holds very many locks)."""
 MOST_SEGMENTS: Final = 2048
 """The largest are looked at."""
 MOST_ASKED: Final = 16
@@ -46,11 +51,17 @@ class PinSurvey:
         self._running: list[tuple[Session, Answer]] = []
         self._left: list[Resident] = []
         self._sum = [0, 0, 0]
+        self._rests_until_s = 0.0
 
     @property
     def idle(self) -> bool:
         """Whether there is nothing to do."""
         return not (self._asked or self._running)
+
+    @property
+    def next_step_s(self) -> float:
+        """When `turn` has something to do: infinity for never."""
+        return float("inf") if self.idle else self._rests_until_s
 
     def ask(self, session: Session, answer: Answer) -> None:
         """Have ``answer`` called with the result of a survey that begins after now.
@@ -63,6 +74,14 @@ class PinSurvey:
         if sum(asker is session for asker, _ in self._asked) >= MOST_ASKED:
             raise Busy("this session waits for too many answers of this kind", hint="wait for them first")
         self._asked.append((session, answer))
+
+    def turn(self, now_s: float) -> None:
+        """Do a step, unless the one before took so long that others come first."""
+        if self.idle or now_s < self._rests_until_s:
+            return
+        self.step()
+        took_s = time.monotonic() - now_s
+        self._rests_until_s = now_s + took_s / SHARE if took_s > LONG_STEP_S else 0.0
 
     def step(self) -> None:
         """Look at a few segments, or hand the result to one who asked."""
@@ -78,7 +97,10 @@ class PinSurvey:
             self._look()
 
     def _look(self) -> None:
+        end_s = time.thread_time() + STEP_S
         for _ in range(min(LOOKS_AT_ONCE, len(self._left))):
+            if time.thread_time() > end_s:
+                break  # somebody holds very many locks
             resident = self._left.pop()
             slots = self._reclaimer.slots_of(resident) or []
             if any(self._sessions.by_slot(slot) for slot in slots):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -39,6 +40,8 @@ HAND_OUT_GRACE_S: Final = 1.0
 """A segment just handed out is not evicted for this long, so that its reader can open it."""
 PROBES_AT_ONCE: Final = 64
 """Looks per turn of the serving loop (about 15 us each)."""
+HOLDERS_S: Final = 0.03
+"""Time of the processor that finding out who holds what may take for one reply."""
 PIN_MEMO_S: Final = 0.2
 """How long a segment found pinned is not considered again for eviction."""
 
@@ -286,11 +289,15 @@ class Reclaimer:
             return None
 
     def holders_of(self, residents: Iterable[Resident], *, limit: int = 512) -> tuple[Holder, ...]:
-        """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock."""
+        """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock.
+
+        A bounded look: at so many segments, and for so long.
+        """
+        end_s = time.thread_time() + HOLDERS_S
         bytes_of: dict[int, int] = {}
         cells_of: dict[int, int] = {}
         for count, resident in enumerate(residents):
-            if count >= limit:
+            if count >= limit or time.thread_time() > end_s:
                 break
             slots = self.slots_of(resident)
             if slots is None:

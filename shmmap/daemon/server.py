@@ -168,10 +168,13 @@ class Server:
         while not self._stopping:
             now_s = time.monotonic()
             until_s = min(
-                self._store.loads.next_event_s(), self.cells.next_deadline_s(), self._heartbeat.next_s
+                self._store.loads.next_event_s(),
+                self.cells.next_deadline_s(),
+                self._heartbeat.next_s,
+                self._survey.next_step_s,
             )
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
-            busy = len(self._hearing) or not self._survey.idle or not self._crowd.idle
+            busy = len(self._hearing) or not self._crowd.idle
             ready = self._poller.poll(0 if busy else min(timeout_ms, int(BEAT_S * 1000)))
             self._turn(ready)
         self._gate.release()
@@ -192,9 +195,9 @@ class Server:
                     if callback is not None:
                         callback()
         self._serve()
-        self._survey.step()
-        self._crowd.step()
         now_s = time.monotonic()
+        self._survey.turn(now_s)
+        self._crowd.step()
         self._store.loads.end_overdue(now_s)
         self._store.loads.pump(now_s)
         self.cells.answer_overdue(now_s)

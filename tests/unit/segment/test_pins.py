@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.segment import pins
 from shmmap.segment.attach import AttachedSegment, attach
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import MAX_SLOT, holders, is_pinned, lock_slot, prepare_process
@@ -159,3 +160,22 @@ def test_nothing_of_it_needs_the_name(shm: ShmDirectory, publish: Publish) -> No
     assert not is_pinned(keeper)
     os.close(keeper)
     assert not Path(f"{shm.path}{name}").exists()
+
+
+def test_asking_for_holders_without_number_ends(
+    shm: ShmDirectory, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who asks has only so much time: the answer is what was found by then."""
+    name = publish()
+    stranger = shm.open(name)
+    slots = range(1, 600, 3)
+    for slot in slots:
+        lock_slot(stranger, slot)
+    fd = shm.open(name)
+    assert holders(fd) == list(slots)
+    monkeypatch.setattr(pins, "PATIENCE_S", 0.0)
+    found = holders(fd)
+    os.close(fd)
+    os.close(stranger)
+    assert 0 < len(found) < 16
+    assert set(found) <= set(slots)
