@@ -345,16 +345,17 @@ def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[Colu
             or offset < header_bytes
             or offset % ALIGNMENT_BYTES
             or offset + nbytes > total_bytes
+            or (nbytes == 0 and max(shape, default=0) > total_bytes)  # numpy has no such array
         ):
             raise SegmentCorrupt(f"column {len(rows)} ({bytes(name)!r}) contradicts the layout")
         rows.append(
             (
-                name.rstrip(b"\0").decode(),
+                _text(name.rstrip(b"\0")),
                 kind,
                 shape,
                 offset,
                 nbytes,
-                unit.rstrip(b"\0").decode(),
+                _text(unit.rstrip(b"\0")),
                 checksum,
             )
         )
@@ -388,8 +389,8 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
     if max(id_at + id_bytes, layer_at + layer_bytes, frame_at + frame_bytes) > end:
         raise SegmentCorrupt("a string lies outside the header")
     return SegmentHeader(
-        cell_id=str(page[id_at : id_at + id_bytes], "utf-8"),
-        layer=str(page[layer_at : layer_at + layer_bytes], "utf-8"),
+        cell_id=_text(page[id_at : id_at + id_bytes]),
+        layer=_text(page[layer_at : layer_at + layer_bytes]),
         columns=tuple(Column(*column) for column in columns),
         rows=rows,
         box=(min_x, min_y, max_x, max_y),
@@ -403,9 +404,16 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
         source=SourceStamp(source_size, source_mtime_ns, source_ctime_ns),
         source_digest=digest,
         builder_version=builder_version,
-        frame_id=str(page[frame_at : frame_at + frame_bytes], "utf-8"),
+        frame_id=_text(page[frame_at : frame_at + frame_bytes]),
         lattice=_unpack_lattice(page),
     )
+
+
+def _text(raw: bytes | memoryview) -> str:
+    try:
+        return str(raw, "utf-8")
+    except UnicodeDecodeError as error:
+        raise SegmentCorrupt(f"{bytes(raw)!r} in the header is no UTF-8") from error
 
 
 def _unpack_lattice(page: memoryview) -> Lattice | None:
