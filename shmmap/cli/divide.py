@@ -11,8 +11,8 @@ from shmmap.cli.output import format_bytes, format_duration, print_json, print_p
 from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
-    from shmmap.dividing.divide import DividedMap
     from shmmap.dividing.frame import Translation
+    from shmmap.dividing.report import DividedMap
 
 __all__ = ["add_parser", "run"]
 
@@ -102,8 +102,9 @@ def run(args: argparse.Namespace) -> int:
 
     from shmmap.cli.work_progress import StageProgress
     from shmmap.daemon.config import parse_bytes
-    from shmmap.dividing.divide import DivideSettings, divide
+    from shmmap.dividing.divide import divide
     from shmmap.dividing.memory import peak_memory_bytes
+    from shmmap.dividing.settings import DivideSettings
 
     try:
         memory_bytes = parse_bytes(args.max_memory)

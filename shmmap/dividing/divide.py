@@ -5,141 +5,40 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit
-from shmmap.dividing.cell_order import ORDERS
 from shmmap.dividing.check import check_cells
 from shmmap.dividing.finishing import thin_out, write_ordered
-from shmmap.dividing.frame import Translation, choose_frame
+from shmmap.dividing.frame import choose_frame
 from shmmap.dividing.inputs import (
-    REPORT_NAME,
     InputFile,
     check_output_directory,
     check_output_place,
     find_inputs,
 )
 from shmmap.dividing.lattice import CellLattice
-from shmmap.dividing.memory import MIN_MEMORY_BYTES, memory_left
+from shmmap.dividing.memory import memory_left
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
 from shmmap.dividing.progress import NoProgress, Progress
+from shmmap.dividing.report import DividedMap, write_report
 from shmmap.dividing.row_layout import AXES, RowLayout, common_rows
+from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.sources import Source, open_source
 from shmmap.dividing.stream import Stream
 from shmmap.dividing.workspace import Workspace, writing_errors
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
-from shmmap.formats.pcd_header import ENCODINGS
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
 
-__all__ = ["DivideSettings", "DividedMap", "divide", "read_report"]
+__all__ = ["divide"]
 
 _CELLS: Final = "pointcloud_map.pcd"
-_FORMAT: Final = "shmmap divided map"
-_VERSION: Final = 1
-
-
-@dataclass(frozen=True, slots=True)
-class DivideSettings:
-    """How to divide.
-
-    Attributes
-    ----------
-    cell_size
-        Side of a cell, metres, at most 9 decimals.
-    origin
-        A corner of the lattice of cells, metres, in the frame of the inputs.
-    translate
-        Added to every point, or ``auto``, or ``none``; see `shmmap.dividing.frame`.
-    leaf
-        Side of the voxels whose points become one, metres; 0 keeps every point.
-    prefix
-        Start of every file name.
-    encoding
-        Of the PCD files: ``binary``, ``binary_compressed`` or ``ascii``.
-    order
-        Of the points in a cell: ``input`` or ``morton``; see `shmmap.dividing.cell_order`.
-    memory_bytes
-        Most memory that the process may take, code and libraries included.
-    common_fields
-        Keep only what all inputs have, where their fields differ.
-    force
-        Replace a divided map that is there.
-    resume
-        Go on where a killed run with the same inputs and settings stopped.
-    check
-        Read everything back and prove that each point is in its cell, before the map appears.
-    durable
-        Force the map to the disk before it appears.
-    checkpoint_s
-        How often the state to resume from is saved.
-    """
-
-    cell_size: float = 20.0
-    origin: tuple[float, float] = (0.0, 0.0)
-    translate: Translation = "auto"
-    leaf: float = 0.0
-    prefix: str = ""
-    encoding: str = "binary"
-    order: str = "input"
-    memory_bytes: int = 1 << 30
-    common_fields: bool = False
-    force: bool = False
-    resume: bool = False
-    check: bool = False
-    durable: bool = True
-    checkpoint_s: float = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class DividedMap:
-    """What was made; also kept in the map as ``shmmap_divide.json``.
-
-    Attributes
-    ----------
-    path
-        The map directory.
-    cells, points
-        Files, and points in them.
-    points_read, dropped
-        Points in the inputs, and how many were not finite.
-    origin
-        Where the map's frame lies in that of the inputs: add it to a point to come back, metres.
-    cell_size, leaf, order, encoding
-        As in `DivideSettings`.
-    fields
-        Names and dtypes of what each point has.
-    bounds
-        Least and greatest coordinates in the map; None for an empty one.
-    sources
-        The inputs: path, bytes, mtime_ns, points.
-    notes
-        What a person should know.
-    resumed_points
-        Points that an earlier, killed run had divided.
-    """
-
-    path: str
-    cells: int
-    points: int
-    points_read: int
-    dropped: int
-    origin: tuple[float, float, float]
-    cell_size: float
-    leaf: float
-    order: str
-    encoding: str
-    fields: list[tuple[str, str]]
-    bounds: list[list[float]] | None
-    sources: list[dict[str, Any]]
-    notes: list[str] = field(default_factory=list)
-    resumed_points: int = 0
 
 
 def divide(
@@ -172,7 +71,7 @@ def divide(
     settings = settings or DivideSettings()
     progress = progress or NoProgress()
     out = os.path.abspath(out_dir)
-    lattice = _check_settings(settings)
+    lattice = lattice_of(settings)
     names = [os.fspath(path) for path in inputs]
     files = find_inputs(names)
     if not files:
@@ -185,19 +84,6 @@ def divide(
         # from here on an error of the system is about writing: sources turn theirs into MapDataError
         stack.enter_context(writing_errors(out))
         return _Run(space, files, settings, lattice, progress, stack).run()
-
-
-def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return what `divide` left about a map, or None for a map made by others."""
-    try:
-        report = json.loads(Path(map_dir, REPORT_NAME).read_bytes())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise MapDataError(f"cannot be read: {error}", path=str(Path(map_dir, REPORT_NAME))) from error
-    if not isinstance(report, dict) or report.get("format") != _FORMAT or report.get("version") != _VERSION:
-        raise MapDataError("not made by this version", path=str(Path(map_dir, REPORT_NAME)))
-    return report
 
 
 class _Run:
@@ -280,11 +166,9 @@ class _Run:
         room = memory_left(settings.memory_bytes)
         stream = Stream(self._sources, RowLayout(self._row, self._frame.move))
         job = self._job()
-        if self._state is not None and self._state.get("job") == job:
-            stream.restore(self._state)
-            files.restore((ix, iy, rows) for ix, iy, rows in self._state["cells"])
-        elif self._state is not None:
+        if self._state is not None and not self._restore(self._state, job, stream, files):
             self._space.empty()
+            os.makedirs(self._space.directory("map/" + _CELLS), exist_ok=True)
             os.makedirs(files.directory, exist_ok=True)
         self.resumed = stream.position
         points = block_points_for(room, self._row.itemsize, threads)
@@ -303,6 +187,18 @@ class _Run:
                 every_s=settings.checkpoint_s,
             )
         return stream
+
+    def _restore(self, state: dict[str, Any], job: dict[str, Any], stream: Stream, files: CellFiles) -> bool:
+        """Return to ``state``; False if it is another job's, or the files are not those it speaks of."""
+        if state.get("job") != job:
+            return False
+        try:
+            files.restore((ix, iy, rows) for ix, iy, rows in state["cells"])
+            stream.restore(state)
+        except OSError:
+            files.counts.clear()
+            return False
+        return True
 
     def _finish(self, stage: CellFiles, final: str) -> CellFiles:
         settings = self._settings
@@ -402,32 +298,7 @@ class _Run:
         entries = ((self._name(*where), self._lattice.corner_text(*where)) for where in cells.counts)
         text = metadata_text(self._lattice.size_text, entries)
         Path(self._space.content, METADATA_NAME).write_text(text, encoding="utf-8")
-        content = {"format": _FORMAT, "version": _VERSION, **asdict(report)}
-        Path(self._space.content, REPORT_NAME).write_text(
-            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-        )
-
-
-def _check_settings(settings: DivideSettings) -> CellLattice:
-    lattice = CellLattice.of(settings.cell_size, settings.origin)
-    if settings.leaf:
-        CellLattice.of(settings.leaf, settings.origin)
-        if settings.leaf > settings.cell_size:
-            raise BadRequest(f"voxels of {settings.leaf} m are larger than cells of {settings.cell_size} m")
-    if "/" in settings.prefix or not settings.prefix.isprintable():
-        raise BadRequest(f"{settings.prefix!r} cannot start a file name")
-    choices = (("encoding", settings.encoding, ENCODINGS), ("order", settings.order, ORDERS))
-    for name, value, allowed in choices:
-        if value not in allowed:
-            raise BadRequest(f"{name} {value!r} is not one of {', '.join(allowed)}")
-    if isinstance(settings.translate, tuple) and not all(map(math.isfinite, settings.translate)):
-        raise BadRequest("a translation is three numbers of metres")
-    if settings.memory_bytes < MIN_MEMORY_BYTES:
-        raise BadRequest(
-            f"{settings.memory_bytes >> 20} MiB of memory are too little",
-            hint=f"at least {MIN_MEMORY_BYTES >> 20}M: code and libraries are counted",
-        )
-    return lattice
+        write_report(self._space.content, report)
 
 
 def _empty_directory(path: str) -> None:

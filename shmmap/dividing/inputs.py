@@ -7,13 +7,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from shmmap.dividing.report import REPORT_NAME
 from shmmap.errors import BadRequest, MapMissing
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.origin.metadata_text import METADATA_NAME
 
-__all__ = ["REPORT_NAME", "InputFile", "check_output_directory", "check_output_place", "find_inputs"]
+__all__ = ["InputFile", "check_output_directory", "check_output_place", "find_inputs"]
 
-REPORT_NAME = "shmmap_divide.json"
 _MAP_PARTS = frozenset({"pointcloud_map.pcd", METADATA_NAME, REPORT_NAME})
 
 

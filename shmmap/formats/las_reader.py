@@ -28,7 +28,7 @@ LAS_SUFFIXES: Final = (".las", ".laz")  # COPC files end in .copc.laz
 
 _SIGNATURE: Final = b"LASF"
 _SHORTEST_HEADER_BYTES: Final = 227  # LAS 1.0 to 1.2
-_LEGACY_COUNT: Final = struct.Struct("<IBHI")  # at 96: offset to points, format, record bytes, points
+_LEGACY_COUNT: Final = struct.Struct("<I4xBHI")  # at 96: offset to points, format, record bytes, points
 _LONG_COUNT_AT: Final = 247  # uint64, from LAS 1.4 on
 _LAZ_BIT: Final = 0x80
 
@@ -102,6 +102,8 @@ class LasReader:
             ``bad_las`` or ``truncated`` if the data contradicts the header.
         """
         at = start
+        if at >= self.points:
+            return
         try:
             self._reader.seek(start)
             while at < self.points:

@@ -13,7 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmmap.dividing.divide import DividedMap, DivideSettings, divide, read_report
+from shmmap.dividing.divide import divide
+from shmmap.dividing.report import DividedMap, read_report
+from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
 from shmmap.formats import cloud
 from shmmap.formats.pcd_writer import write_pcd

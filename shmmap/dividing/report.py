@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept beside a divided map: where its frame lies, and what it was made of."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from shmmap.errors import MapDataError
+
+__all__ = ["REPORT_NAME", "DividedMap", "read_report", "write_report"]
+
+REPORT_NAME: Final = "shmmap_divide.json"
+_FORMAT: Final = "shmmap divided map"
+_VERSION: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class DividedMap:
+    """What was made; also kept in the map as ``shmmap_divide.json``.
+
+    Attributes
+    ----------
+    path
+        The map directory.
+    cells, points
+        Files, and points in them.
+    points_read, dropped
+        Points in the inputs, and how many were not finite.
+    origin
+        Where the map's frame lies in that of the inputs: add it to a point to come back, metres.
+    cell_size, leaf, order, encoding
+        As in `DivideSettings`.
+    fields
+        Names and dtypes of what each point has.
+    bounds
+        Least and greatest coordinates in the map; None for an empty one.
+    sources
+        The inputs: path, bytes, mtime_ns, points.
+    notes
+        What a person should know.
+    resumed_points
+        Points that an earlier, killed run had divided.
+    """
+
+    path: str
+    cells: int
+    points: int
+    points_read: int
+    dropped: int
+    origin: tuple[float, float, float]
+    cell_size: float
+    leaf: float
+    order: str
+    encoding: str
+    fields: list[tuple[str, str]]
+    bounds: list[list[float]] | None
+    sources: list[dict[str, Any]]
+    notes: list[str] = field(default_factory=list)
+    resumed_points: int = 0
+
+
+def write_report(directory: str | os.PathLike[str], report: DividedMap) -> None:
+    """Write ``report`` into a map's directory."""
+    content = {"format": _FORMAT, "version": _VERSION, **asdict(report)}
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    Path(directory, REPORT_NAME).write_text(text, encoding="utf-8")
+
+
+def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Return what `divide` left about a map, or None for a map made by others."""
+    try:
+        report = json.loads(Path(map_dir, REPORT_NAME).read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise MapDataError(f"cannot be read: {error}", path=str(Path(map_dir, REPORT_NAME))) from error
+    if not isinstance(report, dict) or report.get("format") != _FORMAT or report.get("version") != _VERSION:
+        raise MapDataError("not made by this version", path=str(Path(map_dir, REPORT_NAME)))
+    return report

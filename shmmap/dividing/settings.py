@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a map is to be divided."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from shmmap.dividing.cell_order import ORDERS
+from shmmap.dividing.frame import Translation
+from shmmap.dividing.lattice import CellLattice
+from shmmap.dividing.memory import MIN_MEMORY_BYTES
+from shmmap.errors import BadRequest
+from shmmap.formats.pcd_header import ENCODINGS
+
+__all__ = ["DivideSettings", "lattice_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class DivideSettings:
+    """How to divide.
+
+    Attributes
+    ----------
+    cell_size
+        Side of a cell, metres, at most 9 decimals.
+    origin
+        A corner of the lattice of cells, metres, in the frame of the inputs.
+    translate
+        Added to every point, or ``auto``, or ``none``; see `shmmap.dividing.frame`.
+    leaf
+        Side of the voxels whose points become one, metres; 0 keeps every point.
+    prefix
+        Start of every file name.
+    encoding
+        Of the PCD files: ``binary``, ``binary_compressed`` or ``ascii``.
+    order
+        Of the points in a cell: ``input`` or ``morton``; see `shmmap.dividing.cell_order`.
+    memory_bytes
+        Most memory that the process may take, code and libraries included.
+    common_fields
+        Keep only what all inputs have, where their fields differ.
+    force
+        Replace a divided map that is there.
+    resume
+        Go on where a killed run with the same inputs and settings stopped.
+    check
+        Read everything back and prove that each point is in its cell, before the map appears.
+    durable
+        Force the map to the disk before it appears.
+    checkpoint_s
+        How often the state to resume from is saved.
+    """
+
+    cell_size: float = 20.0
+    origin: tuple[float, float] = (0.0, 0.0)
+    translate: Translation = "auto"
+    leaf: float = 0.0
+    prefix: str = ""
+    encoding: str = "binary"
+    order: str = "input"
+    memory_bytes: int = 1 << 30
+    common_fields: bool = False
+    force: bool = False
+    resume: bool = False
+    check: bool = False
+    durable: bool = True
+    checkpoint_s: float = 5.0
+
+
+def lattice_of(settings: DivideSettings) -> CellLattice:
+    """Check the settings and return the lattice of cells, in the frame of the inputs.
+
+    Raises
+    ------
+    BadRequest
+        A setting makes no sense.
+    """
+    lattice = CellLattice.of(settings.cell_size, settings.origin)
+    if settings.leaf:
+        CellLattice.of(settings.leaf, settings.origin)
+        if settings.leaf > settings.cell_size:
+            raise BadRequest(f"voxels of {settings.leaf} m are larger than cells of {settings.cell_size} m")
+    if "/" in settings.prefix or not settings.prefix.isprintable():
+        raise BadRequest(f"{settings.prefix!r} cannot start a file name")
+    choices = (("encoding", settings.encoding, ENCODINGS), ("order", settings.order, ORDERS))
+    for name, value, allowed in choices:
+        if value not in allowed:
+            raise BadRequest(f"{name} {value!r} is not one of {', '.join(allowed)}")
+    if isinstance(settings.translate, tuple) and not all(map(math.isfinite, settings.translate)):
+        raise BadRequest("a translation is three numbers of metres")
+    if settings.memory_bytes < MIN_MEMORY_BYTES:
+        raise BadRequest(
+            f"{settings.memory_bytes >> 20} MiB of memory are too little",
+            hint=f"at least {MIN_MEMORY_BYTES >> 20}M: code and libraries are counted",
+        )
+    return lattice

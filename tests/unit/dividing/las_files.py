@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LAS and LAZ files made by laspy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+
+
+def write_las(
+    path: Path,
+    columns: dict[str, NDArray[Any]],
+    *,
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    point_format: int = 6,
+) -> laspy.LasData:
+    """Write x, y, z at a millimetre and intensity; other columns become extra dimensions."""
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format >= 6 else "1.2")
+    header.scales, header.offsets = np.full(3, 0.001), np.array(offset)
+    extra = [name for name in columns if name not in ("x", "y", "z", "intensity")]
+    header.add_extra_dims([laspy.ExtraBytesParams(name, columns[name].dtype) for name in extra])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (columns[axis].astype(np.float64) for axis in "xyz")
+    las.intensity = columns["intensity"].astype(np.uint16)
+    for name in extra:
+        las[name] = columns[name]
+    las.write(str(path))
+    return las

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Dividing formats other than PCD."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+
+from shmmap.dividing.divide import divide
+from shmmap.dividing.report import DividedMap
+from shmmap.dividing.settings import DivideSettings
+from shmmap.errors import MapDataError
+from shmmap.formats.cloud import describe, read_cloud
+from shmmap.formats.las_reader import LasReader
+from tests.support.clouds import map_rows, xyzircaedt
+from tests.unit.dividing.las_files import write_las
+
+
+def run(path: Path, out: Path, **options: Any) -> DividedMap:
+    return divide([path], out, DivideSettings(**{"durable": False, "check": True, **options}))
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_las_keeps_every_dimension(tmp_path: Path, suffix: str, point_format: int) -> None:
+    columns = xyzircaedt(2500)
+    offset = (512000.0, 5403000.0, 300.0)
+    for axis, shift in zip("xyz", offset, strict=True):
+        columns[axis] = columns[axis].astype(np.float64) + shift
+    path = tmp_path / f"in.{suffix}"
+    las = write_las(path, columns, offset=offset, point_format=point_format)
+    made = run(path, tmp_path / "map")
+    names = [name for name, _ in made.fields]
+    assert names[:4] == ["x", "y", "z", "intensity"]
+    assert {"classification", "return_number", "gps_time", *list(columns)[4:]} <= set(names)
+    types = dict(made.fields)
+    assert (types["x"], types["channel"], types["azimuth"], types["gps_time"]) == ("<f4", "<u2", "<f4", "<f8")
+    by_time = {stamp: i for i, stamp in enumerate(columns["time_stamp"].tolist())}
+    seen = 0
+    for rows in map_rows(tmp_path / "map").values():
+        for row in rows:
+            point = dict(zip(names, row, strict=True))
+            i = by_time[point["time_stamp"]]
+            for axis, shift in zip("xyz", made.origin, strict=True):
+                assert abs(point[axis] + shift - float(np.asarray(getattr(las, axis))[i])) <= 0.0005
+            for name in names[3:]:
+                assert point[name] == np.asarray(las[name])[i]
+            seen += 1
+    assert seen == 2500
+
+
+def test_las_in_blocks_from_anywhere(tmp_path: Path) -> None:
+    columns = xyzircaedt(1000)
+    write_las(tmp_path / "in.laz", columns)
+    with LasReader(tmp_path / "in.laz") as reader:
+        assert (reader.points, reader.compressed, reader.version) == (1000, True, "1.4")
+        for start in (0, 1, 437, 999, 1000):
+            stamps = [block["time_stamp"] for block in reader.blocks(300, start)]
+            assert np.concatenate([*stamps, []]).tolist() == list(range(start, 1000))
+
+
+def test_a_las_cloud_in_memory(tmp_path: Path) -> None:
+    columns = xyzircaedt(300)
+    write_las(tmp_path / "in.las", columns)
+    cloud = read_cloud(tmp_path / "in.las")
+    assert cloud.xyz.dtype == np.float64
+    assert np.abs(cloud.xyz[:, 0] - columns["x"]).max() <= 0.00051
+    assert cloud.columns["channel"].tolist() == columns["channel"].tolist()
+    found = describe(tmp_path / "in.las")
+    assert (found.format, found.points) == ("las", 300)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9, 0.999])
+def test_a_las_file_cut_short_is_refused(tmp_path: Path, suffix: str, keep: float) -> None:
+    path = tmp_path / f"in.{suffix}"
+    write_las(path, xyzircaedt(60_000))
+    os.truncate(path, int(path.stat().st_size * keep))
+    before = os.listdir(tmp_path)
+    with pytest.raises(MapDataError):
+        run(path, tmp_path / "map")
+    assert os.listdir(tmp_path) == before
+
+
+def test_a_las_header_that_lies_about_bounds(tmp_path: Path) -> None:
+    path = tmp_path / "in.las"
+    las = write_las(path, xyzircaedt(100))
+    data = bytearray(path.read_bytes())
+    # max_x, min_x, max_y, ... stand at byte 179; the points are moved by their offset at 155
+    data[155:163] = np.float64(400_000.0).tobytes()
+    path.write_bytes(bytes(data))
+    del las
+    with pytest.raises(MapDataError) as caught:
+        run(path, tmp_path / "map")
+    assert caught.value.cause == "bad_bounds"
+    made = run(path, tmp_path / "map", translate=(-400_000.0, 0.0, 0.0))
+    assert made.points == 100
+
+
+def test_ply_and_xyz_through_open3d(tmp_path: Path) -> None:
+    o3d = pytest.importorskip("open3d")
+    columns = xyzircaedt(800)
+    xyz = np.column_stack([columns[axis] for axis in "xyz"])
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(xyz))
+    cloud.point["intensity"] = o3d.core.Tensor.from_numpy(columns["intensity"].astype(np.float32)[:, None])
+    assert o3d.t.io.write_point_cloud(str(tmp_path / "in.ply"), cloud)
+    np.savetxt(tmp_path / "in.xyz", xyz.astype(np.float64), fmt="%.9g")
+    for name in ("in.ply", "in.xyz"):
+        made = run(tmp_path / name, tmp_path / f"map-{name}")
+        rows = [row for cell in map_rows(tmp_path / f"map-{name}").values() for row in cell]
+        assert sorted(row[:3] for row in rows) == sorted(map(tuple, xyz.tolist()))
+        assert dict(made.fields)["x"] == "<f4"
+    assert ("intensity", "<f4") in run(tmp_path / "in.ply", tmp_path / "again").fields
+
+
+def test_real_las_laz_and_copc(data_dir: Path, tmp_path: Path) -> None:
+    for name in ("autzen_trim.las", "autzen_trim.laz", "lone-star.copc.laz"):
+        path = data_dir / "las_copc" / name
+        made = run(path, tmp_path / name)
+        las = laspy.read(str(path))
+        assert made.points == made.points_read == len(las)
+        names = [field for field, _ in made.fields]
+        rows = [row for cell in map_rows(tmp_path / name).values() for row in cell]
+        for i in (names.index("intensity"), names.index("gps_time")):
+            assert sorted(row[i] for row in rows) == sorted(np.asarray(las[names[i]]).tolist())
+        for axis in range(3):
+            found = np.sort([row[axis] for row in rows]) + made.origin[axis]
+            assert np.abs(found - np.sort(np.asarray(las.xyz[:, axis]))).max() <= 0.0005
+    one, other = (map_rows(tmp_path / f"autzen_trim.{suffix}") for suffix in ("las", "laz"))
+    assert one == other

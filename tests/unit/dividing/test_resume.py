@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run that was interrupted goes on where it was, and the map is the same to the byte."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shmmap.dividing.divide import divide
+from shmmap.dividing.progress import NoProgress
+from shmmap.dividing.report import DividedMap
+from shmmap.dividing.settings import DivideSettings
+from shmmap.dividing.workspace import Workspace
+from shmmap.errors import InstanceBusy
+from shmmap.formats.pcd_writer import write_pcd
+from tests.support.clouds import Columns, expected_rows, map_rows, rows_of, xyzircaedt
+from tests.unit.dividing.las_files import write_las
+
+
+class Interrupt(NoProgress):
+    """Interrupts a run when ``points`` have been read, or when a stage begins."""
+
+    def __init__(self, points: int, stage: str = "") -> None:
+        self._left = points
+        self._stage = stage
+
+    def stage(self, name: str, total: int) -> None:
+        del total
+        if name == self._stage:
+            raise KeyboardInterrupt
+
+    def advance(self, points: int) -> None:
+        self._left -= points
+        if self._left < 0 and not self._stage:
+            raise KeyboardInterrupt
+
+
+def settings(**options: Any) -> DivideSettings:
+    return DivideSettings(**{"durable": False, "checkpoint_s": 0.0, **options})
+
+
+def files_of(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (out / "pointcloud_map.pcd").iterdir()}
+
+
+def interrupted(files: list[Path], out: Path, points: int, stage: str = "", **options: Any) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        divide(files, out, settings(**options), progress=Interrupt(points, stage))
+    assert not out.exists()
+
+
+def resumed(files: list[Path], out: Path, **options: Any) -> DividedMap:
+    made = divide(files, out, settings(resume=True, **options))
+    assert not [name for name in os.listdir(out.parent) if name.startswith(".")]
+    return made
+
+
+def inputs(folder: Path, kind: str) -> tuple[list[Path], Columns]:
+    """Two files of a kind, and all their points."""
+    parts = [xyzircaedt(3000, seed=seed) for seed in (1, 2)]
+    parts[1]["time_stamp"] += np.uint32(3000)
+    files = []
+    for i, part in enumerate(parts):
+        path = folder / f"in{i}.{'laz' if kind == 'laz' else 'pcd'}"
+        if kind == "laz":
+            write_las(path, part)
+        else:
+            write_pcd(path, part, encoding=kind)
+        files.append(path)
+    return files, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+@pytest.mark.parametrize("kind", ["binary", "binary_compressed", "ascii", "laz"])
+@pytest.mark.parametrize("points", [1600, 4200])
+def test_a_resumed_map_is_the_same(tmp_path: Path, kind: str, points: int) -> None:
+    files, columns = inputs(tmp_path, kind)
+    whole = divide(files, tmp_path / "whole", settings())
+    interrupted(files, tmp_path / "map", points)
+    made = resumed(files, tmp_path / "map", check=True)
+    assert 0 < made.resumed_points <= points
+    assert files_of(tmp_path / "map") == files_of(tmp_path / "whole")
+    assert (made.points, made.dropped, made.bounds) == (whole.points, whole.dropped, whole.bounds)
+    if kind != "laz":
+        assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+
+
+@pytest.mark.parametrize(
+    ("stage", "options"),
+    [
+        ("thinning out", {"leaf": 0.5}),
+        ("sorting", {"leaf": 0.5, "order": "morton"}),
+        ("encoding", {"encoding": "binary_compressed"}),
+        ("checking", {"leaf": 0.5, "check": True}),
+        ("checking", {"check": True}),
+    ],
+)
+def test_a_run_that_was_nearly_done(tmp_path: Path, stage: str, options: dict[str, Any]) -> None:
+    files, _ = inputs(tmp_path, "binary")
+    divide(files, tmp_path / "whole", settings(**options))
+    interrupted(files, tmp_path / "map", 0, stage, **options)
+    made = resumed(files, tmp_path / "map", **options)
+    assert made.resumed_points > 0
+    assert files_of(tmp_path / "map") == files_of(tmp_path / "whole")
+
+
+def test_something_else_starts_anew(tmp_path: Path) -> None:
+    files, columns = inputs(tmp_path, "binary")
+    interrupted(files, tmp_path / "map", 4200)
+    made = divide(files, tmp_path / "map", settings(resume=True, cell_size=15.0))
+    assert made.resumed_points == 0
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns), "15")
+
+
+def test_a_changed_input_starts_anew(tmp_path: Path) -> None:
+    files, columns = inputs(tmp_path, "binary")
+    interrupted(files, tmp_path / "map", 4200)
+    columns = {name: column[::2] for name, column in columns.items()}
+    write_pcd(files[0], columns)
+    made = divide(files[:1], tmp_path / "map", settings(resume=True))
+    assert made.resumed_points == 0
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+
+
+@pytest.mark.parametrize("damage", ["short", "gone", "state", "boot"])
+def test_a_state_that_is_no_use_is_no_danger(tmp_path: Path, damage: str) -> None:
+    files, columns = inputs(tmp_path, "binary")
+    interrupted(files, tmp_path / "map", 4200)
+    space = tmp_path / ".map.dividing"
+    cell = max((space / "map" / "pointcloud_map.pcd").iterdir(), key=lambda path: path.stat().st_size)
+    if damage == "short":
+        os.truncate(cell, 100)
+    elif damage == "gone":
+        cell.unlink()
+    elif damage == "state":
+        (space / "state.json").write_text("{")
+    else:
+        text = (space / "state.json").read_text()
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        (space / "state.json").write_text(text.replace(boot, "another"))
+    made = resumed(files, tmp_path / "map")
+    assert made.resumed_points == 0
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+
+
+def test_without_resume_leftovers_are_swept(tmp_path: Path) -> None:
+    files, columns = inputs(tmp_path, "binary")
+    interrupted(files, tmp_path / "map", 4200)
+    made = divide(files, tmp_path / "map", settings())
+    assert made.resumed_points == 0
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+    assert sorted(os.listdir(tmp_path)) == ["in0.pcd", "in1.pcd", "map"]
+
+
+def test_two_runs_do_not_mix(tmp_path: Path) -> None:
+    files, _ = inputs(tmp_path, "binary")
+    with Workspace(str(tmp_path / "map")), pytest.raises(InstanceBusy):
+        divide(files, tmp_path / "map", settings())
+    assert sorted(os.listdir(tmp_path)) == ["in0.pcd", "in1.pcd"]
+    divide(files, tmp_path / "map", settings())
