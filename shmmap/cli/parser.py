@@ -20,6 +20,7 @@ from shmmap.cli import (
     health,
     inspect,
     ls,
+    merge,
     pin,
     query,
     reload,
@@ -37,6 +38,7 @@ __all__ = ["VERBS", "build_parser", "join_negative_values", "verb_first"]
 VERBS: Final = (
     demo,
     divide,
+    merge,
     serve,
     status,
     ls,

@@ -94,6 +94,7 @@ def source_bounds(sources: Sequence[Source]) -> Bound3:
         rows = np.empty(_SCAN_POINTS, source.row)
         while count := source.read(rows):
             bounds.add(np.column_stack([rows[axis][:count] for axis in "xyz"]))
+        source.close()
     return bounds.result()
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.dividing.row_layout import AXES, RowLayout
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.causes import refusal
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
@@ -89,11 +89,11 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
     """
     suffix = os.path.splitext(path)[1].lower()
     if suffix == ".pcd":
-        reader = PcdReader(path, keep_non_finite=True, block_points=_BLOCK_POINTS)
-        floats = all(reader.record[axis].kind == "f" for axis in AXES)
-        if reader.header.encoding == "binary" and floats:
-            return _BinaryPcd(reader)
-        return _StreamedPcd(reader, memory_bytes, scratch_dir)
+        with _open_pcd(path) as reader:
+            floats = all(reader.record[axis].kind == "f" for axis in AXES)
+            if reader.header.encoding == "binary" and floats:
+                return _BinaryPcd(reader)
+            return _StreamedPcd(reader, memory_bytes, scratch_dir)
     if suffix in LAS_SUFFIXES:
         return _Las(path)
     if suffix not in CLOUD_SUFFIXES:
@@ -106,8 +106,20 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
     return _Whole(path, suffix, memory_bytes)
 
 
+def _open_pcd(path: str) -> PcdReader:
+    return PcdReader(path, keep_non_finite=True, block_points=_BLOCK_POINTS)
+
+
+def _changed(path: str) -> MapDataError:
+    return refusal("changed", "the file changed since it was looked at", path=path)
+
+
 class _BinaryPcd:
-    """Binary PCD: records straight from the file."""
+    """Binary PCD: records straight from the file.
+
+    Like the other sources it has the file open only while it is read: a map has more cells than a
+    process may have open files.
+    """
 
     claimed_bounds: Bound3 | None = None
 
@@ -115,7 +127,7 @@ class _BinaryPcd:
         self.path = reader.path
         self.points = reader.header.points
         self.warnings = reader.warnings
-        self._reader = reader
+        self._reader: PcdReader | None = None
         self._record = reader.record
         names = self._record.names or ()
         axis = reader.columns[0].dtype
@@ -126,6 +138,10 @@ class _BinaryPcd:
         self._staged = np.empty(0, self._record)
 
     def begin(self, layout: RowLayout, start: int) -> None:
+        self.close()
+        self._reader = _open_pcd(self.path)
+        if self._reader.header.points != self.points or self._reader.record != self._record:
+            raise _changed(self.path)
         self._layout, self._at = layout, start
         self._direct = self.row == self._record and layout.takes_as_is(self.row)
         if not self._direct:
@@ -145,6 +161,8 @@ class _BinaryPcd:
         return count
 
     def _fill(self, memory: NDArray[np.uint8], ahead: int = 0) -> None:
+        if self._reader is None:
+            raise ValueError("read before begin")
         view = memory.data
         offset = self._reader.header.data_offset + (self._at + ahead) * self._record.itemsize
         done = 0
@@ -163,7 +181,9 @@ class _BinaryPcd:
             done += got
 
     def close(self) -> None:
-        self._reader.close()
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
 
 
 class _Stream:
@@ -185,6 +205,7 @@ class _Stream:
         raise NotImplementedError
 
     def begin(self, layout: RowLayout, start: int) -> None:
+        self.close()
         self._layout = layout
         self._iterator = self._blocks(start)
         self._used = self._length = 0
@@ -209,6 +230,9 @@ class _Stream:
         return at
 
     def close(self) -> None:
+        close = getattr(self._iterator, "close", None)
+        if close is not None:
+            close()  # a generator that holds a file open
         self._iterator = iter(())
         self._block = {}
 
@@ -218,7 +242,6 @@ class _StreamedPcd(_Stream):
 
     def __init__(self, reader: PcdReader, memory_bytes: int, scratch_dir: str) -> None:
         super().__init__(reader.path, reader.header.points, reader.columns)
-        self._reader = reader
         self._scratch_dir = scratch_dir
         header = reader.header
         expanded = header.points * header.point_bytes
@@ -227,35 +250,33 @@ class _StreamedPcd(_Stream):
         self.warnings = reader.warnings
 
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
-        if self._expand:
-            yield from expanded_blocks(self._reader, self._scratch_dir, _BLOCK_POINTS, start)
-            return
-        names = [spec.name for spec in self._reader.columns]
-        for block in self._reader.blocks():
-            skipped = min(start, len(block[0]))
-            start -= skipped
-            if skipped < len(block[0]):
-                yield dict(zip(names, (column[skipped:] for column in block), strict=True))
-
-    def close(self) -> None:
-        super().close()
-        self._reader.close()
+        with _open_pcd(self.path) as reader:
+            if reader.header.points != self.points or _row_of(reader.columns) != self.row:
+                raise _changed(self.path)
+            if self._expand:
+                yield from expanded_blocks(reader, self._scratch_dir, _BLOCK_POINTS, start)
+                return
+            names = [spec.name for spec in reader.columns]
+            for block in reader.blocks():
+                skipped = min(start, len(block[0]))
+                start -= skipped
+                if skipped < len(block[0]):
+                    yield dict(zip(names, (column[skipped:] for column in block), strict=True))
 
 
 class _Las(_Stream):
     """LAS, LAZ and COPC."""
 
     def __init__(self, path: str) -> None:
-        self._reader = LasReader(path)
-        super().__init__(path, self._reader.points, self._reader.columns)
-        self.claimed_bounds = self._reader.bounds
+        with LasReader(path) as reader:
+            super().__init__(path, reader.points, reader.columns)
+            self.claimed_bounds = reader.bounds
 
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
-        return self._reader.blocks(_LAS_BLOCK_POINTS, start)
-
-    def close(self) -> None:
-        super().close()
-        self._reader.close()
+        with LasReader(self.path) as reader:
+            if reader.points != self.points or _row_of(reader.columns) != self.row:
+                raise _changed(self.path)
+            yield from reader.blocks(_LAS_BLOCK_POINTS, start)
 
 
 class _Whole(_Stream):

@@ -88,6 +88,7 @@ class Stream:
                 self.position += count
                 left -= count
                 progress.advance(count)
+            source.close()
         partition.drain()
         self._take(partition, before)
 

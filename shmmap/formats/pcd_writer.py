@@ -17,7 +17,7 @@ from shmmap.formats import lzf
 from shmmap.formats.pcd_fields import PADDING
 from shmmap.formats.pcd_header import ENCODINGS, IDENTITY_VIEWPOINT
 
-__all__ = ["pcd_header", "write_pcd"]
+__all__ = ["pcd_header", "pcd_rows", "write_pcd"]
 
 _BLOCK_POINTS: Final = 1 << 16
 _LZF_LIMIT_BYTES: Final = (1 << 31) - 1  # liblzf's int sizes; the file's own size words are uint32
@@ -140,6 +140,13 @@ def pcd_header(
     if header_bytes and len(first) + len(text) > header_bytes:
         raise BadRequest(f"the header needs {len(first) + len(text)} bytes, more than {header_bytes}")
     return first + text
+
+
+def pcd_rows(rows: NDArray[np.void], encoding: str) -> bytes | memoryview:
+    """Return packed ``rows`` (N,), one field per PCD field, as ``binary`` or ``ascii`` data."""
+    if encoding == "binary":
+        return rows.view(np.uint8).data
+    return b"".join(_ascii([(name, rows[name]) for name in rows.dtype.names or ()], len(rows)))
 
 
 def _count(array: NDArray[Any]) -> int:

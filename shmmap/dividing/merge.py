@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Divided maps and clouds into one PCD file: the inverse of dividing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import IO, Any, Final
+
+import numpy as np
+
+from shmmap.dividing.inputs import check_output_place, find_inputs
+from shmmap.dividing.memory import memory_left
+from shmmap.dividing.progress import NoProgress, Progress
+from shmmap.dividing.report import read_report
+from shmmap.dividing.row_layout import AXES, NO_MOVE, RowLayout, common_rows
+from shmmap.dividing.sources import Source, open_source
+from shmmap.dividing.workspace import flush_directory, writing_errors
+from shmmap.errors import BadRequest, CannotWrite
+from shmmap.formats.pcd_writer import pcd_header, pcd_rows
+
+__all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
+
+MERGED_ENCODINGS: Final = ("binary", "ascii")
+"""Encodings that can be written without holding all points."""
+
+_BLOCK_BYTES: Final = 16 << 20
+_Move = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class MergedCloud:
+    """What was made.
+
+    Attributes
+    ----------
+    path
+        The file.
+    points, bytes
+        Its size.
+    files
+        How many files it was made of.
+    fields
+        Names and dtypes of what each point has.
+    origin
+        What was added to the points of divided maps, one entry per map that had an origin of its own.
+    """
+
+    path: str
+    points: int
+    bytes: int
+    files: int
+    fields: list[tuple[str, str]]
+    origin: dict[str, list[float]] = field(default_factory=dict)
+
+
+def merge(
+    inputs: Sequence[str | os.PathLike[str]],
+    out_file: str | os.PathLike[str],
+    *,
+    encoding: str = "binary",
+    keep_frame: bool = False,
+    common_fields: bool = False,
+    force: bool = False,
+    memory_bytes: int = 1 << 30,
+    progress: Progress | None = None,
+) -> MergedCloud:
+    """Write all points of ``inputs`` to one PCD file, which appears complete or not at all.
+
+    Points of a map that `divide` moved go back to where they were, in float64, unless ``keep_frame``;
+    everything else keeps its bits.  Files come in the order of their paths, points in that of the files.
+
+    Parameters
+    ----------
+    inputs
+        Divided maps, directories of clouds, and clouds of any format that is read.
+    out_file
+        A name that ends in .pcd; ``force`` replaces a file that is there.
+    encoding
+        One of `MERGED_ENCODINGS`.
+    common_fields
+        Keep only what all inputs have, where their fields differ.
+
+    Raises
+    ------
+    BadRequest, MapMissing, MapDataError, CannotWrite
+        As `divide`.
+    """
+    progress = progress or NoProgress()
+    out = os.path.abspath(out_file)
+    if not out.lower().endswith(".pcd"):
+        raise BadRequest(f"{out} does not end in .pcd", hint="the merged cloud is a PCD file")
+    if encoding not in MERGED_ENCODINGS:
+        raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(MERGED_ENCODINGS)}")
+    if os.path.isdir(out) or (os.path.lexists(out) and not force):
+        raise BadRequest(f"{out} exists already", hint="--force replaces a file")
+    with contextlib.ExitStack() as stack:
+        sources: list[Source] = []
+        moves: list[_Move] = []
+        origins: dict[str, list[float]] = {}
+        for path in [os.fspath(path) for path in inputs]:
+            report = read_report(path) if os.path.isdir(path) and not keep_frame else None
+            x, y, z = report["origin"] if report is not None else NO_MOVE
+            if (x, y, z) != NO_MOVE:
+                origins[os.path.abspath(path)] = [x, y, z]
+            files = find_inputs([path])
+            check_output_place([path], files, out)
+            for file in files:
+                source = open_source(
+                    file.path, memory_bytes=memory_left(memory_bytes) // 2, scratch_dir=os.path.dirname(out)
+                )
+                stack.callback(source.close)
+                sources.append(source)
+                moves.append((x, y, z))
+        if not sources:
+            raise BadRequest("nothing to merge")
+        row = common_rows(
+            [source.row for source in sources], [source.path for source in sources], common_only=common_fields
+        )
+        if origins:
+            row = np.dtype(
+                [(name, np.dtype("<f8") if name in AXES else row[name]) for name in row.names or ()]
+            )
+        points = sum(source.points for source in sources)
+        header = pcd_header(_fields(row), points, encoding)
+        stack.enter_context(writing_errors(out))
+        _check_space(out, len(header) + points * row.itemsize)
+        progress.stage("merging", points)
+        with _appearing(out) as target:
+            target.write(header)
+            for source, move in zip(sources, moves, strict=True):
+                _append(target, source, RowLayout(row, move), encoding, progress)
+        progress.done(points)
+    return MergedCloud(
+        path=out,
+        points=points,
+        bytes=os.stat(out).st_size,
+        files=len(sources),
+        fields=[(name, row[name].str) for name in row.names or ()],
+        origin=origins,
+    )
+
+
+def _append(file: IO[bytes], source: Source, layout: RowLayout, encoding: str, progress: Progress) -> None:
+    rows = np.empty(max(1, min(source.points, _BLOCK_BYTES // layout.row.itemsize)), layout.row)
+    source.begin(layout, 0)
+    left = source.points
+    while left:
+        count = source.read(rows[:left])
+        file.write(pcd_rows(rows[:count], encoding))
+        left -= count
+        progress.advance(count)
+    source.close()  # a map has more cells than a process may have open files
+
+
+@contextlib.contextmanager
+def _appearing(path: str) -> Iterator[IO[bytes]]:
+    """A file that is there under its name only when it is complete and on the disk."""
+    directory, name = os.path.split(path)
+    interim = os.path.join(directory, f".{name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(interim, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(interim, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(interim)
+        raise
+    flush_directory(directory)
+
+
+def _check_space(out: str, needed: int) -> None:
+    have = os.statvfs(os.path.dirname(out))
+    free = have.f_bavail * have.f_frsize
+    if needed > free:
+        raise CannotWrite(
+            f"{out} needs about {needed >> 20} MiB, {free >> 20} MiB are free",
+            hint="free some space, or choose another disk",
+        )
+
+
+def _fields(row: np.dtype[np.void]) -> list[tuple[str, np.dtype[Any], int]]:
+    return [(name, row[name].base, int(np.prod(row[name].shape, dtype=int))) for name in row.names or ()]
