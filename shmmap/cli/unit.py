@@ -102,14 +102,14 @@ def _let_systemd_know(user: bool, planned: Sequence[PlannedFile]) -> None:
     """Make the account and the directories, and let the manager read its units again."""
     import subprocess
 
-    of_directory = {one.path.parent.name: str(one.path) for one in planned}
-    commands = [
-        ["systemd-sysusers", of_directory["sysusers.d"]],
-        ["systemd-tmpfiles", "--create", of_directory["tmpfiles.d"]],
-        ["systemctl", "daemon-reload"],
-    ]
-    if user:
-        commands = [["systemctl", "--user", "daemon-reload"]]
+    commands = [["systemctl", "--user", "daemon-reload"]]
+    if not user:
+        of_directory = {one.path.parent.name: str(one.path) for one in planned}
+        commands = [
+            ["systemd-sysusers", of_directory["sysusers.d"]],
+            ["systemd-tmpfiles", "--create", of_directory["tmpfiles.d"]],
+            ["systemctl", "daemon-reload"],
+        ]
     for command in commands:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:

@@ -12,6 +12,7 @@ from tests.support.booted_systemd import BootedSystemd
 from tests.support.divided_map import DividedMap, make_map
 
 MAP = "/home/alice/autoware_map"
+RUN = "/run/user/61003"
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +25,13 @@ def machine() -> Iterator[BootedSystemd]:
             mkdir -p /etc/sysusers.d
             printf 'u alice 61003 "" /home/alice\nu mallory 61004 "" /\n' >/etc/sysusers.d/people.conf
             systemd-sysusers /etc/sysusers.d/people.conf
-            mkdir -p {MAP}; chmod 700 /home/alice
+            mkdir -p {MAP} {RUN}; chmod 700 /home/alice {RUN}; chown alice:alice /home/alice {RUN}
             mount --bind /exchange/map {MAP}
+            # a user's service manager without the session manager, which needs a real login
+            cd /run/systemd/system; mkdir user@.service.d user-runtime-dir@.service.d
+            printf '[Service]\nEnvironment=XDG_RUNTIME_DIR={RUN}\nPAMName=\n' >user@.service.d/test.conf
+            printf '[Service]\nExecStart=\nExecStart=/bin/true\nExecStop=\n' \
+                >user-runtime-dir@.service.d/test.conf
         """)
         done = one.run(sys.executable, "-m", "shmmap.cli", "unit", "install", "--map", MAP)
         assert "next: systemctl enable --now shmmapd" in done.stdout
@@ -39,7 +45,7 @@ def machine() -> Iterator[BootedSystemd]:
 def fresh(machine: BootedSystemd) -> Iterator[BootedSystemd]:
     """Return the machine with every unit of the service stopped, and nothing left of it."""
     stop = """
-        systemctl stop 'shmmapd*.socket' 'shmmapd*.service'
+        systemctl stop 'shmmapd*.socket' 'shmmapd*.service' user@61003.service
         systemctl reset-failed
         rm -rf /run/systemd/system/shmmapd*.d
         systemctl daemon-reload

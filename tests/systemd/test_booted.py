@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from tests.support.booted_systemd import BootedSystemd
 from tests.support.divided_map import DividedMap
 from tests.support.patience import Patience
+from tests.systemd.conftest import MAP, RUN
 
 pytestmark = pytest.mark.root
 
@@ -72,12 +74,11 @@ def shmmap(machine: BootedSystemd, *words: str, user: str = "") -> subprocess.Co
     return machine.run(sys.executable, "-m", "shmmap.cli", *words, user=user, check=False)
 
 
-def segments(machine: BootedSystemd, instance: str = "default") -> dict[str, str]:
+def segments(machine: BootedSystemd, instance: str = "default", *, at: str = "/dev/shm") -> dict[str, str]:
     """Published segments by name, with their inodes."""
-    lines = machine.shell(
-        f"cd /dev/shm; ls -i | grep 'shmmap[.]{instance}[.][0-9a-f]*$' || true"
-    ).splitlines()
-    return {name: inode for inode, name in (line.split() for line in lines) if len(name.split(".")[-1]) == 16}
+    published = re.compile(rf"shmmap\.{instance}\.[0-9a-f]{{16}}")
+    lines = [line.split() for line in machine.shell(f"ls -i {at}").splitlines()]
+    return {name: inode for inode, name in lines if published.fullmatch(name)}
 
 
 def test_it_serves_the_members_of_the_group_and_nobody_else(fresh: BootedSystemd) -> None:
@@ -96,7 +97,9 @@ def test_it_serves_the_members_of_the_group_and_nobody_else(fresh: BootedSystemd
         ).splitlines()
         found = {line.split()[0]: line.split(maxsplit=1)[1] for line in modes}
         assert found.pop("/run/shmmap") == "750 shmmap:shmmap"
-        assert found.pop("/run/shmmap/default.sock") == "660 shmmap:shmmap"
+        sockets = [name for name in found if name.endswith(".sock")]
+        assert "/run/shmmap/default.sock" in sockets
+        assert {found.pop(name) for name in sockets} == {"660 shmmap:shmmap"}
         assert len(found) >= 12
         names = segments(fresh)
         assert {found[f"/dev/shm/{name}"] for name in names} == {"440 shmmap:shmmap"}
@@ -237,3 +240,79 @@ def test_what_cannot_get_better_is_tried_once(
         assert says in unit["StatusText"]
     finally:
         fresh.shell("mv /etc/shmmap/kept /etc/shmmap/shmmap.toml")
+
+
+def test_the_doctor_tells_each_user_what_is_wrong(fresh: BootedSystemd) -> None:
+    def findings(user: str = "") -> dict[str, str]:
+        told = json.loads(shmmap(fresh, "doctor", "--json", user=user).stdout)
+        return {one["name"]: f"{one['state']}: {one['fact']} {one['advice']}" for one in told["findings"]}
+
+    fresh.run("systemctl", "start", "shmmapd")
+    well = findings("alice")
+    assert {name for name, text in well.items() if text.startswith("fail")} == set(), well
+    assert well["group"].startswith("ok: alice is a member of shmmap")
+    assert well["descriptors"].startswith("ok: limit of the daemon")
+    stranger = findings("mallory")
+    assert stranger["group"].startswith("fail: mallory is no member of shmmap")
+    assert "usermod -aG shmmap mallory" in stranger["group"]
+    assert stranger["socket"].startswith("fail")
+    fresh.run("systemctl", "stop", "shmmapd")
+    asleep = findings()
+    assert asleep["map"].startswith("ok: /home/alice/autoware_map can be read by shmmap")
+    fresh.shell("mv /etc/systemd/system/shmmapd.service.d/20-map.conf /etc/kept")
+    try:
+        assert "unit install --map /home/alice/autoware_map" in findings()["map"]
+    finally:
+        fresh.shell("mv /etc/kept /etc/systemd/system/shmmapd.service.d/20-map.conf")
+
+
+def test_segments_on_huge_pages(fresh: BootedSystemd) -> None:
+    """As the operator's guide says it, with the files that come with the package."""
+    print_file = [sys.executable, "-m", "shmmap.cli", "unit", "print"]
+    mount = fresh.run(*print_file, "system/run-shmmap_huge.mount").stdout
+    drop_in = fresh.run(*print_file, "drop-ins/huge-pages.conf").stdout
+    fresh.shell(f"""
+        cat >/run/systemd/system/run-shmmap_huge.mount <<'END'
+{mount}END
+        mkdir -p /run/systemd/system/shmmapd.service.d
+        cat >/run/systemd/system/shmmapd.service.d/huge-pages.conf <<'END'
+{drop_in}END
+        systemctl daemon-reload
+    """)
+    try:
+        if fresh.run("systemctl", "start", "run-shmmap_huge.mount", check=False).returncode:
+            pytest.skip("this kernel has no huge pages for tmpfs")
+        fresh.run("systemctl", "start", "shmmapd")
+        with Client(fresh, "alice") as alice:
+            assert len(alice.ask()) == 12
+        assert (len(segments(fresh)), len(segments(fresh, at="/run/shmmap_huge"))) == (0, 12)
+        assert fresh.run("ls", "/run/shmmap_huge", user="mallory", check=False).returncode != 0
+    finally:
+        fresh.shell("""
+            systemctl stop shmmapd run-shmmap_huge.mount
+            rm /run/systemd/system/run-shmmap_huge.mount
+        """)
+
+
+def test_a_user_s_own_service(fresh: BootedSystemd) -> None:
+    own = ["env", "HOME=/home/alice", f"XDG_RUNTIME_DIR={RUN}"]
+    control = [*own, "systemctl", "--user"]
+    command = [*own, sys.executable, "-m", "shmmap.cli"]
+    fresh.run("systemctl", "start", "user@61003.service")
+    installed = fresh.run(*command, "unit", "install", "--user", "--map", MAP, user="alice").stdout
+    assert "/home/alice/.config/systemd/user/shmmapd.service" in installed
+    assert "loginctl enable-linger" in installed
+    fresh.run(*control, "start", "shmmapd", user="alice")
+    fresh.run(*command, "query", "--circle", "0,0,25", user="alice")
+    names = segments(fresh)
+    assert len(names) == 12
+    assert fresh.run("stat", "-c", "%a", f"{RUN}/shmmap/default.sock").stdout == "600\n"
+    fresh.run(*control, "restart", "shmmapd", user="alice")
+    assert segments(fresh) == names
+    fresh.run(*control, "reload", "shmmapd", user="alice")
+    fresh.run(*control, "stop", "shmmapd", user="alice")
+    assert fresh.shell("ls /dev/shm") == ""
+    fresh.run(*control, "start", "shmmapd.socket", user="alice")
+    fresh.run(*command, "query", "--circle", "0,0,25", "--timeout", "120", user="alice")
+    assert len(segments(fresh)) == 12
+    fresh.run(*control, "stop", "shmmapd.socket", "shmmapd.service", user="alice")
