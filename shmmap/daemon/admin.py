@@ -11,7 +11,7 @@ from shmmap import __version__
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.event_log import EventLog
 from shmmap.daemon.operator_pins import OperatorPins
-from shmmap.daemon.pin_survey import Pinned
+from shmmap.daemon.pin_survey import Pinned, Share
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
@@ -172,12 +172,15 @@ class Admin:
             epoch=self._epoch,
             map_version=self._store.catalogue.map_version,
             counters=dict(self._statistics.values),
-            sessions=tuple(self._session_row(session, now_s) for session in self._sessions),
+            sessions=tuple(
+                self._session_row(session, pinned.shares.get(session.slot, Share()), now_s)
+                for session in self._sessions
+            ),
             unknown_holders=pinned.unknown,
             unknown_bytes=pinned.unknown_bytes,
         )
 
-    def _session_row(self, session: Session, now_s: float) -> messages.SessionRow:
+    def _session_row(self, session: Session, share: Share, now_s: float) -> messages.SessionRow:
         intent = session.intent
         return messages.SessionRow(
             session.slot,
@@ -191,6 +194,9 @@ class Admin:
             session.requests,
             now_s - session.last_request_s,
             (intent.x, intent.y) if intent is not None else None,
+            share.mapped_bytes,
+            share.superseded,
+            share.superseded_bytes,
         )
 
     def _show(self, message: messages.Show) -> messages.ShownCell:

@@ -14,6 +14,7 @@ __all__ = ["choose_budget"]
 DEFAULT_CEILING_BYTES: Final = 4 << 30
 RESERVE_BYTES: Final = 256 << 20
 SMALLEST_BYTES: Final = 1 << 20
+LARGEST: Final = 1 << 62
 
 
 def _available_bytes() -> int:
@@ -23,12 +24,15 @@ def _available_bytes() -> int:
     return DEFAULT_CEILING_BYTES
 
 
-def choose_budget(asked_bytes: int, directory: ShmDirectory, *, ours_bytes: int = 0) -> int:
+def choose_budget(
+    asked_bytes: int, directory: ShmDirectory, *, ours_bytes: int = 0, limit_bytes: int | None = None
+) -> int:
     """Return the budget in bytes.
 
-    An explicit one that does not fit the file system is refused.  The default is a quarter of the
-    available memory, at most 4 GiB, less where the file system is smaller (a reserve of 5 %, at
-    most 256 MiB, stays free).
+    An explicit one that does not fit the file system, or the control group, is refused.  The default is
+    a quarter of the available memory, at most 4 GiB, less where the file system is smaller (a reserve
+    of 5 %, at most 256 MiB, stays free) or the control group is (a reserve of half of it, at most
+    256 MiB, is left to the processes themselves).
 
     Parameters
     ----------
@@ -36,20 +40,31 @@ def choose_budget(asked_bytes: int, directory: ShmDirectory, *, ours_bytes: int 
         The explicit budget; 0 for the default.
     ours_bytes
         What an earlier life of the daemon left in the directory: it is ours to keep or to free.
+    limit_bytes
+        Memory limit of the control group; None for none.
 
     Raises
     ------
     ConfigError
-        The explicit budget is larger than what is free, or too small for anything.
+        The explicit budget is larger than what is free, the kernel would kill for it, or it is too small
+        for anything.
     """
     size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
-    room = free - min(size // 20, RESERVE_BYTES)
+    group_room = limit_bytes - min(limit_bytes // 2, RESERVE_BYTES) if limit_bytes is not None else LARGEST
+    room = min(free - min(size // 20, RESERVE_BYTES), group_room)
     if asked_bytes:
         if asked_bytes > free:
             raise ConfigError(
                 f"a budget of {asked_bytes} bytes does not fit {directory.path}, which has {free} free",
                 key="budget",
                 hint="lower --budget, or enlarge the tmpfs (docker: --shm-size)",
+            )
+        if limit_bytes is not None and asked_bytes > group_room:
+            raise ConfigError(
+                f"a budget of {asked_bytes} bytes does not fit the control group's memory limit of"
+                f" {limit_bytes} bytes, of which {limit_bytes - group_room} are left to the processes",
+                key="budget",
+                hint="lower --budget, or raise the limit (systemd: MemoryMax=, docker: --memory)",
             )
         if asked_bytes < SMALLEST_BYTES:
             raise ConfigError(

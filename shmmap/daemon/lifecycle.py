@@ -45,6 +45,7 @@ from shmmap.daemon.budget import choose_budget
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.event_log import EventLog, nowhere
 from shmmap.daemon.event_socket import EventSocket, events_path
+from shmmap.daemon.control_group import memory_limit_bytes
 from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import Leftovers
@@ -214,7 +215,10 @@ class _Life:
             frame_id=catalogue.frame_id,
         )
         budget = choose_budget(  # may refuse: before anything has a name
-            config.budget_bytes, directory, ours_bytes=directory.used_bytes(segment_prefix(config.instance))
+            config.budget_bytes,
+            directory,
+            ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
+            limit_bytes=memory_limit_bytes(),
         )
         self._statistics = StatisticsWriter(directory, config.instance, self._identity, mode=mode, gid=gid)
         self._sessions = Sessions()

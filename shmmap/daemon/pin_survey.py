@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.errors import Busy
 
-__all__ = ["PinSurvey", "Pinned"]
+__all__ = ["PinSurvey", "Pinned", "Share"]
 
 LOOKS_AT_ONCE: Final = 16
 """Half a millisecond of the serving loop."""
@@ -30,12 +31,26 @@ MOST_ASKED: Final = 16
 """Answers one session may wait for."""
 
 
-class Pinned(NamedTuple):
-    """What the largest segments come to; `unknown` ones are mapped by nobody who told."""
+@dataclass(slots=True)
+class Share:
+    """What one session maps; ``superseded`` segments have left service or have a successor."""
 
-    pinned_bytes: int
-    unknown: int
-    unknown_bytes: int
+    mapped_bytes: int = 0
+    superseded: int = 0
+    superseded_bytes: int = 0
+
+
+@dataclass(slots=True)
+class Pinned:
+    """What the largest segments come to; ``unknown`` ones are mapped by nobody who told.
+
+    ``shares`` goes by the slots of the sessions that map anything.
+    """
+
+    pinned_bytes: int = 0
+    unknown: int = 0
+    unknown_bytes: int = 0
+    shares: dict[int, Share] = field(default_factory=dict)
 
 
 Answer = Callable[[Pinned], None]
@@ -44,13 +59,16 @@ Answer = Callable[[Pinned], None]
 class PinSurvey:
     """Looks at all segments, a few per `step`."""
 
-    def __init__(self, reclaimer: Reclaimer, sessions: Sessions) -> None:
+    def __init__(
+        self, reclaimer: Reclaimer, sessions: Sessions, *, in_service: Callable[[Resident], bool]
+    ) -> None:
         self._reclaimer = reclaimer
+        self._in_service = in_service
         self._sessions = sessions
         self._asked: list[tuple[Session, Answer]] = []
         self._running: list[tuple[Session, Answer]] = []
         self._left: list[Resident] = []
-        self._sum = [0, 0, 0]
+        self._found = Pinned()
         self._rests_until_s = 0.0
 
     @property
@@ -89,23 +107,32 @@ class PinSurvey:
             self._look()
         elif self._running:
             _, answer = self._running.pop()
-            answer(Pinned(*self._sum))
+            answer(self._found)
         elif self._asked:
             self._running, self._asked = self._asked[::-1], []
             self._left = self._reclaimer.everything()[:MOST_SEGMENTS]
-            self._sum = [0, 0, 0]
+            self._found = Pinned()
             self._look()
 
     def _look(self) -> None:
-        end_s = time.thread_time() + STEP_S
+        found, end_s = self._found, time.thread_time() + STEP_S
         for _ in range(min(LOOKS_AT_ONCE, len(self._left))):
             if time.thread_time() > end_s:
                 break  # somebody holds very many locks
             resident = self._left.pop()
             slots = self._reclaimer.slots_of(resident) or []
-            if any(self._sessions.by_slot(slot) for slot in slots):
-                self._sum[0] += resident.nbytes
+            known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
+            if known:
+                found.pinned_bytes += resident.nbytes
+                for slot in known:
+                    self._add(found.shares.setdefault(slot, Share()), resident)
             elif self._reclaimer.is_pinned(resident):
-                self._sum[0] += resident.nbytes
-                self._sum[1] += 1
-                self._sum[2] += resident.nbytes
+                found.pinned_bytes += resident.nbytes
+                found.unknown += 1
+                found.unknown_bytes += resident.nbytes
+
+    def _add(self, share: Share, resident: Resident) -> None:
+        share.mapped_bytes += resident.nbytes
+        if not self._in_service(resident):
+            share.superseded += 1
+            share.superseded_bytes += resident.nbytes

@@ -105,7 +105,7 @@ class Server:
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
         self._replies = Replies(socket, statistics)
         self._hearing = Hearing(socket, sessions, statistics, self._refuse_unread)
-        self._survey = PinSurvey(store.reclaimer, sessions)
+        self._survey = PinSurvey(store.reclaimer, sessions, in_service=store.is_in_service)
         self._gate = ListenGate(self.watch, self.unwatch)
         self._crowd = CrowdControl(
             self._gate,
@@ -309,7 +309,7 @@ class Server:
                 self.end_session(spare)
             if self._sessions.full:
                 raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
-            session = self._sessions.open(identity, peer, message.client, now_s)
+            session = self._sessions.open(identity, peer, message.client, now_s, slot=message.session)
             session.fd = _descriptor(frame)
             self._statistics.add("sessions_opened")
             self._event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)

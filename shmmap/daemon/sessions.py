@@ -117,7 +117,7 @@ class Session:
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
         """This session as a line in a reply."""
-        return Holder(self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells)
+        return Holder(self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells, self.command)
 
 
 def predicted_path(intent: Intent) -> list[tuple[float, float]]:
@@ -145,7 +145,8 @@ def command_of(pid: int) -> str:
 class Sessions:
     """All sessions of this epoch, by routing identity, slot and pidfd.
 
-    Slots are random 62-bit numbers, so that one is never used again, not even by a later epoch.
+    Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
+    it maps is locked under its slot, also when a later life of the daemon asks whose that is.
     """
 
     LIMIT = 4096
@@ -191,15 +192,18 @@ class Sessions:
         mine = [session for session in self if (session.peer.pid if session.pidfd >= 0 else 0) == owner]
         return min(mine, key=lambda session: session.last_request_s, default=None)
 
-    def open(self, identity: bytes, peer: Peer, client: str, now_s: float) -> Session:
+    def open(self, identity: bytes, peer: Peer, client: str, now_s: float, *, slot: int = 0) -> Session:
         """Begin a session; ``pidfd`` is -1 where the process cannot be watched.
+
+        ``slot`` is the one that the client had in an earlier life of the daemon and keeps, 0 for none.
 
         Raises
         ------
         NoSession
             The process has ended already: nobody would ever end its session.
         """
-        slot = secrets.randbelow(MAX_SLOT) + 1
+        if not 0 < slot <= MAX_SLOT or slot in self._by_slot:
+            slot = secrets.randbelow(MAX_SLOT) + 1
         pidfd = -1
         if peer.pid > 0:
             try:

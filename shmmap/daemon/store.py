@@ -387,6 +387,10 @@ class Store:
         index = self.index_of(resident.key.cell_id)
         return index is not None and self.layers.version(index, resident.key.layer) == resident.version
 
+    def is_in_service(self, resident: Resident) -> bool:
+        """Whether a segment is handed out to whoever asks for its cell."""
+        return self.books.resident_named(resident.name) is resident and self.is_current(resident)
+
     # --- leaving --------------------------------------------------------------------------------
 
     def _chill(self, index: int) -> None:

@@ -59,7 +59,7 @@ __all__ = [
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (1, 1)
+PROTOCOL_VERSION: Final = (1, 2)
 
 
 class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
@@ -144,12 +144,17 @@ class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
 
 class Hello(msgspec.Struct, array_like=True, tag="hello"):
-    """First message of a session."""
+    """First message of a session.
+
+    ``session`` is the slot of the client's session with an earlier life of the daemon, 0 for none: it
+    keeps it, so that the locks it holds go on naming it.
+    """
 
     request: int
     major: int
     minor: int
     client: str = ""
+    session: int = 0
 
 
 class Metadata(msgspec.Struct, array_like=True, tag="metadata"):
@@ -354,6 +359,7 @@ class Holder(msgspec.Struct, array_like=True, frozen=True):
     client: str
     bytes: int
     cells: int = 0
+    command: str = ""
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
@@ -421,7 +427,12 @@ class Released(msgspec.Struct, array_like=True, tag="released"):
 
 
 class SessionRow(msgspec.Struct, array_like=True, frozen=True):
-    """One client as the daemon sees it; ``pid`` is the kernel's word, 0 where it gives none."""
+    """One client as the daemon sees it; ``pid`` is the kernel's word, 0 where it gives none.
+
+    ``cells`` and ``bytes`` are what it was handed and did not say it dropped; ``mapped_bytes`` what
+    it maps by the kernel's word, ``superseded`` the segments among them that have left service or have a
+    successor.
+    """
 
     session: int
     pid: int
@@ -434,6 +445,9 @@ class SessionRow(msgspec.Struct, array_like=True, frozen=True):
     requests: int
     idle_s: float
     pose: tuple[float, float] | None = None
+    mapped_bytes: int = 0
+    superseded: int = 0
+    superseded_bytes: int = 0
 
 
 class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):

@@ -219,6 +219,21 @@ def test_a_reload_finishes_with_room_for_one_more_cell_only(
 
 
 @pytest.mark.root
+def test_a_file_system_smaller_than_the_budget(
+    daemon: DaemonFactory, heavy_map: DividedMap, private_tmpfs: Callable[[str], str]
+) -> None:
+    """It does not start, and says what to do; one that fits does."""
+    directory = private_tmpfs("16m")
+    one = daemon(heavy_map.root, "--budget", "64M", shm_dir=directory, start=False)
+    assert one.run_to_end() == 78
+    assert f"a budget of {64 << 20} bytes does not fit {directory}" in one.log
+    assert "lower --budget, or enlarge the tmpfs" in one.log
+    assert one.leftovers() == []
+    one.arguments[1] = "12M"
+    one.start()
+
+
+@pytest.mark.root
 def test_a_full_file_system_is_reported_and_survived(
     daemon: DaemonFactory, connect: Connect, heavy_map: DividedMap, private_tmpfs: Callable[[str], str]
 ) -> None:

@@ -37,10 +37,10 @@ def shm(tmp_path: Path) -> Iterator[str]:
     os.rmdir(path)
 
 
-def choose(path: str, asked: int, size: int, free: int) -> int:
+def choose(path: str, asked: int, size: int, free: int, limit: int | None = None, ours: int = 0) -> int:
     directory = Sized(path, size, free)
     try:
-        return choose_budget(asked, directory)
+        return choose_budget(asked, directory, ours_bytes=ours, limit_bytes=limit)
     finally:
         directory.close()
 
@@ -81,3 +81,19 @@ def test_the_default_shrinks_to_the_file_system(shm: str) -> None:
     with pytest.raises(ConfigError) as failure:
         choose(shm, 0, 64 << 20, 3 << 20)
     assert failure.value.key == "shm_dir"
+
+
+def test_a_control_group_that_allows_less(shm: str) -> None:
+    """Beyond its limit the kernel kills, so an explicit budget is refused and the default shrinks."""
+    assert choose(shm, 0, 1 << 40, 1 << 39, limit=100 << 20) == 50 << 20
+    assert choose(shm, 744 << 20, 1 << 40, 1 << 39, limit=1000 << 20) == 744 << 20
+    with pytest.raises(ConfigError, match="control group") as failure:
+        choose(shm, 745 << 20, 1 << 40, 1 << 39, limit=1000 << 20)
+    assert (failure.value.key, failure.value.exit_code) == ("budget", 78)
+    assert failure.value.hint
+
+
+def test_what_an_earlier_life_left_counts_as_free(shm: str) -> None:
+    assert choose(shm, 64 << 20, 64 << 20, 4 << 20, ours=60 << 20) == 64 << 20
+    with pytest.raises(ConfigError):
+        choose(shm, 64 << 20, 64 << 20, 4 << 20, ours=59 << 20)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The memory limit of the control group that this process lives in, versions 1 and 2 (cgroups(7)).
+
+Shared memory counts for the group of whoever wrote it first, and stays charged when that process
+ends.  Beyond the limit there is no error: the kernel kills.  So the limit has to be known beforehand.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+__all__ = ["memory_limit_bytes"]
+
+_NO_LIMIT: Final = 1 << 60
+"""Version 1 says "none" with the largest number of pages there is."""
+_FILES: Final = {"cgroup2": "memory.max", "cgroup": "memory.limit_in_bytes"}
+
+
+def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
+    """Return the lowest memory limit of this process's group and the groups around it; None for none.
+
+    Parameters
+    ----------
+    proc
+        Directory with ``cgroup`` and ``mountinfo`` of the process.
+    """
+    groups = _groups(f"{proc}/cgroup")
+    limits: list[int] = []
+    for kind, root, mount, options in _mounts(f"{proc}/mountinfo"):
+        if kind == "cgroup" and "memory" not in options:
+            continue
+        group = groups.get(kind)
+        if group is None:
+            continue
+        inside = os.path.relpath(group, root) if _is_below(group, root) else "."
+        place = Path(mount, inside)
+        while True:
+            limits += _read(place / _FILES[kind])
+            if place == Path(mount):
+                break
+            place = place.parent
+    return min(limits, default=None)
+
+
+def _groups(path: str) -> dict[str, str]:
+    """Per kind of hierarchy, the group of the process."""
+    found: dict[str, str] = {}
+    for line in _lines(path):
+        _number, controllers, group = line.split(":", 2)
+        if not controllers:
+            found["cgroup2"] = group
+        elif "memory" in controllers.split(","):
+            found["cgroup"] = group
+    return found
+
+
+def _mounts(path: str) -> list[tuple[str, str, str, list[str]]]:
+    """Kind, root inside the hierarchy, mount point and options of every mounted hierarchy."""
+    found = []
+    for line in _lines(path):
+        first, _, second = line.partition(" - ")
+        before, after = first.split(), second.split()
+        if len(after) >= 3 and after[0] in _FILES:
+            found.append((after[0], before[3], before[4], after[2].split(",")))
+    return found
+
+
+def _is_below(group: str, root: str) -> bool:
+    return group == root or group.startswith(root.rstrip("/") + "/")
+
+
+def _lines(path: str) -> list[str]:
+    try:
+        return Path(path).read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    except OSError:
+        return []
+
+
+def _read(path: Path) -> list[int]:
+    try:
+        text = path.read_text(encoding="ascii").strip()
+    except OSError:
+        return []
+    return [int(text)] if text.isdigit() and int(text) < _NO_LIMIT else []
