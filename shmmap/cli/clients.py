@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from shmmap.cli.accounts import user_name
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.output import Column, format_bytes, format_duration, print_json, print_table
 
@@ -15,17 +16,21 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"clients": [{"session": hex, "pid": as the kernel says, 0 where it does not, "uid", "gid", "client",
-                "command", "cells", "bytes", "requests", "idle_s", "pose": [x, y] or null}],
-   "unknown_holders": mappings of nobody known, "unknown_bytes"}
+  {"clients": [{"session": hex, "pid": as the kernel says, 0 where it does not, "uid", "user", "gid",
+                "client", "command", "cells": handed to it and not given back, "bytes": theirs, "requests",
+                "idle_s", "pose": [x, y] or null, "mapped_bytes": what it maps by the kernel's word,
+                "superseded": segments among those that nobody new gets, "superseded_bytes"}],
+   "unknown_holders": segments mapped by nobody known, "unknown_bytes"}
 The list includes this program itself."""
 
 _COLUMNS = (
     Column("CLIENT"),
     Column("PID", "right"),
-    Column("UID", "right"),
+    Column("USER"),
     Column("CELLS", "right"),
-    Column("HOLDS", "right"),
+    Column("HANDED", "right"),
+    Column("MAPS", "right"),
+    Column("OLD", "right"),
     Column("REQUESTS", "right"),
     Column("IDLE", "right"),
     Column("AT"),
@@ -40,7 +45,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "clients",
         run,
         help="who is connected and holds what",
-        description="List the sessions the daemon knows, and memory that nobody known holds.",
+        description="List the sessions the daemon knows, and memory that nobody known holds.\n"
+        "HANDED is what a client was given and did not say it dropped, MAPS what it has mapped by the\n"
+        "kernel's word, OLD the part of that which was replaced or evicted and goes when it lets go.",
         json=_JSON,
     )
     add_daemon_options(parser)
@@ -74,6 +81,7 @@ def _as_json(row: SessionRow) -> dict[str, object]:
         "session": f"{row.session:016x}",
         "pid": row.pid,
         "uid": row.uid,
+        "user": user_name(row.uid),
         "gid": row.gid,
         "client": row.client,
         "command": row.command,
@@ -82,6 +90,9 @@ def _as_json(row: SessionRow) -> dict[str, object]:
         "requests": row.requests,
         "idle_s": round(row.idle_s, 3),
         "pose": None if row.pose is None else list(row.pose),
+        "mapped_bytes": row.mapped_bytes,
+        "superseded": row.superseded,
+        "superseded_bytes": row.superseded_bytes,
     }
 
 
@@ -89,9 +100,11 @@ def _as_text(row: SessionRow) -> list[str]:
     return [
         row.client or "-",
         str(row.pid or "?"),
-        str(row.uid),
+        user_name(row.uid),
         f"{row.cells:,}",
         format_bytes(row.bytes),
+        format_bytes(row.mapped_bytes),
+        format_bytes(row.superseded_bytes) if row.superseded else "-",
         f"{row.requests:,}",
         format_duration(row.idle_s),
         "-" if row.pose is None else f"{row.pose[0]:.1f},{row.pose[1]:.1f}",

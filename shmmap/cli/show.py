@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from shmmap.cli.accounts import user_name
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.output import format_bytes, print_json, print_pairs
 
@@ -19,7 +20,8 @@ _JSON = """\
    "source_bytes", "loading": [layer], "pinned": [layer an operator keeps],
    "failure": text of the last failure that still stands, or "",
    "segments": [{"layer", "version": hex, "segment", "state": "resident" | "stale" | "zombie", "bytes",
-                 "points", "holders": [{"session": hex, "pid", "uid", "client", "bytes"}]}]}
+                 "points",
+                 "holders": [{"session": hex, "pid", "uid", "user", "client", "command", "bytes"}]}]}
 A holder of session 0 is unknown: it did not open the segment through the library.
 Exit code: 0, or 1 when the map has no such cell."""
 
@@ -85,7 +87,9 @@ def _holder_as_json(holder: Holder) -> dict[str, object]:
         "session": f"{holder.session:016x}",
         "pid": holder.pid,
         "uid": holder.uid,
+        "user": user_name(holder.uid),
         "client": holder.client,
+        "command": holder.command,
         "bytes": holder.bytes,
     }
 
@@ -121,4 +125,6 @@ def _segment_line(segment: ShownSegment) -> str:
 def _holder_line(holder: Holder) -> str:
     if not holder.session:
         return "unknown: mapped, but not through the library"
-    return f"{holder.client or 'client'}, pid {holder.pid}, uid {holder.uid}"
+    command = f" ({holder.command})" if holder.command not in ("", holder.client) else ""
+    who = f"{holder.client or 'client'}{command}, pid {holder.pid}, user {user_name(holder.uid)}"
+    return f"{who}, {format_bytes(holder.bytes)}"

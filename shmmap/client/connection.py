@@ -70,6 +70,7 @@ class Connection:
         self._name = name
         self._next_request = int.from_bytes(os.urandom(6), "little")
         self._handshakes = 0
+        self._slot = 0  # kept over restarts of the daemon: what is mapped is locked under it
         # a context of our own: no other library's sockets can hold up its end
         context = zmq.Context()
         self._socket = context.socket(zmq.DEALER)
@@ -139,7 +140,7 @@ class Connection:
 
     def _greet(self, deadline_s: float) -> Welcome:
         started_s = time.monotonic()
-        hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name)
+        hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name, self._slot)
         reply = self._exchange(hello.request, encode(hello), deadline_s, 0.0)
         self._watch_connection()
         if reply is None:
@@ -157,6 +158,7 @@ class Connection:
                 f"this client {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
                 hint=_UPDATE_HINT,
             )
+        self._slot = reply.session
         return reply
 
     def _exchange(self, request: int, data: bytes, deadline_s: float, quiet_s: float) -> Reply | None:

@@ -203,9 +203,7 @@ class Admin:
         store = self._store
         index = store.index_of(message.id)
         if index is None:
-            raise UnknownCell(
-                f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is resident"
-            )
+            return self._show_gone(message)
         cell_id = store.catalogue.id(index)
         version = store.catalogue.version(index)
         slots = {key: slot for key, slot in store.books.slots.items() if key.cell_id == cell_id}
@@ -235,6 +233,18 @@ class Admin:
             z_max=z_max,
             pinned=self.pins.layers_of(cell_id),
         )
+
+    def _show_gone(self, message: messages.Show) -> messages.ShownCell:
+        """A cell that left the map while somebody maps it: version 0."""
+        everything = self._store.reclaimer.everything()
+        names = (message.id, self._store.id_prefix + message.id)
+        left = [resident for resident in everything if resident.key.cell_id in names and message.id]
+        if not left:
+            raise UnknownCell(
+                f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is resident"
+            )
+        shown = tuple(self._segment(resident, "zombie") for resident in left)
+        return messages.ShownCell(message.request, left[0].key.cell_id, 0, *left[0].box, 0, shown)
 
     def _segment(self, resident: Resident, state: str) -> messages.ShownSegment:
         return messages.ShownSegment(

@@ -43,14 +43,15 @@ from shmmap.daemon.activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.admin import Admin
 from shmmap.daemon.budget import choose_budget
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.control_group import memory_limit_bytes
 from shmmap.daemon.event_log import EventLog, nowhere
 from shmmap.daemon.event_socket import EventSocket, events_path
-from shmmap.daemon.control_group import memory_limit_bytes
 from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import Leftovers
 from shmmap.daemon.listening import bind_socket
 from shmmap.daemon.logs import set_up_logging
+from shmmap.daemon.own_names import lock_name, stopped_early, take_away
 from shmmap.daemon.pin_support import Rung
 from shmmap.daemon.pin_watch import PinWatch
 from shmmap.daemon.prerequisites import (
@@ -125,11 +126,11 @@ def run(config: DaemonConfig) -> int:
             lock = InstanceLock(_lock_path(path))
             stack.callback(lock.release)
             # a second one beside the segments: two runtime directories may share a directory of segments
-            shm_lock = InstanceLock(f"{directory.path}/shmmap.{config.instance}.lock")
+            shm_lock = InstanceLock(directory.path + lock_name(config.instance))
             stack.callback(shm_lock.release)
             stack.callback(ignore_signals)  # without the locks no name is ours to take away
             step("daemon.lock")
-            stack.push(partial(_stopped_early, signals, directory, config.instance))
+            stack.push(partial(stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
@@ -156,26 +157,6 @@ def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str
 
 def _lock_path(socket_path: str) -> str:
     return socket_path.removesuffix(".sock") + ".lock"
-
-
-def _names_of(directory: ShmDirectory, instance: str) -> list[str]:
-    """Names of this instance but the lock's, which goes last."""
-    prefix = segment_prefix(instance)
-    return [name for name in directory.names(prefix) if name != prefix + "lock"]
-
-
-def _stopped_early(
-    signals: StartSignals,
-    directory: ShmDirectory,
-    instance: str,
-    kind: type[BaseException] | None,
-    *_: object,
-) -> None:
-    """A stop empties, even one that came before there was anything but what an earlier life left."""
-    if kind is SystemExit and not signals.keep:
-        for name in _names_of(directory, instance):
-            with contextlib.suppress(OSError):
-                directory.unlink(name)
 
 
 class _Life:
@@ -426,12 +407,9 @@ class _Life:
         """
         del number, frame
         directory, instance = self._directory, self._config.instance
-        names = [directory.path + name for name in _names_of(directory, instance)]
-        own_socket = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]
-        locks = (f"{directory.path}{segment_prefix(instance)}lock", _lock_path(self._socket_path))
-        for path in (*names, *own_socket, *locks):
-            with contextlib.suppress(OSError):
-                os.unlink(path)
+        locks = (directory.path + lock_name(instance), _lock_path(self._socket_path))
+        ours = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]
+        take_away(directory, instance, (*ours, *locks))
         os._exit(0)  # the loaders die with this process
 
     def close(self, *, keep: bool) -> None:

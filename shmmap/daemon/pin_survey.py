@@ -16,6 +16,7 @@ from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.errors import Busy
+from shmmap.segment.pins import LOADER_SLOT
 
 __all__ = ["PinSurvey", "Pinned", "Share"]
 
@@ -126,7 +127,7 @@ class PinSurvey:
                 found.pinned_bytes += resident.nbytes
                 for slot in known:
                     self._add(found.shares.setdefault(slot, Share()), resident)
-            elif self._reclaimer.is_pinned(resident):
+            elif LOADER_SLOT not in slots and self._reclaimer.is_pinned(resident):
                 found.pinned_bytes += resident.nbytes
                 found.unknown += 1
                 found.unknown_bytes += resident.nbytes

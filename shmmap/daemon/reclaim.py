@@ -23,7 +23,7 @@ from shmmap.daemon.sessions import Sessions
 from shmmap.protocol.messages import Holder
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import zombie_name
-from shmmap.segment.pins import holders
+from shmmap.segment.pins import LOADER_SLOT, holders
 
 __all__ = ["Outcome", "Reclaimer"]
 
@@ -303,7 +303,7 @@ class Reclaimer:
             if slots is None:
                 continue
             known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
-            if not known and self.is_pinned(resident):
+            if not known and LOADER_SLOT not in slots and self.is_pinned(resident):
                 known = [0]
             for slot in known:
                 bytes_of[slot] = bytes_of.get(slot, 0) + resident.nbytes

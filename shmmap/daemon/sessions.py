@@ -117,7 +117,9 @@ class Session:
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
         """This session as a line in a reply."""
-        return Holder(self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells, self.command)
+        return Holder(
+            self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells, self.command
+        )
 
 
 def predicted_path(intent: Intent) -> list[tuple[float, float]]:

@@ -28,6 +28,7 @@ from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.verify import verify_file
 
 __all__ = ["main"]
@@ -169,6 +170,7 @@ class _Worker:
         except OSError:
             return None
         try:
+            lock_slot(fd, LOADER_SLOT)
             source = read_segment(fd, job.box, spec.source_columns)
             return source if source.stamp == SourceStamp.of(os.stat(job.path)) else None
         except (OSError, SegmentCorrupt):
@@ -185,6 +187,7 @@ class _Worker:
                 fd = self._directory.open(job.segment)
                 try:
                     step("worker.check")
+                    lock_slot(fd, LOADER_SLOT)
                     verify_file(fd)
                 finally:
                     os.close(fd)

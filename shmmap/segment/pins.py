@@ -20,11 +20,13 @@ from typing import Final
 
 from shmmap.segment.crash_steps import step
 
-__all__ = ["MAX_SLOT", "holders", "is_pinned", "lock_slot", "prepare_process"]
+__all__ = ["LOADER_SLOT", "MAX_SLOT", "holders", "is_pinned", "lock_slot", "prepare_process"]
 
 MAX_SLOT: Final = (1 << 62) - 1
 PATIENCE_S: Final = 0.02
 """Time of the processor that asking for one segment's holders may take; 100 of them take 0.5 ms."""
+LOADER_SLOT: Final = 0
+"""The daemon's own loaders lock this one while they look at a segment; no session has it."""
 
 _FLOCK: Final = struct.Struct("@hhqqi4x")  # struct flock of 64-bit Linux: type, whence, start, len, pid
 _OFD_GETLK: Final = 36

@@ -313,3 +313,38 @@ def test_a_smaller_budget_takes_over_what_fits(
     assert 0 < one.segment_bytes() <= 1 << 20
     assert_right(client, client.area(circle(0, 0, 5)), divided_map)
     assert one.segment_bytes() <= 1 << 20
+
+
+def test_who_holds_what_is_known_across_a_restart(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    """A client that goes on is named: for what serves again, for what was replaced, for what left the map."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, name="the holder") as client:
+        held = {cell.id: cell for cell in client.around(0, 0, 5).raise_for_failures()}
+        slot = client.welcome.session
+        one.kill()
+        divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(5), (0, 0), 700))
+        divided_map.remove_cell("-20_0.pcd")
+        divided_map.write_metadata()
+        one.start()
+        gone = divided_map.id("-20_0.pcd")
+        for cell_id, state in (
+            (divided_map.id("0_-20.pcd"), "resident"),
+            (divided_map.id("0_0.pcd"), "zombie"),
+            (gone, "zombie"),
+        ):
+            (segment,) = client.show(cell_id).segments
+            assert (segment.segment, segment.state) == (held[cell_id].segment, state)
+            assert [(h.session, h.pid, h.uid, h.client) for h in segment.holders] == [
+                (slot, os.getpid(), os.getuid(), "the holder")
+            ]
+            assert segment.holders[0].command
+        assert client.welcome.session == slot
+        stats = client.stats()
+        (row,) = stats.sessions
+        old = [held[divided_map.id("0_0.pcd")], held[gone]]
+        old_bytes = sum(os.stat(f"{one.shm_dir}{cell.segment}.zombie").st_size for cell in old)
+        assert (row.superseded, row.superseded_bytes) == (2, old_bytes)
+        assert row.mapped_bytes == one.segment_bytes()
+        assert stats.unknown_holders == 0
+        with pytest.raises(shmmap.UnknownCell):
+            client.show("nowhere.pcd")

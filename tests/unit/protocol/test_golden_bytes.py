@@ -19,7 +19,7 @@ HANDLE = m.Handle("a.pcd", 1, "points", "00", 0, 8192, 9, 0.0, 0.0, 20.0, 20.0)
 
 # message, what PROTOCOL.md makes of it, and the bytes
 REQUESTS: list[tuple[Any, list[Any], str]] = [
-    (m.Hello(1, 1, 0, "c"), ["hello", 1, 1, 0, "c"], "95a568656c6c6f010100a163"),
+    (m.Hello(1, 1, 0, "c", 9), ["hello", 1, 1, 0, "c", 9], "96a568656c6c6f010100a16309"),
     (
         m.Metadata(2, m.BoxMessage(0.0, 1.0, 2.0, 3.0), 5, 6, 7),
         ["metadata", 2, ["box", 0.0, 1.0, 2.0, 3.0, None, None], 5, 6, 7],
@@ -167,13 +167,13 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ["b.pcd"],
             b"\x02\x00\x00\x00\x00\x00\x00\x00",
             [["c", "points"]],
-            [["d", "points", "over_budget", "no", [[0, 0, 0, "unknown", 8, 1]]]],
+            [["d", "points", "over_budget", "no", [[0, 0, 0, "unknown", 8, 1, ""]]]],
         ],
         (
             "99a563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
             "000000cb0000000000000000cb4034000000000000cb4034000000000000c291a5622e706364c408"
             "02000000000000009192a163a6706f696e74739195a164a6706f696e7473ab6f7665725f62756467"
-            "6574a26e6f9196000000a7756e6b6e6f776e0801"
+            "6574a26e6f9197000000a7756e6b6e6f776e0801a0"
         ),
     ),
     (
@@ -187,12 +187,27 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
     (m.Released(6), ["released", 6], "92a872656c656173656406"),
     (
         m.StatsReply(
-            7, 3, 5, {"requests": 1}, (m.SessionRow(4, 5, 6, 7, "c", "cmd", 1, 2, 3, 0.5, (1.0, 2.0)),), 1, 2
+            7,
+            3,
+            5,
+            {"requests": 1},
+            (m.SessionRow(4, 5, 6, 7, "c", "cmd", 1, 2, 3, 0.5, (1.0, 2.0), 8, 9, 10),),
+            1,
+            2,
         ),
-        ["stats_reply", 7, 3, 5, {"requests": 1}, [[4, 5, 6, 7, "c", "cmd", 1, 2, 3, 0.5, [1.0, 2.0]]], 1, 2],
+        [
+            "stats_reply",
+            7,
+            3,
+            5,
+            {"requests": 1},
+            [[4, 5, 6, 7, "c", "cmd", 1, 2, 3, 0.5, [1.0, 2.0], 8, 9, 10]],
+            1,
+            2,
+        ],
         (
-            "98ab73746174735f7265706c7907030581a8726571756573747301919b04050607a163a3636d6401"
-            "0203cb3fe000000000000092cb3ff0000000000000cb40000000000000000102"
+            "98ab73746174735f7265706c7907030581a8726571756573747301919e04050607a163a3636d6401"
+            "0203cb3fe000000000000092cb3ff0000000000000cb400000000000000008090a0102"
         ),
     ),
     (
@@ -205,7 +220,7 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             20.0,
             20.0,
             300,
-            (m.ShownSegment("points", 1, "00", "zombie", 1, 2, (m.Holder(4, 5, 6, "c", 7, 8),)),),
+            (m.ShownSegment("points", 1, "00", "zombie", 1, 2, (m.Holder(4, 5, 6, "c", 7, 8, "cmd"),)),),
             ("points",),
             "bad",
             -1.0,
@@ -222,7 +237,7 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             20.0,
             20.0,
             300,
-            [["points", 1, "00", "zombie", 1, 2, [[4, 5, 6, "c", 7, 8]]]],
+            [["points", 1, "00", "zombie", 1, 2, [[4, 5, 6, "c", 7, 8, "cmd"]]]],
             ["points"],
             "bad",
             -1.0,
@@ -231,8 +246,8 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
         ],
         (
             "9faa73686f776e5f63656c6c08a16101cb0000000000000000cb0000000000000000cb4034000000"
-            "000000cb4034000000000000cd012c9197a6706f696e747301a23030a67a6f6d6269650102919604"
-            "0506a163070891a6706f696e7473a3626164cbbff0000000000000cb3ff0000000000000"
+            "000000cb4034000000000000cd012c9197a6706f696e747301a23030a67a6f6d6269650102919704"
+            "0506a1630708a3636d6491a6706f696e7473a3626164cbbff0000000000000cb3ff0000000000000"
             "91a6706f696e7473"
         ),
     ),
@@ -299,7 +314,7 @@ def test_replies_of_a_later_minor_version_are_read(message: object, elements: li
 @pytest.mark.parametrize(
     ("short", "full"),
     [
-        (["hello", 1, 1, 0], m.Hello(1, 1, 0, "")),
+        (["hello", 1, 1, 0], m.Hello(1, 1, 0, "", 0)),
         (["metadata", 1], m.Metadata(1, None, None, 0, 1000)),
         (
             ["area", 1, ["box", 0, 1, 2, 3]],
