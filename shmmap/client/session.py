@@ -18,6 +18,7 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
+from shmmap.client.visible import check_visible
 from shmmap.errors import BadRequest, NoAnswer
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
@@ -150,6 +151,8 @@ class Session:
             step("client.answer")
             answer = Answer(lambda handle: self._attach(handle, connection, populate), self.whole_id)
             answer.take(reply, range(len(reply.cells)))
+            if answer.gone:
+                check_visible(self._shm_dir or self.welcome.shm_dir, self.welcome.segment_prefix)
             for _ in range(_STALE_ROUNDS):
                 if not answer.gone or time.monotonic() >= deadline_s:
                     break

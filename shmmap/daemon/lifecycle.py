@@ -297,8 +297,8 @@ class _Life:
                     socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
                 bind_socket(socket, self._socket_path, self._gid, own=self._owns_socket)
                 step("daemon.bind")
-                server.guard()
                 bind_socket(events.socket, events_path(self._socket_path), self._gid)
+                server.guard()
                 server.watch(events.fd, events.drain)
                 self._event_log.send = events.send
                 self._tell_epoch("started")
