@@ -343,7 +343,7 @@ class _Life:
     def _status(self) -> str:
         books = self._store.books
         return status_line(
-            resident=books.resident_count,
+            resident=len({resident.key.cell_id for resident in books.residents()}),  # some have layers, too
             cells=len(self._store.catalogue),
             used_bytes=books.used_bytes,
             budget_bytes=books.budget_bytes,

@@ -111,8 +111,10 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
     """Look at the machine and at what the instance's daemon tells."""
     try:
         seen, unreadable = read_statistics(config.instance, config.shm_dir), ""
-    except (ShmmapError, OSError) as error:
-        seen, unreadable = None, str(error)
+    except ShmmapError as error:
+        seen, unreadable = None, error.message
+    except OSError as error:
+        seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
     if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
         path = seen.identity.endpoint
     else:

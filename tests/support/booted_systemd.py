@@ -147,7 +147,7 @@ class BootedSystemd:
     def _boot(self, systemd: str) -> None:
         script = self._directory / "prepare"
         script.write_text(PREPARE)
-        enter = 'echo 0 >"$1/cgroup.procs" || exit 77; shift; exec "$@"'
+        enter = 'echo 0 >"$1/cgroup.procs" || exit 77; shift; exec setpriv --pdeathsig KILL "$@"'
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
             notify.bind(str(self.shared / "notify"))
             self._process = subprocess.Popen(

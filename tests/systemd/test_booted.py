@@ -117,10 +117,23 @@ def test_the_daemon_has_no_rights_it_does_not_need(fresh: BootedSystemd) -> None
     fresh.run("systemctl", "start", "shmmapd")
     with Client(fresh, "alice") as alice:
         assert len(alice.ask()) == 12
+    # layers are compiled: machine code is made at run time, and kept for the next loader
+    layer = [
+        "query",
+        "--id",
+        f"{MAP}/pointcloud_map.pcd/0_0.pcd",
+        "--layer",
+        "voxel(leaf=1)",
+        "--wait",
+        "120",
+    ]
+    done = shmmap(fresh, *layer, user="alice")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "voxel" in done.stdout
+    assert fresh.shell("find /var/cache/shmmap/numba -name '*.nbc'") != ""
     pid = fresh.properties("shmmapd")["MainPID"]
-    status = dict(
-        line.split(":\t", 1) for line in fresh.shell(f"cat /proc/{pid}/status").splitlines() if ":\t" in line
-    )
+    lines = fresh.shell(f"cat /proc/{pid}/status").splitlines()
+    status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
     assert (status["CapEff"].strip("0"), status["CapBnd"].strip("0")) == ("", "")
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
     inside = ["nsenter", f"--target={pid}", "--mount", "--net", "setpriv", "--reuid=shmmap", "--regid=shmmap"]
