@@ -82,19 +82,20 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
 
 
-def add_statistics_options(parser: argparse.ArgumentParser) -> None:
-    """Add what finds a daemon's statistics segment, and ``--json``."""
+def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
+    """Add what finds a daemon's statistics segment, and ``--json`` unless the verb has none."""
     group = parser.add_argument_group("which daemon")
     group.add_argument("--instance", metavar="NAME", help="instance name (default: default)")
     group.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
     group.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     group.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
-    add_json_option(parser)
+    if json:
+        add_json_option(parser)
 
 
-def add_daemon_options(parser: argparse.ArgumentParser) -> None:
-    """Add what finds a daemon and bounds how long it is asked, and ``--json``."""
-    add_statistics_options(parser)
+def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
+    """Add what finds a daemon and bounds how long it is asked, and ``--json`` unless the verb has none."""
+    add_statistics_options(parser, json=json)
     parser.add_argument(
         "--timeout",
         metavar="SECONDS",

@@ -11,7 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["Column", "format_bytes", "format_duration", "print_json", "print_pairs", "print_table"]
+__all__ = [
+    "Column",
+    "format_bytes",
+    "format_duration",
+    "print_json",
+    "print_pairs",
+    "print_table",
+    "wants_style",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +39,7 @@ def print_json(value: object) -> None:
 
 def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under headings: ruled and coloured on a terminal, plain and aligned in a pipe."""
-    if _wants_style() and importlib.util.find_spec("rich") is not None:  # a client-only install lacks it
+    if wants_style() and importlib.util.find_spec("rich") is not None:  # a client-only install lacks it
         _print_rich(columns, rows)
         return
     cells = [[column.name for column in columns], *rows]
@@ -44,7 +52,8 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         print("  ".join(padded).rstrip())
 
 
-def _wants_style() -> bool:
+def wants_style() -> bool:
+    """Whether to print colours: on a terminal that can, unless NO_COLOR says not to."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 

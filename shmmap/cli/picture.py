@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 from xml.sax.saxutils import escape
 
-__all__ = ["CellSquare", "Raster", "Vehicle", "top_view_svg"]
+__all__ = ["CellSquare", "Raster", "Vehicle", "WindowBox", "top_view_svg"]
 
 BoxTuple: TypeAlias = tuple[float, float, float, float]
 
@@ -55,12 +55,24 @@ class Raster:
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """Where the vehicle is (metres), where it heads (radians from x to y), how far it looks."""
+    """Where a vehicle is (metres), where it heads (radians from x to y), how far it looks; a tooltip.
+
+    ``heading`` None is not known, ``radius`` 0 draws no window.
+    """
 
     x: float
     y: float
-    heading: float
+    heading: float | None
     radius: float
+    title: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowBox:
+    """A rectangle (metres) that somebody follows."""
+
+    box: BoxTuple
+    title: str = ""
 
 
 class _Page:
@@ -97,6 +109,8 @@ def top_view_svg(
     driven: Sequence[tuple[float, float]] = (),
     ahead: Sequence[tuple[float, float]] = (),
     vehicle: Vehicle | None = None,
+    others: Sequence[Vehicle] = (),
+    windows: Sequence[WindowBox] = (),
 ) -> str:
     """Return the picture.
 
@@ -112,6 +126,10 @@ def top_view_svg(
         The ground: points seen from above.
     driven, ahead
         The route behind and before the vehicle, (x, y) each, metres.
+    vehicle, others
+        The one that drove the route, and more.
+    windows
+        Rectangles that are followed.
     """
     page = _Page(bounds)
     parts = [
@@ -138,11 +156,14 @@ def top_view_svg(
         parts.append(f'<polyline class="route ahead" points="{page.points(ahead)}"/>')
     if driven:
         parts.append(f'<polyline class="route" points="{page.points(driven)}"/>')
-    if vehicle is not None:
-        parts += _vehicle(page, vehicle)
+    for window in windows:
+        tooltip = f"<title>{escape(window.title)}</title>"
+        parts.append(f'<rect class="window" {page.rectangle(window.box)}>{tooltip}</rect>')
+    for one in (*others, *([vehicle] if vehicle is not None else [])):
+        parts += _vehicle(page, one)
     parts += [
         "</g>",
-        *_caption(page, title, note, {cell.state for cell in cells}, bool(driven)),
+        *_caption(page, title, note, {cell.state for cell in cells}, bool(driven), bool(others or windows)),
         "</svg>",
         "",
     ]
@@ -151,17 +172,25 @@ def top_view_svg(
 
 def _vehicle(page: _Page, vehicle: Vehicle) -> list[str]:
     x, y = page.x(vehicle.x), page.y(vehicle.y)
-    turn = -math.degrees(vehicle.heading)
-    return [
-        f'<circle class="window" cx="{x:.1f}" cy="{y:.1f}" r="{vehicle.radius * page.scale:.1f}"/>',
-        (
+    tooltip = f"<title>{escape(vehicle.title)}</title>" if vehicle.title else ""
+    parts = []
+    if vehicle.radius > 0:
+        radius = vehicle.radius * page.scale
+        parts.append(f'<circle class="window" cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}"/>')
+    if vehicle.heading is None:
+        parts.append(f'<circle class="vehicle" cx="{x:.1f}" cy="{y:.1f}" r="7">{tooltip}</circle>')
+    else:
+        turn = -math.degrees(vehicle.heading)
+        parts.append(
             f'<path class="vehicle" transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})"'
-            ' d="M 12 0 L -8 7 L -4 0 L -8 -7 Z"/>'
-        ),
-    ]
+            f' d="M 12 0 L -8 7 L -4 0 L -8 -7 Z">{tooltip}</path>'
+        )
+    return parts
 
 
-def _caption(page: _Page, title: str, note: str, states: set[str], with_route: bool) -> list[str]:
+def _caption(
+    page: _Page, title: str, note: str, states: set[str], with_route: bool, with_clients: bool
+) -> list[str]:
     top = page.map_height + 2 * MARGIN_PX
     bar_m = _round_length(0.18 * (page.max_x - page.min_x))
     right = WIDTH_PX - MARGIN_PX
@@ -173,13 +202,13 @@ def _caption(page: _Page, title: str, note: str, states: set[str], with_route: b
         f'<text x="{(left + right) / 2:.1f}" y="{top + 65:.0f}" text-anchor="middle">{bar_m:g} m</text>',
     ]
     x, y = MARGIN_PX, top + 58
-    for label, symbol in _legend(states, with_route):
+    for label, symbol in _legend(states, with_route, with_clients):
         parts.append(f'<g transform="translate({x:.0f} {y:.0f})">{symbol}<text x="26">{label}</text></g>')
         x += 44 + 7.6 * len(label)
     return parts
 
 
-def _legend(states: set[str], with_route: bool) -> list[tuple[str, str]]:
+def _legend(states: set[str], with_route: bool, with_clients: bool) -> list[tuple[str, str]]:
     square = '<rect class="cell {}" y="-11" width="16" height="13"/>'
     names = {
         "": "cell on disk",
@@ -190,6 +219,9 @@ def _legend(states: set[str], with_route: bool) -> list[tuple[str, str]]:
     entries = [(label, square.format(state)) for state, label in names.items() if state in states]
     if with_route:
         entries.append(("route driven", '<path class="route" d="M 0 -5 h 18"/>'))
+    if with_clients:
+        entries.append(("client", '<circle class="vehicle" cx="9" cy="-5" r="6"/>'))
+    if with_route or with_clients:
         entries.append(("window", '<path class="window" d="M 0 -5 h 19"/>'))
     return entries
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from shmmap.cli.cache_verdict import cache_verdict
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.output import format_bytes, format_duration, print_json, print_pairs
 from shmmap.errors import DaemonUnreachable
@@ -114,6 +115,8 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     evicted, over_budget, quota = (
         f"{count[name]:,}" for name in ("evictions", "refused_over_budget", "refused_quota")
     )
+    verdict = cache_verdict(count)
+    lines.append(("cache", f"{'TOO SMALL' if verdict.too_small else 'large enough'}: {verdict.why}"))
     if {evicted, over_budget, quota} != {"0"}:
         text = f"{evicted} evicted, {over_budget} refused for the budget, {quota} for a quota"
         lines.append(("pressure", text))

@@ -18,6 +18,7 @@ CONTRACT += ["pin", "unpin", "stop"]
 CONTRACT += ["config", "unit", "doctor"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
 CONTRACT += ["divide", "merge"]
+CONTRACT += ["top", "tail", "map", "metrics"]
 
 
 def parse(*words: str) -> argparse.Namespace:

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The statistics in Prometheus' text format, version 0.0.4.
+
+https://prometheus.io/docs/instrumenting/exposition_formats/ says what a line may look like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from shmmap.statistics.counters import SPANS, WINDOWED
+from shmmap.statistics.histogram import STEPS, Histogram, lower_bound_ns
+from shmmap.statistics.reader import Snapshot
+
+__all__ = ["exposition"]
+
+_TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
+
+
+def exposition(found: Snapshot, instance: str) -> str:
+    """Return the text of a scrape; of a daemon that is not there it says only that it is not up.
+
+    Parameters
+    ----------
+    instance
+        Label ``daemon`` of every sample (``instance`` is Prometheus' own label).
+    """
+    return "\n".join(_lines(found, instance)) + "\n"
+
+
+def _lines(found: Snapshot, instance: str) -> Iterator[str]:
+    label = f'daemon="{_escaped(instance)}"'
+
+    def one(name: str, kind: str, text: str, value: float, more: str = "") -> Iterable[str]:
+        name = f"shmmap_{name}"
+        return (
+            f"# HELP {name} {_escaped_help(text)}",
+            f"# TYPE {name} {kind}",
+            f"{name}{{{label}{more}}} {_number(value)}",
+        )
+
+    yield from one("up", "gauge", "1 if the daemon is healthy", found.state == "healthy")
+    identity = found.identity
+    if identity is None:
+        return
+    yield from one("beat_age_seconds", "gauge", "Time since the daemon last wrote", found.beat_age_s)
+    started = identity.started_unix_ns * 1e-9
+    yield from one("start_time_seconds", "gauge", "When this life of the daemon began, Unix time", started)
+    more = "".join(
+        f',{name}="{_escaped(value)}"'
+        for name, value in (
+            ("version", identity.library_version),
+            ("map", identity.map_path),
+            ("map_version", f"{identity.map_version:016x}"),
+            ("epoch", f"{identity.epoch:016x}"),
+            ("state", found.state),
+        )
+    )
+    yield from one("info", "gauge", "What this daemon is and serves", 1, more)
+    for counter in found.descriptions:
+        if counter.name in _TOLD_ELSEWHERE:
+            continue
+        value: float = found.counters[counter.name]
+        name = counter.name
+        if counter.unit == "ns":
+            name, value = name.removesuffix("_unix_ns") + "_timestamp_seconds", value * 1e-9
+        if counter.kind == "counter":
+            name += "_total"
+        yield from one(name, counter.kind, counter.help, value)
+    for described in found.histogram_descriptions:
+        name = f"shmmap_{described.name}_seconds"
+        yield f"# HELP {name} {_escaped_help(described.help)}"
+        yield f"# TYPE {name} histogram"
+        yield from _histogram(name, label, found.histograms[described.name])
+
+
+def _histogram(name: str, label: str, histogram: Histogram) -> Iterator[str]:
+    """One bucket per octave: a quarter of what the segment has is enough for a chart."""
+    below = 0
+    counts = histogram.counts
+    for bucket, count in enumerate(counts[:-1]):
+        below += count
+        if bucket % STEPS == 0:
+            yield f'{name}_bucket{{{label},le="{lower_bound_ns(bucket + 1) * 1e-9:.9g}"}} {below}'
+    total = below + counts[-1]
+    yield f'{name}_bucket{{{label},le="+Inf"}} {total}'
+    yield f"{name}_sum{{{label}}} {_number(histogram.sum_ns * 1e-9)}"
+    yield f"{name}_count{{{label}}} {total}"
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1 << 62 else f"{value:.9f}"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+
+
+def _escaped_help(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("\n", "\\n")

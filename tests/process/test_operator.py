@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Somebody who knows Linux, but not shmmap, finds out from the command line alone what they have to know."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import shmmap as client_library
+from shmmap.statistics.reader import StatisticsReader
+from tests.process.conftest import DaemonFactory
+from tests.process.test_cli_verbs import Shmmap
+from tests.process.test_reload import change
+from tests.support.divided_map import DividedMap, make_map
+from tests.support.patience import Patience
+
+DEADLINE_S = 60.0
+
+
+def after(shmmap: Shmmap, told: Callable[[dict[str, int]], bool]) -> dict[str, int]:
+    """Wait for a beat that tells this; returns its counters."""
+    waiting = Patience()
+    with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
+        while waiting(not told(reader.snapshot(tables=False).counters)):
+            os.sched_yield()
+        return reader.snapshot(tables=False).counters
+
+
+@pytest.fixture
+def shmmap(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> Shmmap:
+    """Return the command line of a daemon with room for everything."""
+    return Shmmap(daemon(divided_map.root), tmp_path)
+
+
+@pytest.fixture
+def tight(daemon: DaemonFactory, tmp_path: Path) -> Shmmap:
+    """Return the command line of a daemon whose budget holds a few cells of 72 kB."""
+    made = make_map(tmp_path / "tight", columns=6, rows=6, points=4200)
+    return Shmmap(daemon(made.root, "--budget", "1M"), tmp_path)
+
+
+def test_six_questions(tight: Shmmap) -> None:
+    with client_library.connect(tight.daemon.endpoint, name="localization") as client:
+        held = client.around(0.0, 0.0, radius=25.0, wait=20.0)
+        cells = len(held)
+        assert cells
+        after(tight, lambda told: told["segments_pinned"] == cells and told["sessions"] == 1)
+
+        # is it healthy?
+        assert tight("health").startswith("healthy: pid ")
+
+        # what is resident around (x, y)?
+        shown = tight("map", "--circle", "0,0,60")
+        picture, legend = shown.rsplit("# in memory", 1)
+        assert "@" in picture
+        assert picture.count("#") > picture.count("@")
+        assert "client" in legend
+        near = tight.json("query", "--circle", "5,5,1", "--wait", "none")
+        assert [cell["box"] for cell in near["cells"]] == [[0.0, 0.0, 20.0, 20.0]]
+
+        # who holds memory?
+        (row,) = [line for line in tight("top").splitlines() if line.startswith("localization")]
+        assert str(os.getpid()) in row
+        assert re.search(r"\d+(\.\d)? KiB", row)
+        (holder,) = [c for c in tight.json("clients")["clients"] if c["client"] == "localization"]
+        assert holder["cells"] == cells
+
+        # why was my request partial?
+        partial = tight.run("query", "--box", "-60,-60,60,60", "--wait", "20")
+        assert partial.returncode == 1
+        assert "over_budget" in partial.stdout
+        assert "localization" in partial.stdout
+
+        # what changed in the last minute?
+        told = tight("tail")
+        assert re.search(r"^\d\d:\d\d:\d\d\.\d{3}  joined    localization, pid ", told, re.MULTILINE)
+        assert re.search(r"loaded    0_0\.pcd points ", told)
+        assert re.search(r"pressure  [\d,]+ cells refused, .* of 1\.0 MiB used, .* mapped by clients", told)
+
+        # is the cache too small?
+        after(tight, lambda told: told["refused_over_budget_10min"] > 0)
+        for verb in ("status", "top"):
+            assert re.search(r"^cache +too small: [\d,]+ cells refused", tight(verb), re.MULTILINE | re.I)
+        judged = tight.json("top")
+        assert judged["cache_too_small"]
+        assert "--budget" in judged["cache"]
+        assert sum(judged["budget"].values()) == 1 << 20
+        del held
+
+
+def test_tail_in_json_and_what_it_leaves_out(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    with client_library.connect(shmmap.daemon.endpoint, name="driver") as client:
+        client.selected([divided_map.id("0_0.pcd")], wait=20.0)
+        change(divided_map, "0_0.pcd", 5)
+        client.reload()
+    lines = [json.loads(line) for line in shmmap("tail", "--json").splitlines()]
+    kinds = [line["event"] for line in lines]
+    assert kinds[:5] == ["epoch", "joined", "loaded", "reload", "changed"]
+    assert all(abs(line["time"] - time.time()) < 3600 for line in lines)
+    assert re.fullmatch(r"[0-9a-f]{16}", lines[2]["version"])
+    assert lines[4] | {"id": "0_0.pcd", "how": "changed"} == lines[4]
+    assert shmmap("tail", "--since", "0") == ""
+    told = shmmap("tail")
+    assert told.count("joined    shmmap tail") == told.count(
+        "left      shmmap tail"
+    )  # of itself it tells nothing
+
+
+def test_tail_follows(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "shmmap.cli", "tail", "--follow", "--json", "--since", "0"],
+        env=shmmap.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as tail:  # fmt: skip
+        try:
+            assert tail.stdout is not None
+            waiting = Patience()
+            seen: list[str] = []
+            with client_library.connect(shmmap.daemon.endpoint, name="driver") as client:
+                while waiting("loaded" not in seen):
+                    # asked until it is told: the program may not be up yet
+                    client.evict([divided_map.id("0_0.pcd")])
+                    client.selected([divided_map.id("0_0.pcd")], wait=20.0)
+                    while select.select([tail.stdout], [], [], 0.1)[0]:
+                        seen.append(json.loads(tail.stdout.readline())["event"])
+        finally:
+            tail.send_signal(signal.SIGINT)
+            _, complaint = tail.communicate(timeout=DEADLINE_S)
+        assert tail.returncode == 130, complaint
+
+
+def test_metrics_and_files(shmmap: Shmmap, divided_map: DividedMap, tmp_path: Path) -> None:
+    shmmap("query", "--circle", "0,0,25")
+    metrics = shmmap("metrics")
+    assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 1' in metrics
+    picture, page = tmp_path / "map.svg", tmp_path / "map.html"
+    shmmap("map", "--svg", str(picture), "--html", str(page))
+    tree = ElementTree.fromstring(picture.read_text())
+    resident = ".//{http://www.w3.org/2000/svg}rect[@class='cell resident']/{http://www.w3.org/2000/svg}title"
+    assert len(tree.findall(resident)) == len(divided_map.in_circle(0, 0, 25))
+    assert "<!doctype html>" in page.read_text()
+    assert "cannot write" in shmmap.run("map", "--svg", str(tmp_path / "no" / "map.svg")).stderr
+
+
+def test_while_the_daemon_is_stopped_and_after_it_was_killed(shmmap: Shmmap) -> None:
+    shmmap("query", "--circle", "0,0,25")
+    shmmap.daemon.send(signal.SIGSTOP)
+    assert "STOPPED" in shmmap("top")
+    assert "the daemon is stopped: cells on disk are not shown" in shmmap("map")
+    assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 0' in shmmap("metrics")
+    shmmap.daemon.send(signal.SIGCONT)
+    shmmap.daemon.kill()
+    for verb in ("top", "map", "metrics"):
+        shmmap(verb, code=69)
+    assert shmmap.run("tail").returncode == 69
+    shmmap.daemon.start()
+
+
+def read_until(fd: int, wanted: bytes, seen: bytes = b"") -> bytes:
+    """Read a terminal until it was sent something."""
+    end_s = time.monotonic() + DEADLINE_S
+    while wanted not in seen:
+        assert select.select([fd], [], [], max(0.0, end_s - time.monotonic()))[0], seen
+        try:
+            seen += os.read(fd, 65536)
+        except OSError:  # the other side is closed
+            break
+    assert wanted in seen, seen
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 0)]
+)
+def test_top_leaves_the_terminal_as_it_was(shmmap: Shmmap, number: signal.Signals, code: int) -> None:
+    ours, theirs = pty.openpty()
+    try:
+        before = termios.tcgetattr(theirs)
+        environment = shmmap.environment | {"TERM": "xterm-256color", "COLUMNS": "100", "LINES": "40"}
+        environment.pop("NO_COLOR", None)
+        with subprocess.Popen(
+            [sys.executable, "-m", "shmmap.cli", "top", "--interval", "0.05"],
+            env=environment, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+        ) as top:  # fmt: skip
+            seen = read_until(ours, b"nobody is connected")
+            assert b"\x1b[?1049h" in seen  # the alternate screen
+            top.send_signal(number)
+            seen = read_until(ours, b"\x1b[?1049l", seen)
+            seen = read_until(ours, b"\x1b[?25h", seen)  # the cursor is back
+            assert top.wait(DEADLINE_S) == code
+        assert termios.tcgetattr(theirs) == before
+    finally:
+        os.close(ours)
+        os.close(theirs)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exposition is what Prometheus' parser takes: judged by the format's rules, line by line."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+
+import pytest
+
+from shmmap.segment.directory import ShmDirectory
+from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
+from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
+from shmmap.statistics.prometheus import exposition
+from shmmap.statistics.reader import Snapshot, read_statistics
+from shmmap.statistics.writer import StatisticsWriter
+
+SAMPLE = re.compile(r'([a-zA-Z_:][a-zA-Z0-9_:]*)\{((?:[a-zA-Z_]\w*="(?:[^"\\\n]|\\["\\n])*",?)*)\} (\S+)')
+LABEL = re.compile(r'(\w+)="((?:[^"\\]|\\.)*)"')
+
+
+def parse(text: str) -> tuple[dict[str, str], dict[tuple[str, str], float]]:
+    """Types by family, samples by (name, le); each family is described before its samples, once."""
+    assert text.endswith("\n")
+    types: dict[str, str] = {}
+    helped: list[str] = []
+    samples: dict[tuple[str, str], float] = {}
+    for line in text.splitlines():
+        if line.startswith("# HELP "):
+            helped.append(line.split(" ", 3)[2])
+            assert helped.count(helped[-1]) == 1
+        elif line.startswith("# TYPE "):
+            _, _, name, kind = line.split(" ")
+            assert name == helped[-1]
+            types[name] = kind
+        else:
+            found = SAMPLE.fullmatch(line)
+            assert found is not None, line
+            family = helped[-1]
+            assert found[1] in ({family} | {f"{family}_{s}" for s in ("bucket", "sum", "count")}), line
+            labels = dict(LABEL.findall(found[2]))
+            assert labels["daemon"] == "unit"
+            key = (found[1], labels.get("le", ""))
+            assert key not in samples
+            samples[key] = float(found[3])
+    assert set(types) == set(helped)
+    return types, samples
+
+
+@pytest.fixture
+def found() -> Iterator[Snapshot]:
+    with tempfile.TemporaryDirectory(prefix="shmmap-unit-", dir="/dev/shm") as path:
+        shm = ShmDirectory(path)
+        identity = DaemonIdentity(
+            pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),
+            epoch=5, instance="unit", endpoint="/run/x.sock", map_path='/maps/"a"\\b\nc', map_version=7,
+            shm_dir=path, id_prefix="/maps/", library_version="1.2.3", started_unix_ns=5 * 10**9,
+        )  # fmt: skip
+        writer = StatisticsWriter(shm, "unit", identity)
+        writer.add("requests", 3)
+        writer.set("last_reload_unix_ns", 1_500_000_000_500_000_000)
+        for duration_ns in (500, 3_000_000, 3_500_000, 10**13):
+            writer.add_duration("load", duration_ns)
+        writer.beat()
+        yield read_statistics("unit", path)
+        writer.close()
+        shm.close()
+
+
+def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:
+    types, samples = parse(exposition(found, "unit"))
+    assert samples["shmmap_up", ""] == 1
+    assert (types["shmmap_requests_total"], samples["shmmap_requests_total", ""]) == ("counter", 3)
+    assert types["shmmap_budget_bytes"] == "gauge"
+    assert samples["shmmap_last_reload_timestamp_seconds", ""] == 1_500_000_000.5
+    told = {name.removeprefix("shmmap_").removesuffix("_total") for name in types}
+    expected = {c.name for c in COUNTERS if not c.name.endswith(("_10s", "_1min", "_10min"))}
+    assert expected - {"last_reload_unix_ns"} <= told
+    assert {f"{h.name}_seconds" for h in HISTOGRAMS} <= told
+
+
+def test_histograms_are_cumulative(found: Snapshot) -> None:
+    types, samples = parse(exposition(found, "unit"))
+    assert types["shmmap_load_seconds"] == "histogram"
+    buckets = [(float(le), n) for (name, le), n in samples.items() if name == "shmmap_load_seconds_bucket"]
+    assert buckets == sorted(buckets)
+    counts = [count for _, count in buckets]
+    assert counts == sorted(counts)
+    assert (buckets[-1][0], counts[-1]) == (float("inf"), 4)
+    assert max(count for bound, count in buckets if bound < 3e-3) == 1
+    assert min(count for bound, count in buckets if bound > 3.5e-3) == 3
+    assert samples["shmmap_load_seconds_count", ""] == 4
+    assert samples["shmmap_load_seconds_sum", ""] == pytest.approx(10_000.0065005)
+
+
+def test_a_daemon_that_is_not_there_is_not_up() -> None:
+    _, samples = parse(exposition(Snapshot("absent", None), "unit"))
+    assert samples == {("shmmap_up", ""): 0.0}
