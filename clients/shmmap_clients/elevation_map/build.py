@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole map, one cell at a time: list, load by id, reduce to columns, let go."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from shmmap import Cell, CellError, CellInfo, Client, LoadTimeout, MapMissing, ShmmapError
+from shmmap_clients.elevation_map.cell_columns import columns_of, heights_of
+from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
+from shmmap_clients.elevation_map.grid import ElevationGrid
+from shmmap_clients.elevation_map.rule import ElevationRule
+from shmmap_clients.elevation_map.seams import ColumnBox, Seams
+
+__all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map", "map_key"]
+
+FORMAT: Final = 1
+_EVERY: Final = 64  # cells between checkpoints
+
+
+class MapChanged(ShmmapError):
+    """The map changed while its elevation was being made: begin again."""
+
+    code = "map_changed"
+    exit_code = 75
+
+
+@dataclass(frozen=True, slots=True)
+class BuildProgress:
+    """How far a build is: cells done of all, and points (or columns of layers) read."""
+
+    done: int
+    cells: int
+    rows: int
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltElevation:
+    """A finished elevation map.
+
+    Attributes
+    ----------
+    grid
+        The heights.
+    map_version
+        State of the map that it is of.
+    cells
+        Cells of the map.
+    loaded
+        Of those, how many this call had to load: 0 where the cache had it all.
+    stray
+        Points left out because they lie outside the box of their cell.
+    failed
+        Cells that could not be had; what they hold is missing.
+    """
+
+    grid: ElevationGrid
+    map_version: int
+    cells: int
+    loaded: int
+    stray: int
+    failed: tuple[CellError, ...]
+
+
+def map_key(map_version: int, rule: ElevationRule) -> str:
+    """Return the name under which a map's elevation is cached, 32 hex digits."""
+    text = json.dumps([FORMAT, f"{map_version:016x}", rule.document], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def build_elevation_map(
+    client: Client,
+    rule: ElevationRule,
+    cache: Path,
+    *,
+    wait_s: float = 60.0,
+    progress: Callable[[BuildProgress], None] | None = None,
+) -> BuiltElevation:
+    """Return the elevation of the daemon's whole map; made only where the cache does not have it.
+
+    A build that was interrupted goes on from its last checkpoint.
+
+    Parameters
+    ----------
+    client
+        Whom to ask.
+    rule
+        What a height is.
+    cache
+        Directory; each map and rule has its own inside.
+    wait_s
+        How long one cell may take.
+    progress
+        Called after each cell.
+
+    Raises
+    ------
+    MapMissing
+        The map has no cells.
+    MapChanged
+        It changed meanwhile.
+    LoadTimeout
+        A cell was not there in time.
+    """
+    listing = client.metadata()
+    if not len(listing):
+        raise MapMissing("the map has no cells")
+    # row after row: only the strip between two rows has to wait
+    cells = sorted(listing, key=lambda cell: (cell.box[1], cell.box[0], cell.id))
+    directory = cache / map_key(listing.map_version, rule)
+    boxes = [ColumnBox.of_box(cell.box, rule.resolution) for cell in cells]
+    first = (min(box.i0 for box in boxes), min(box.j0 for box in boxes))
+    shape = (max(box.j1 for box in boxes) - first[1], max(box.i1 for box in boxes) - first[0])
+    grid = ElevationGrid(directory / "heights", rule.resolution, first, shape)
+    journal = Journal(directory)
+    seams = Seams(boxes)
+    state = journal.read(seams)
+    if state is None:
+        shutil.rmtree(directory, ignore_errors=True)
+        directory.mkdir(parents=True)
+        ElevationGrid.create(grid.path, rule.resolution, first, shape)
+        state = Checkpoint()
+    failed: list[CellError] = []
+    begun = state.done
+    for number in range(state.done, len(cells)):
+        if number + 1 < len(cells):  # the daemon loads it while we compute
+            client.selected((cells[number + 1].id,), rule.layer, wait=None)
+        cell = _load(client, cells[number], rule.layer, wait_s, failed)
+        rows = None
+        if cell is not None:
+            rows = columns_of(cell, rule)
+            state.rows += len(rows)
+            inside = rows.inside(boxes[number])
+            if not inside.all():
+                state.stray += int((~inside).sum())
+                rows = rows.where(inside)
+        complete = seams.add(number, rows)
+        del rows, cell
+        if complete is not None:
+            grid.put(*heights_of(complete, rule))
+        state.done = number + 1
+        if not failed and (state.done % _EVERY == 0 or state.done == len(cells)):
+            journal.write(state, seams)
+        if progress is not None:
+            progress(BuildProgress(state.done, len(cells), state.rows))
+    client.release()
+    loaded = len(cells) - begun
+    return BuiltElevation(grid, listing.map_version, len(cells), loaded, state.stray, tuple(failed))
+
+
+def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:
+    """The cell at the version that was listed; None if it cannot be had, which is remembered."""
+    answer = client.selected((info.id,), layer, wait=wait_s)
+    if answer.failed:
+        failed += answer.failed
+        return None
+    if answer.pending:
+        raise LoadTimeout(
+            f"{info.id} ({layer}): not loaded within {wait_s:g} s", cell_id=info.id, layer=layer
+        )
+    cell = answer.cells[0]
+    if cell.version != info.version:
+        raise MapChanged("the map changed while its elevation was being made", hint="begin again")
+    return cell

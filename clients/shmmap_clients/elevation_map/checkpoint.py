@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an interrupted build needs to go on: how far it was, and the rows that wait at seams."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shmmap_clients.elevation_map.seams import Columns, Seams
+
+__all__ = ["Checkpoint", "Journal"]
+
+
+@dataclass(slots=True)
+class Checkpoint:
+    """Cells done, in order; rows read; points outside their cell."""
+
+    done: int = 0
+    rows: int = 0
+    stray: int = 0
+
+
+class Journal:
+    """Keeps the latest checkpoint of a build in its directory.
+
+    ``seams-N.npz`` is written first, then ``state.json`` with N by rename: whenever a build dies, the state
+    names seams that are there whole.  Columns finished after a checkpoint are made again, with the
+    same heights.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+
+    def write(self, state: Checkpoint, seams: Seams) -> None:
+        """Replace the checkpoint."""
+        arrays = {}
+        for number, rows in seams.waiting.items():
+            arrays[f"i{number}"], arrays[f"j{number}"] = rows.i, rows.j
+            arrays[f"values{number}"] = rows.values
+        with open(self._directory / f"seams-{state.done}.npz", "wb") as file:
+            with zipfile.ZipFile(file, "w") as archive:
+                for name, array in arrays.items():
+                    with archive.open(f"{name}.npy", "w") as member:
+                        np.lib.format.write_array(member, array, allow_pickle=False)
+            file.flush()
+            os.fsync(file.fileno())
+        interim = self._directory / "state.json.tmp"
+        interim.write_text(json.dumps(asdict(state)), encoding="utf-8")
+        interim.replace(self._directory / "state.json")
+        for path in self._directory.glob("seams-*.npz"):
+            if path.name != f"seams-{state.done}.npz":
+                path.unlink()
+
+    def read(self, seams: Seams) -> Checkpoint | None:
+        """Return the latest checkpoint and fill ``seams`` from it; None where there is no good one."""
+        try:
+            state = Checkpoint(**json.loads((self._directory / "state.json").read_text(encoding="utf-8")))
+            with np.load(self._directory / f"seams-{state.done}.npz", allow_pickle=False) as archive:
+                waiting = {
+                    int(name[1:]): Columns(
+                        archive[name], archive[f"j{name[1:]}"], archive[f"values{name[1:]}"]
+                    )
+                    for name in archive.files
+                    if name.startswith("i")
+                }
+        except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+            return None
+        if not (self._directory / "heights").exists():
+            return None
+        seams.waiting.update(waiting)
+        return state

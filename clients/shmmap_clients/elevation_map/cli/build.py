@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap-elevation build``: the whole map, one cell at a time."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shmmap_clients.command_line import print_json
+
+if TYPE_CHECKING:
+    from shmmap_clients.elevation_map.build import BuildProgress
+
+__all__ = ["add_parser", "run"]
+
+_ATTEMPTS = 3
+_EVERY_S = 0.5
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = subparsers.add_parser(
+        "build",
+        help="make an elevation map of the whole map",
+        description="Make the elevation of the daemon's whole map, one cell at a time, and write it."
+        "  What was made before is kept by the map's version and the rule, and an interrupted run goes on.",
+        epilog="JSON: map_version, cells, loaded (cells that this run loaded), rows and columns of the grid,"
+        " resolution, origin (its south-west corner), measured and filled columns, stray points outside"
+        " their cell, failed (cells that could not be had), files.  Exit code: 0, or 1 where cells failed.",
+    )
+    parser.add_argument(
+        "--out", action="append", default=[], metavar="FILE", help=".npz, .tif or .png; may be given again"
+    )
+    parser.add_argument("--hillshade", metavar="FILE", help="a shaded picture (PNG) and its world file")
+    rule = parser.add_argument_group("heights")
+    rule.add_argument(
+        "--rule", choices=("surface", "min", "mean", "max"), default="surface",
+        help="lowest surface as Autoware makes it from points (default); the others from elevation layers",
+    )  # fmt: skip
+    rule.add_argument("--resolution", type=float, default=0.3, metavar="M", help="default 0.3")
+    rule.add_argument("--tolerance", type=float, default=0.2, metavar="M", help="within a cluster (0.2)")
+    rule.add_argument("--height-range", type=float, default=1.0, metavar="M", help="above the lowest (1.0)")
+    rule.add_argument("--min-points", type=int, default=3, metavar="N", help="of a cluster (3)")
+    rule.add_argument(
+        "--fill-radius", type=float, default=1.0, metavar="M", help="fill holes this near to heights (1.0)"
+    )
+    parser.add_argument("--epsg", type=int, metavar="CODE", help="coordinate system of a GeoTIFF")
+    parser.add_argument("--cache", metavar="DIR", help="default: $XDG_CACHE_HOME/shmmap/elevation")
+    parser.add_argument("--wait", type=float, default=60.0, metavar="SECONDS", help="for one cell (60)")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    daemon = parser.add_argument_group("which daemon")
+    daemon.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
+    daemon.add_argument("--shm-dir", metavar="DIR", help="directory of the segments")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Build and write."""
+    import numpy as np
+
+    import shmmap
+    from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
+    from shmmap_clients.elevation_map.grid import FILLED, MEASURED
+    from shmmap_clients.elevation_map.output import SUFFIXES, write_elevation, write_hillshade
+    from shmmap_clients.elevation_map.rule import ElevationRule
+
+    rule = ElevationRule(args.rule, args.resolution, args.tolerance, args.height_range, args.min_points)
+    files = [Path(name) for name in args.out]
+    for path in files:
+        if path.suffix.lower() not in SUFFIXES:
+            raise shmmap.BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
+    if not args.fill_radius >= 0:
+        raise shmmap.BadRequest(f"--fill-radius must not be negative, it is {args.fill_radius}")
+    progress = None if args.quiet else _ProgressLine()
+    with shmmap.connect(args.endpoint, name="shmmap-elevation", shm_dir=args.shm_dir) as client:
+        for attempt in range(_ATTEMPTS):
+            try:
+                built = build_elevation_map(
+                    client, rule, _cache(args.cache), wait_s=args.wait, progress=progress
+                )
+                break
+            except MapChanged:
+                if attempt == _ATTEMPTS - 1:
+                    raise
+    if progress is not None:
+        progress.end()
+    grid = built.grid
+    document = {
+        "map_version": f"{built.map_version:016x}",
+        "rule": rule.document,
+        "fill_radius": args.fill_radius,
+    }
+    for path in files:
+        write_elevation(path, grid, args.fill_radius, document, epsg=args.epsg)
+    if args.hillshade:
+        write_hillshade(Path(args.hillshade), grid, args.fill_radius)
+    counts = np.zeros(3, np.int64)
+    for _, _, kind in grid.blocks(args.fill_radius):
+        counts += np.bincount(kind.ravel(), minlength=3)
+    summary = {
+        "map_version": document["map_version"],
+        "cells": built.cells,
+        "loaded": built.loaded,
+        "rows": grid.shape[0],
+        "columns": grid.shape[1],
+        "resolution": grid.resolution,
+        "origin": list(grid.origin),
+        "measured": int(counts[MEASURED]),
+        "filled": int(counts[FILLED]),
+        "stray": built.stray,
+        "failed": [
+            {"id": error.cell_id, "code": error.code, "message": str(error)} for error in built.failed
+        ],
+        "files": [str(path) for path in files] + ([args.hillshade] if args.hillshade else []),
+    }
+    if args.json:
+        print_json(summary)
+    else:
+        print(
+            f"{built.cells} cells, {built.loaded} loaded: {grid.shape[1]} x {grid.shape[0]} columns of"
+            f" {grid.resolution:g} m, {counts[MEASURED]} measured, {counts[FILLED]} filled"
+        )
+        for error in built.failed:
+            print(f"missing: {error}", file=sys.stderr)
+    return 1 if built.failed else 0
+
+
+def _cache(named: str | None) -> Path:
+    if named:
+        return Path(named)
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "elevation"
+
+
+class _ProgressLine:
+    """One line that is written over on a terminal, and a line now and then elsewhere."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stderr.isatty()
+        self._next_s = 0.0
+        self._shown = False
+
+    def __call__(self, progress: BuildProgress) -> None:
+        now_s = time.monotonic()
+        if now_s < self._next_s and progress.done < progress.cells:
+            return
+        self._next_s = now_s + (_EVERY_S if self._terminal else 10 * _EVERY_S)
+        text = f"{progress.done} of {progress.cells} cells, {progress.rows} rows"
+        print(f"\r{text}" if self._terminal else text, end="" if self._terminal else "\n", file=sys.stderr)
+        sys.stderr.flush()
+        self._shown = True
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self._terminal and self._shown:
+            print(file=sys.stderr)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heights on a ground grid in a file: only the pages in use are in memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.elevation_map.holes import fill_holes, fill_reach
+
+__all__ = ["FILLED", "MEASURED", "NOTHING", "ElevationGrid"]
+
+NOTHING, MEASURED, FILLED = range(3)
+_NAN_BITS: Final = np.float32(np.nan).view(np.uint32)
+_BLOCK_BYTES: Final = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class ElevationGrid:
+    """A grid of heights; row 0 is the southernmost, column 0 the westernmost.
+
+    The file holds the bits of float32, each xor the bits of NaN: so the holes of a sparse file, which
+    read as zeros, are columns without a height.
+
+    Attributes
+    ----------
+    path
+        The file.
+    resolution
+        Edge of a column, metres.
+    first
+        Index i, j of column [0, 0]: it begins at i · resolution, j · resolution.
+    shape
+        Rows and columns.
+    """
+
+    path: Path
+    resolution: float
+    first: tuple[int, int]
+    shape: tuple[int, int]
+
+    @classmethod
+    def create(
+        cls, path: Path, resolution: float, first: tuple[int, int], shape: tuple[int, int]
+    ) -> ElevationGrid:
+        """Make the file, without any height; it takes no room on the disk yet."""
+        with open(path, "wb") as file:
+            file.truncate(4 * shape[0] * shape[1])
+        return cls(path, resolution, first, shape)
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """South-west corner of column [0, 0], metres, map frame."""
+        return self.first[0] * self.resolution, self.first[1] * self.resolution
+
+    @property
+    def block_rows(self) -> int:
+        """How many rows are best read at a time."""
+        return max(1, _BLOCK_BYTES // (4 * max(1, self.shape[1])))
+
+    def put(self, i: NDArray[np.int64], j: NDArray[np.int64], heights: NDArray[np.floating]) -> None:
+        """Write heights of columns (indices from the map's origin); NaN is none."""
+        rows, columns = j - self.first[1], i - self.first[0]
+        bits = heights.astype(np.float32).view(np.uint32) ^ _NAN_BITS
+        bits[np.isnan(heights)] = 0
+        with open(self.path, "r+b") as file:
+            low, high = int(rows.min()), int(rows.max()) + 1
+            left, right = int(columns.min()), int(columns.max()) + 1
+            # a block of the touched rows at a time: pread and pwrite leave no pages mapped in this process
+            block = np.zeros((high - low, right - left), np.uint32)
+            for row in range(low, high):
+                at = 4 * (row * self.shape[1] + left)
+                block[row - low] = np.frombuffer(os.pread(file.fileno(), 4 * (right - left), at), np.uint32)
+            block[rows - low, columns - left] = bits
+            for row in range(low, high):
+                os.pwrite(file.fileno(), block[row - low].tobytes(), 4 * (row * self.shape[1] + left))
+
+    def rows(self, begin: int, end: int) -> NDArray[np.float32]:
+        """Rows ``begin`` to ``end``, (n, columns) float32; rows outside the grid are NaN, as are columns
+        without a height."""
+        low, high = max(begin, 0), min(end, self.shape[0])
+        result = np.full((end - begin, self.shape[1]), np.nan, np.float32)
+        if low < high:
+            with open(self.path, "rb") as file:
+                wanted = 4 * (high - low) * self.shape[1]
+                data = os.pread(file.fileno(), wanted, 4 * low * self.shape[1])
+            bits = np.frombuffer(data, np.uint32) ^ _NAN_BITS
+            result[low - begin : high - begin] = bits.view(np.float32).reshape(high - low, -1)
+        return result
+
+    def filled(
+        self, begin: int, end: int, fill_radius: float, margin: int = 0
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Rows with holes filled, and what each value is.
+
+        Parameters
+        ----------
+        begin, end
+            Rows.
+        fill_radius
+            See `fill_holes`, metres; 0: nothing is filled.
+        margin
+            More rows on both sides.
+
+        Returns
+        -------
+        (n, columns) float32 metres, and (n, columns) uint8: `NOTHING`, `MEASURED` or `FILLED`.
+        """
+        reach = fill_reach(fill_radius / self.resolution)
+        around = self.rows(begin - margin - reach, end + margin + reach)
+        inner = slice(reach, len(around) - reach)
+        kind = np.where(np.isnan(around[inner]), NOTHING, MEASURED).astype(np.uint8)
+        if reach:
+            heights = fill_holes(around, fill_radius / self.resolution)[inner]
+            row = np.arange(begin - margin, end + margin)
+            heights[(row < 0) | (row >= self.shape[0])] = np.nan  # nothing is filled beyond the grid
+            kind[(kind == NOTHING) & ~np.isnan(heights)] = FILLED
+        else:
+            heights = around[inner]
+        return heights, kind
+
+    def blocks(
+        self, fill_radius: float, *, from_north: bool = False, margin: int = 0
+    ) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.uint8]]]:
+        """All rows, some at a time: first row, heights and kinds as in `filled`.
+
+        From the north, blocks come in that order, and rows within each as well.
+        """
+        starts = range(0, self.shape[0], self.block_rows)
+        for begin in reversed(starts) if from_north else starts:
+            end = min(begin + self.block_rows, self.shape[0])
+            heights, kind = self.filled(begin, end, fill_radius, margin)
+            yield (begin, heights[::-1], kind[::-1]) if from_north else (begin, heights, kind)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Elevation maps as files: NPZ, GeoTIFF, PNG with a world file; written block by block."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import secrets
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest
+from shmmap_clients.elevation_map.grid import ElevationGrid
+from shmmap_clients.elevation_map.hillshade import hillshade
+from shmmap_clients.png import PngWriter
+
+__all__ = ["SUFFIXES", "write_elevation", "write_hillshade"]
+
+SUFFIXES: Final = (".npz", ".tif", ".tiff", ".png")
+_TILE: Final = 256
+_FINEST_STEP: Final = 0.001  # metres: a PNG has no finer steps
+
+
+def write_elevation(
+    path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str, Any], *, epsg: int | None = None
+) -> None:
+    """Write a grid; the file appears whole.
+
+    ``.npz``: ``height`` (rows, columns) float32 metres, row 0 the southernmost, NaN where there is none;
+    ``kind`` uint8 (0 nothing, 1 measured, 2 filled); ``resolution`` and ``origin`` (south-west corner
+    of [0, 0], metres); ``document``, JSON.  ``.tif``: float32, NaN as no data, tiled.  ``.png``: 16
+    bits, 0 where there is none, else ``z = z_min + (value - 1) * step`` with both in ``PATH.json``,
+    and a world file; the one lossy format, its step at least a millimetre.
+
+    Parameters
+    ----------
+    fill_radius
+        See `fill_holes`, metres.
+    document
+        What the file is of, for people and programs.
+    epsg
+        Coordinate system for a GeoTIFF.
+
+    Raises
+    ------
+    BadRequest
+        The suffix is unknown, or the package for GeoTIFF is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        with _replacing(path) as file:
+            _npz(file, grid, fill_radius, document)
+    elif suffix in (".tif", ".tiff"):
+        _geotiff(path, grid, fill_radius, document, epsg)
+    elif suffix == ".png":
+        _png(path, grid, fill_radius, document)
+    else:
+        raise BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
+
+
+def write_hillshade(path: Path, grid: ElevationGrid, fill_radius: float) -> None:
+    """Write a shaded picture as PNG, north up, and its world file."""
+    with _replacing(path) as file:
+        writer = PngWriter(file, grid.shape[1], grid.shape[0], channels=2)
+        for _, heights, _ in grid.blocks(fill_radius, from_north=True, margin=1):
+            writer.add(hillshade(heights[::-1], grid.resolution)[::-1])
+        writer.finish()
+    _world_file(path, grid)
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[IO[bytes]]:
+    interim = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(interim, "xb") as file:
+            yield file
+        interim.replace(path)
+    finally:
+        interim.unlink(missing_ok=True)
+
+
+def _npz(file: IO[bytes], grid: ElevationGrid, fill_radius: float, document: dict[str, Any]) -> None:
+    small = {
+        "resolution": np.array(grid.resolution),
+        "origin": np.array(grid.origin),
+        "document": np.array(json.dumps(document)),
+    }
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in small.items():
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+        for name, dtype, place in (("height", "<f4", 1), ("kind", "|u1", 2)):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                header = {"descr": dtype, "fortran_order": False, "shape": grid.shape}
+                np.lib.format.write_array_header_1_0(member, header)
+                for block in grid.blocks(fill_radius):
+                    member.write(np.ascontiguousarray(block[place]).tobytes())
+
+
+def _geotiff(
+    path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str, Any], epsg: int | None
+) -> None:
+    try:
+        import tifffile
+    except ImportError:
+        raise BadRequest(
+            "GeoTIFF needs the package tifffile", hint="pip install 'shmmap[geotiff]', or write .npz"
+        ) from None
+    west, south = grid.origin
+    north = south + grid.shape[0] * grid.resolution
+    # GeoTIFF 1.1 (OGC 19-008r4): projected, pixels are areas; 32767: a system of the user's own
+    keys = [1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, epsg if epsg is not None else 32767]
+    tags = [
+        (33550, "d", 3, (grid.resolution, grid.resolution, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, west, north, 0.0), True),
+        (34735, "H", len(keys), tuple(keys), True),
+        (42113, "s", 4, "nan", True),
+    ]
+    interim = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        tifffile.imwrite(
+            interim, _tiles(grid, fill_radius), shape=grid.shape, dtype=np.float32, tile=(_TILE, _TILE),
+            photometric="minisblack", compression="zlib", metadata=None,
+            description=json.dumps(document), extratags=tags, bigtiff=math.prod(grid.shape) > 1 << 29,
+        )  # fmt: skip
+        interim.replace(path)
+    finally:
+        interim.unlink(missing_ok=True)
+
+
+def _tiles(grid: ElevationGrid, fill_radius: float) -> Iterator[NDArray[np.float32]]:
+    """Tiles from the north-west, row by row; those at the edges are full as well."""
+    rows, columns = grid.shape
+    for top in range(0, rows, _TILE):
+        strip, _ = grid.filled(rows - top - _TILE, rows - top, fill_radius)
+        strip = strip[::-1]
+        for left in range(0, columns, _TILE):
+            tile = np.full((_TILE, _TILE), np.nan, np.float32)
+            part = strip[:, left : left + _TILE]
+            tile[:, : part.shape[1]] = part
+            yield tile
+
+
+def _png(path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str, Any]) -> None:
+    low, high = math.inf, -math.inf
+    for _, heights, kind in grid.blocks(fill_radius):
+        if kind.any():
+            low, high = min(low, float(np.nanmin(heights))), max(high, float(np.nanmax(heights)))
+    z_min = low if low <= high else 0.0
+    step = max(_FINEST_STEP, (high - low) / 65534) if low <= high else _FINEST_STEP
+    with _replacing(path) as file:
+        writer = PngWriter(file, grid.shape[1], grid.shape[0], bits=16)
+        for _, heights, kind in grid.blocks(fill_radius, from_north=True):
+            levels = np.where(kind > 0, np.rint((heights.astype(np.float64) - z_min) / step) + 1, 0)
+            writer.add(levels.astype(np.uint16))
+        writer.finish()
+    _world_file(path, grid)
+    with _replacing(path.with_name(path.name + ".json")) as file:
+        file.write(json.dumps({**document, "z_min": z_min, "step": step}).encode())
+
+
+def _world_file(path: Path, grid: ElevationGrid) -> None:
+    """Six lines: pixel sizes and the middle of the upper left pixel."""
+    west, south = grid.origin
+    north = south + grid.shape[0] * grid.resolution
+    half = grid.resolution / 2
+    numbers = (grid.resolution, 0.0, 0.0, -grid.resolution, west + half, north - half)
+    with _replacing(path.with_suffix(".pgw")) as file:
+        file.write("".join(f"{number:.12g}\n" for number in numbers).encode())

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lowest surface of each column: clusters, and the mean height of the chosen one.
+
+Importing this module compiles the kernel, or loads it from numba's cache (tenths of a second).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from shmmap_clients.elevation_map.rule import ElevationRule
+
+__all__ = ["surface_heights"]
+
+
+def surface_heights(
+    xyz: NDArray[Any], column: NDArray[np.int64], rule: ElevationRule
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the columns that have points, ascending, and the height of each.
+
+    Parameters
+    ----------
+    xyz
+        (N, 3) float32 or float64, metres.
+    column
+        (N,) int64: which column each point is in.
+    rule
+        Tolerance, height range and least number of points.
+
+    Returns
+    -------
+    (M,) int64 and (M,) float64, metres; NaN where no cluster is large enough.
+    """
+    order = np.lexsort((xyz[:, 2], column))
+    ordered = xyz[order].astype(np.float64)
+    columns, start = np.unique(column[order], return_index=True)
+    bounds = np.append(start, len(order)).astype(np.int64)
+    heights = np.empty(len(columns))
+    _surface(ordered, bounds, rule.tolerance, rule.height_range, rule.min_points, heights)
+    return columns, heights
+
+
+@numba.njit(inline="always")
+def _root(parent: Any, member: Any) -> Any:
+    while parent[member] != member:
+        parent[member] = parent[parent[member]]  # halves the path for whoever comes next
+        member = parent[member]
+    return member
+
+
+@numba.njit(
+    types.void(
+        types.float64[:, ::1], types.int64[::1], types.float64, types.float64, types.int64, types.float64[::1]
+    ),
+    nogil=True,
+    cache=True,
+    error_model="numpy",
+)
+def _surface(xyz: Any, bounds: Any, tolerance: Any, height_range: Any, min_points: Any, heights: Any) -> None:
+    """``xyz`` sorted by column and height, column n in rows ``bounds[n] : bounds[n + 1]``."""
+    largest = 0
+    for n in range(heights.shape[0]):
+        largest = max(largest, bounds[n + 1] - bounds[n])
+    parent = np.empty(largest, np.int64)
+    count = np.empty(largest, np.int64)
+    total = np.empty(largest, np.float64)
+    squared = tolerance * tolerance
+    for n in range(heights.shape[0]):
+        first, size = bounds[n], bounds[n + 1] - bounds[n]
+        heights[n] = np.nan
+        if size < min_points:
+            continue
+        for k in range(size):
+            parent[k] = k
+            x, y, z = xyz[first + k, 0], xyz[first + k, 1], xyz[first + k, 2]
+            own = k
+            for other in range(k - 1, -1, -1):
+                d_z = z - xyz[first + other, 2]
+                if d_z > tolerance:
+                    break
+                root = _root(parent, other)
+                if root == own:
+                    continue
+                d_x, d_y = x - xyz[first + other, 0], y - xyz[first + other, 1]
+                if d_x * d_x + d_y * d_y + d_z * d_z <= squared:
+                    # the older root stays: own may be it already
+                    low, high = min(root, own), max(root, own)
+                    parent[high] = low
+                    own = low
+        base = xyz[first, 2]
+        for k in range(size):
+            count[k] = 0
+            total[k] = 0.0
+        for k in range(size):
+            root = _root(parent, k)
+            count[root] += 1
+            total[root] += xyz[first + k, 2] - base
+        lowest = np.inf
+        for k in range(size):
+            if count[k] >= min_points:
+                lowest = min(lowest, total[k] / count[k])
+        chosen, most = np.inf, 0
+        for k in range(size):
+            if count[k] >= min_points:
+                mean = total[k] / count[k]
+                if mean - lowest <= height_range and (
+                    count[k] > most or (count[k] == most and mean < chosen)
+                ):
+                    chosen, most = mean, count[k]
+        if most > 0:
+            heights[n] = base + chosen

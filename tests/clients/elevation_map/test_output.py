@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files as other programs read them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.elevation_map.grid import ElevationGrid
+from shmmap_clients.elevation_map.hillshade import hillshade
+from shmmap_clients.elevation_map.holes import fill_holes
+from shmmap_clients.elevation_map.output import write_elevation, write_hillshade
+
+from shmmap import BadRequest
+
+Made = tuple[ElevationGrid, NDArray[np.float32]]
+DOCUMENT = {"map_version": "0123456789abcdef"}
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Made:
+    """A grid of two tiles each way, a third of it holes, and what filling within 0.6 m gives."""
+    rng = np.random.default_rng(4)
+    x, y = np.meshgrid(np.arange(300), np.arange(270))
+    heights = (700 + np.sin(x / 20) * 3 + y * 0.02).astype(np.float32)
+    heights[rng.random(heights.shape) < 0.3] = np.nan
+    heights[50:120, 30:90] = np.nan
+    grid = ElevationGrid.create(tmp_path / "grid", 0.3, (-100, 40), heights.shape)
+    j, i = np.nonzero(~np.isnan(heights))
+    grid.put(i - 100, j + 40, heights[j, i].astype(np.float64))
+    return grid, fill_holes(heights, 2.0)
+
+
+def test_npz(made: Made, tmp_path: Path) -> None:
+    grid, expected = made
+    write_elevation(tmp_path / "e.npz", grid, 0.6, DOCUMENT)
+    with np.load(tmp_path / "e.npz", allow_pickle=False) as read:
+        assert np.array_equal(read["height"], expected, equal_nan=True)
+        assert read["height"].dtype == np.float32
+        assert np.array_equal(read["kind"] == 0, np.isnan(expected))
+        assert float(read["resolution"]) == 0.3
+        assert np.allclose(read["origin"], (-30.0, 12.0))
+        assert json.loads(str(read["document"])) == DOCUMENT
+    assert not [path for path in tmp_path.iterdir() if path.name.endswith(".tmp")]
+
+
+def test_geotiff(made: Made, tmp_path: Path) -> None:
+    tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed (extra geotiff)")
+    grid, expected = made
+    write_elevation(tmp_path / "e.tif", grid, 0.6, DOCUMENT, epsg=32632)
+    with tifffile.TiffFile(tmp_path / "e.tif") as file:
+        page = file.pages[0]
+        assert np.array_equal(page.asarray(), expected[::-1], equal_nan=True)
+        assert page.is_tiled
+        assert page.tags[33550].value == (0.3, 0.3, 0.0)
+        assert np.allclose(page.tags[33922].value, (0, 0, 0, -30.0, 12.0 + 270 * 0.3, 0))
+        assert page.tags[42113].value == "nan"
+        assert page.geotiff_tags["ProjectedCSTypeGeoKey"] == 32632
+        assert json.loads(page.description) == DOCUMENT
+
+
+def test_png_with_a_world_file(made: Made, tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image", reason="pillow is not installed")
+    grid, expected = made
+    write_elevation(tmp_path / "e.png", grid, 0.6, DOCUMENT)
+    with image.open(tmp_path / "e.png") as read:
+        levels = np.asarray(read).astype(np.int64)[::-1]
+    about = json.loads((tmp_path / "e.png.json").read_text())
+    assert about["step"] == 0.001
+    assert np.array_equal(levels == 0, np.isnan(expected))
+    heights = about["z_min"] + (levels - 1) * about["step"]
+    assert np.nanmax(np.abs(np.where(levels, heights, np.nan) - expected)) < 0.00051
+    numbers = [float(line) for line in (tmp_path / "e.pgw").read_text().split()]
+    assert np.allclose(numbers, (0.3, 0, 0, -0.3, -30 + 0.15, 12 + 270 * 0.3 - 0.15))
+
+
+def test_hillshade(made: Made, tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image", reason="pillow is not installed")
+    grid, expected = made
+    write_hillshade(tmp_path / "h.png", grid, 0.6)
+    with image.open(tmp_path / "h.png") as read:
+        pixels = np.asarray(read)[::-1]
+    assert np.array_equal(pixels[:, :, 1] == 0, np.isnan(expected))
+    whole = hillshade(np.pad(expected, ((1, 1), (0, 0)), constant_values=np.nan), 0.3)
+    assert np.array_equal(pixels, whole)
+
+
+def test_light_comes_from_the_north_west() -> None:
+    x, y = np.meshgrid(np.arange(9.0), np.arange(9.0))
+
+    def grey(heights: NDArray[np.float64]) -> int:
+        return int(hillshade(heights.astype(np.float32), 1.0)[4, 4, 0])
+
+    flat = grey(0 * x)
+    assert grey(0.3 * (x - y)) > flat > grey(0.3 * (y - x))  # facing the light: descending to the north-west
+
+
+def test_an_empty_grid_and_unknown_suffixes(tmp_path: Path) -> None:
+    grid = ElevationGrid.create(tmp_path / "grid", 1.0, (0, 0), (3, 4))
+    for name in ("e.npz", "e.png"):
+        write_elevation(tmp_path / name, grid, 1.0, DOCUMENT)
+    with np.load(tmp_path / "e.npz") as read:
+        assert np.isnan(read["height"]).all()
+    with pytest.raises(BadRequest):
+        write_elevation(tmp_path / "e.xyz", grid, 1.0, DOCUMENT)

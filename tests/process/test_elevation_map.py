@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap-elevation`` against real daemons: known ground, right seams, a cache, and interrupted runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.elevation_map import ElevationRule, WindowHeights, build_elevation_map
+from shmmap_clients.elevation_map.build import BuildProgress, MapChanged
+from shmmap_clients.elevation_map.surface import surface_heights
+
+import shmmap
+from shmmap.testing.town import Town
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, random_points
+
+Factory = Callable[..., DaemonProcess]
+LONG_S = 120.0
+
+
+def whole_cloud(made: DividedMap) -> NDArray[Any]:
+    parts = [made.points(name) for name in sorted(made.corners)]
+    return np.concatenate([np.stack([p["x"], p["y"], p["z"]], axis=1) for p in parts])
+
+
+def in_one_go(xyz: NDArray[Any], rule: ElevationRule) -> dict[tuple[int, int], float]:
+    """Heights of all columns from all points at once, as if there were no cells."""
+    index = np.floor(xyz[:, :2].astype(np.float64) * (1 / rule.resolution)).astype(np.int64)
+    low = index.min(axis=0)
+    key = (index[:, 1] - low[1]) * 100_000 + index[:, 0] - low[0]
+    if rule.name == "surface":
+        columns, heights = surface_heights(xyz, key, rule)
+    else:
+        columns, member = np.unique(key, return_inverse=True)
+        groups = [xyz[member.reshape(-1) == n, 2].astype(np.float64) for n in range(len(columns))]
+        heights = np.array([float(getattr(group, rule.name)()) for group in groups])
+    return {
+        (int(c % 100_000 + low[0]), int(c // 100_000 + low[1])): float(z)
+        for c, z in zip(columns, heights, strict=True)
+        if not np.isnan(z)
+    }
+
+
+@pytest.mark.parametrize("name", ["surface", "min", "mean", "max"])
+def test_columns_know_no_cell_borders(
+    daemon: Factory, divided_map: DividedMap, tmp_path: Path, name: str
+) -> None:
+    rule = ElevationRule(name, 1.3, tolerance=4.0)  # does not divide the cells' 20 m
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        built = build_elevation_map(client, rule, tmp_path / "cache", wait_s=LONG_S)
+    assert (built.cells, built.loaded, built.stray, built.failed) == (36, 36, 0, ())
+    heights = built.grid.rows(0, built.grid.shape[0])
+    j, i = np.nonzero(~np.isnan(heights))
+    first = built.grid.first
+    got = {(int(a) + first[0], int(b) + first[1]): float(heights[b, a]) for a, b in zip(i, j, strict=True)}
+    expected = in_one_go(whole_cloud(divided_map), rule)
+    assert got.keys() == expected.keys()
+    assert max(abs(got[key] - expected[key]) for key in got) < 1e-5
+    assert len(got) > 1000
+
+
+def test_generated_ground_is_met(daemon: Factory, tmp_path: Path) -> None:
+    town = Town(seed=3, blocks=(1, 1), density=250.0)
+    town.write(tmp_path / "town")
+    one = daemon(tmp_path / "town")
+    with shmmap.connect(one.endpoint) as client:
+        built = build_elevation_map(client, ElevationRule(), tmp_path / "cache", wait_s=LONG_S)
+    grid = built.grid
+    heights, _ = grid.filled(0, grid.shape[0], 0.0)
+    x = grid.origin[0] + (np.arange(grid.shape[1]) + 0.5) * grid.resolution
+    y = grid.origin[1] + (np.arange(grid.shape[0]) + 0.5) * grid.resolution
+    truth = town.ground_height(*np.meshgrid(x, y))
+    # edges: columns with anything but ground in them (cars, walls, leaves), or with a curb
+    cloud = np.concatenate([tile["xyz"] for tile in town.tiles()])
+    above = np.abs(cloud[:, 2] - town.ground_height(cloud[:, 0], cloud[:, 1])) > 0.1
+    index = np.floor(cloud[above, :2].astype(np.float64) * (1 / 0.3)).astype(int) - grid.first
+    clear = ~np.isnan(heights)
+    clear[index[:, 1], index[:, 0]] = False
+    away = np.minimum(np.abs((x + 40) % 80 - 40)[None, :], np.abs((y + 40) % 80 - 40)[:, None])
+    clear &= np.abs(away - 4.0) > 0.3
+    error = np.abs(heights - truth)[clear]
+    assert clear.sum() > 10_000
+    assert np.percentile(error, 99) < 0.01  # points scatter by 15 mm, some 22 make a column
+    assert error.max() < 0.03
+
+
+def test_an_interrupted_build_goes_on_and_a_finished_one_is_kept(
+    daemon: Factory, divided_map: DividedMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmmap_clients.elevation_map.build._EVERY", 7)
+    one = daemon(divided_map.root)
+    rule, cache = ElevationRule("surface", 1.3, tolerance=4.0), tmp_path / "cache"
+
+    class Interrupted(Exception):
+        pass
+
+    def stop_at_17(progress: BuildProgress) -> None:
+        if progress.done == 17:
+            raise Interrupted
+
+    with shmmap.connect(one.endpoint) as client:
+        with pytest.raises(Interrupted):
+            build_elevation_map(client, rule, cache, wait_s=LONG_S, progress=stop_at_17)
+        resumed = build_elevation_map(client, rule, cache, wait_s=LONG_S)
+        assert resumed.loaded == 36 - 14
+        again = build_elevation_map(client, rule, cache, wait_s=LONG_S)
+        assert again.loaded == 0
+        fresh = build_elevation_map(client, rule, tmp_path / "other", wait_s=LONG_S)
+        assert again.grid.path.read_bytes() == fresh.grid.path.read_bytes()
+
+        # another state of the map is another entry of the cache
+        name = sorted(divided_map.corners)[0]
+        corner = divided_map.corners[name]
+        divided_map.write_cell(name, corner, random_points(np.random.default_rng(5), corner, 400))
+        client.reload()
+        changed = build_elevation_map(client, rule, cache, wait_s=LONG_S)
+        assert changed.loaded == 36
+        assert changed.map_version != fresh.map_version
+
+        def rewrite(progress: BuildProgress) -> None:
+            if progress.done == 3:
+                last = sorted(divided_map.corners)[-1]
+                corner = divided_map.corners[last]
+                divided_map.write_cell(last, corner, random_points(np.random.default_rng(6), corner, 300))
+                client.reload()
+
+        with pytest.raises(MapChanged):
+            build_elevation_map(client, rule, tmp_path / "third", wait_s=LONG_S, progress=rewrite)
+
+
+def test_heights_follow_a_window(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    rng = np.random.default_rng(8)
+    cloud = whole_cloud(divided_map)
+    for name in ("min", "mean", "max"):
+        rule = ElevationRule(name, 1.3)
+        expected = in_one_go(cloud, rule)
+        with shmmap.MapWindow(one.endpoint, 40.0, layers=rule.layer, update_distance=0.0) as window:
+            for x, y in ((-30.0, 5.0), (12.0, -7.0)):
+                window.move_to(x, y, wait=LONG_S)
+                xy = rng.uniform((x - 27, y - 27), (x + 27, y + 27), (400, 2))
+                got = WindowHeights(window, rule).at(xy)
+                keys = np.floor(xy * (1 / rule.resolution)).astype(int).tolist()
+                want = np.array([expected.get((i, j), np.nan) for i, j in keys])
+                assert np.array_equal(np.isnan(got), np.isnan(want))
+                assert np.nanmax(np.abs(got - want)) < 1e-5
+    with pytest.raises(shmmap.BadRequest), shmmap.MapWindow(one.endpoint, 40.0) as window:
+        WindowHeights(window, ElevationRule())
+
+
+def test_the_program(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:
+    one = daemon(divided_map.root)
+    (divided_map.pcd_dir / sorted(divided_map.corners)[5]).write_bytes(b"no cloud")
+    command = [
+        sys.executable, "-m", "shmmap_clients.elevation_map", "build", "--resolution", "1.0",
+        "--tolerance", "4", "--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint,
+    ]  # fmt: skip
+    words = ["--out", f"{tmp_path}/e.npz", "--hillshade", f"{tmp_path}/h.png", "--json"]
+    with shmmap.connect(one.endpoint) as client:
+        client.reload()
+    done = subprocess.run([*command, *words], capture_output=True, text=True, timeout=LONG_S)
+    assert done.returncode == 1, done.stderr
+    document = json.loads(done.stdout)
+    assert [Path(failure["id"]).name for failure in document["failed"]] == [sorted(divided_map.corners)[5]]
+    assert "36 of 36 cells" in done.stderr
+    with np.load(tmp_path / "e.npz") as read:
+        assert read["height"].shape == (document["rows"], document["columns"])
+        assert int((read["kind"] == 1).sum()) == document["measured"] > 0
+    assert (tmp_path / "h.png").read_bytes()[1:4] == b"PNG"
+    wrong = subprocess.run([*command, "--out", "e.xyz"], capture_output=True, text=True, timeout=LONG_S)
+    assert wrong.returncode == 2
