@@ -12,7 +12,8 @@ __all__ = ["add_parser", "run"]
 _EPILOG = """\
 Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.
 MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
-or inside the folder of the files), or one PCD file.
+or inside the folder of the files), or one cloud of any format that is read: a PCD file of up to 256 MiB
+is one cell, any other is divided into the cache directory first.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and leaves the memory to its
 next start, which goes on warm, as after a crash (a restart sends it first, then SIGTERM as usual; in
 a container: --stop-signal USR1); SIGHUP reads the map again.
@@ -29,7 +30,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Load map cells into shared memory and answer clients until told to stop.",
         epilog=_EPILOG,
     )
-    parser.add_argument("map_path", metavar="MAP", nargs="?", help="the map: a directory or a PCD file")
+    parser.add_argument("map_path", metavar="MAP", nargs="?", help="the map: a directory or a cloud")
     parser.add_argument("--metadata", metavar="FILE", help="the map's YAML, where it lies elsewhere")
     parser.add_argument(
         "--strict", action="store_true", default=None, help="refuse what Autoware's own loader refuses"

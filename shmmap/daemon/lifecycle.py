@@ -44,6 +44,7 @@ from shmmap.daemon.admin import Admin
 from shmmap.daemon.budget import choose_budget
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.control_group import memory_limit_bytes
+from shmmap.daemon.divided_cloud import find_origin
 from shmmap.daemon.event_log import EventLog, nowhere
 from shmmap.daemon.event_socket import EventSocket, events_path
 from shmmap.daemon.eviction import POLICIES
@@ -73,7 +74,6 @@ from shmmap.daemon.store import Store
 from shmmap.daemon.workers import WorkerPool
 from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 from shmmap.segment.crash_steps import step
@@ -115,12 +115,7 @@ def run(config: DaemonConfig) -> int:
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
         pins = choose_pins(directory)
-        origin = open_map(
-            config.map_path,
-            metadata=config.metadata or None,
-            strict=config.strict,
-            cache_dir=config.cache_dir or None,
-        )
+        origin = find_origin(config)
         config = dataclasses.replace(config, map_path=origin.path)
         with signals.held():
             lock = InstanceLock(_lock_path(path))

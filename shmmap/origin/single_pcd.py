@@ -12,13 +12,24 @@ from shmmap.formats.pcd_reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.stamp import Stamp
 
-__all__ = ["MAX_SINGLE_PCD_BYTES", "load_single_pcd"]
+__all__ = ["MAX_SINGLE_PCD_BYTES", "is_served_whole", "load_single_pcd"]
 
 MAX_SINGLE_PCD_BYTES = 256 << 20
 """A larger file is refused: loading all of a map to use a part of it is what dividing avoids."""
 
 # What a compressed file of that size may hold; point clouds shrink to a half or a third.
 _MAX_POINT_BYTES = 4 * MAX_SINGLE_PCD_BYTES
+
+
+def is_served_whole(path: str) -> bool:
+    """Whether the PCD file at ``path`` is small enough to be one cell; also if it is no sound file."""
+    try:
+        if os.stat(path).st_size > MAX_SINGLE_PCD_BYTES:
+            return False
+        with PcdReader(path) as reader:
+            return reader.header.points * reader.header.point_bytes <= _MAX_POINT_BYTES
+    except (OSError, MapDataError):
+        return True  # who loads it says what is wrong
 
 
 def load_single_pcd(path: str) -> Catalogue:
@@ -55,5 +66,5 @@ def _refuse_large(path: str, what: str, size: int, limit: int) -> None:
             f"{size / 2**20:.0f} MiB of {what}; a map of one file without metadata may have {limit >> 20}",
             path=path,
             cause="needs_dividing",
-            hint="divide it into cells of about 20 m with metadata, as Autoware's pointcloud divider does",
+            hint="divide it into cells: shmmap divide",
         )

@@ -133,6 +133,11 @@ class DaemonProcess:
         return self.process.pid
 
     @property
+    def cache_dir(self) -> Path:
+        """``XDG_CACHE_HOME`` of the daemon."""
+        return Path(self._private) / "cache"
+
+    @property
     def log(self) -> str:
         """What the daemon wrote on stderr in all its lives."""
         return self.log_path.read_text(errors="replace") if self.log_path.exists() else ""

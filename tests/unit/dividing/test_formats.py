@@ -18,7 +18,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.las_reader import LasReader
 from tests.support.clouds import map_rows, xyzircaedt
-from tests.unit.dividing.las_files import write_las
+from tests.support.las_files import write_las
 
 
 def run(path: Path, out: Path, **options: Any) -> DividedMap:

@@ -18,7 +18,7 @@ from shmmap.dividing.workspace import Workspace
 from shmmap.errors import InstanceBusy
 from shmmap.formats.pcd_writer import write_pcd
 from tests.support.clouds import Columns, expected_rows, map_rows, rows_of, xyzircaedt
-from tests.unit.dividing.las_files import write_las
+from tests.support.las_files import write_las
 
 
 class Interrupt(NoProgress):

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A daemon that is given one cloud of any format divides it into its cache first."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.process.conftest import DaemonFactory
+from tests.support.clouds import Columns, expected_rows, rows_of, xyzircaedt
+from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.las_files import write_las
+from tests.support.patience import LIMIT_S
+from tests.support.pcd_files import read_pcd
+from tests.support.raw_client import RawClient, circle
+
+Connect = Callable[..., RawClient]
+
+FAR = (512000.0, 5403000.0, 300.0)
+
+
+def cloud(path: Path, count: int = 3000, *, seed: int = 0) -> Columns:
+    """Write a LAZ file far from its frame's origin; returns its points as the file has them."""
+    columns = xyzircaedt(count, seed=seed)
+    for axis, shift in zip("xyz", FAR, strict=True):
+        columns[axis] = columns[axis].astype(np.float64) + shift
+    las = write_las(path, columns, offset=FAR)
+    for axis in "xyz":
+        columns[axis] = np.asarray(getattr(las, axis))
+    return columns
+
+
+def served(client: RawClient) -> list[tuple[float, ...]]:
+    """Every point of the map, read from the cells' files, after all cells were loaded."""
+    reply = client.area(circle(FAR[0], FAR[1], 1000.0))
+    assert (reply.pending, reply.failed) == ([], [])
+    rows = []
+    for cell in reply.cells:
+        columns = read_pcd(Path(cell.id))
+        assert len(columns["x"]) == cell.points
+        box = cell.box
+        assert ((columns["x"] >= box[0]) & (columns["x"] < box[2])).all()
+        assert ((columns["y"] >= box[1]) & (columns["y"] < box[3])).all()
+        names = ("x", "y", "z", "time_stamp")
+        rows += rows_of({name: columns[name] for name in names})
+    return sorted(rows, key=lambda row: row[-1])
+
+
+def points(columns: Columns) -> list[tuple[float, ...]]:
+    return rows_of({name: columns[name] for name in ("x", "y", "z", "time_stamp")})
+
+
+def divisions(one: DaemonProcess) -> int:
+    """How often it divided a cloud, in all its lives."""
+    return len(re.findall(r"dividing \S+ into", one.log))
+
+
+def test_a_cloud_is_divided_once_in_its_own_frame(
+    daemon: DaemonFactory, connect: Connect, tmp_path: Path
+) -> None:
+    columns = cloud(tmp_path / "town.laz")
+    one = daemon(tmp_path / "town.laz")
+    assert served(connect(one)) == points(columns)
+    assert one.stop() == 0
+    one.start()
+    reply = connect(one).area(circle(FAR[0], FAR[1], 1000.0))
+    assert len(reply.cells) == len(expected_rows(rows_of(columns)))
+    assert divisions(one) == 1
+
+
+def test_a_changed_cloud_is_divided_again(daemon: DaemonFactory, connect: Connect, tmp_path: Path) -> None:
+    cloud(tmp_path / "town.laz")
+    one = daemon(tmp_path / "town.laz")
+    client = connect(one)
+    assert len(served(client)) == 3000
+    for seed in (1, 2):
+        columns = cloud(tmp_path / "new.laz", 2000, seed=seed)
+        (tmp_path / "new.laz").rename(tmp_path / "town.laz")
+        client.ask("reload")
+        assert served(client) == points(columns)
+    assert divisions(one) == 3
+    kept = [path.name for path in cache_of(one).iterdir() if not path.name.startswith(".")]
+    assert len(kept) == 2  # the map, and the link to it
+    (tmp_path / "town.laz").write_bytes(b"LASF, but no more")
+    with pytest.raises(Exception, match="header"):
+        client.ask("reload")
+    assert served(client) == points(columns)  # what was there stays in service
+
+
+def test_a_stop_while_dividing(daemon: DaemonFactory, connect: Connect, tmp_path: Path) -> None:
+    columns = cloud(tmp_path / "town.laz", 400_000)
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        one = daemon(tmp_path / "town.laz", start=False)
+        stopped_while_dividing(one, number)
+        one.start()
+        assert served(connect(one)) == points(columns)
+        assert not [path for path in cache_of(one).iterdir() if path.name.endswith(".dividing")]
+
+
+def stopped_while_dividing(one: DaemonProcess, number: signal.Signals) -> None:
+    path = f"{one.runtime_dir}/notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        notify.bind(path)
+        notify.settimeout(LIMIT_S)
+        process = one.spawn(notify=path)
+        while b"STATUS=dividing" not in (said := notify.recv(4096)):
+            assert b"READY=1" not in said
+        assert b"EXTEND_TIMEOUT_USEC=" in said
+        children = one.children()
+        process.send_signal(number)
+        assert process.wait(LIMIT_S) == (0 if number == signal.SIGTERM else -number)
+    os.unlink(path)
+    for child in children:
+        assert child == process.pid or wait_ended(child, LIMIT_S)
+
+
+def test_two_daemons_of_one_cloud_divide_it_once(
+    daemon: DaemonFactory, connect: Connect, tmp_path: Path
+) -> None:
+    columns = cloud(tmp_path / "town.laz")
+    cache = str(tmp_path / "cache")
+    one = daemon(tmp_path / "town.laz", "--cache-dir", cache)
+    two = daemon(tmp_path / "town.laz", "--cache-dir", cache)
+    assert served(connect(one)) == served(connect(two)) == points(columns)
+    assert divisions(one) + divisions(two) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "code"), [("bad.laz", b"LASF" + bytes(400), 65), ("bad.ply", b"ply\n", 65)]
+)
+def test_a_cloud_that_cannot_be_read(
+    daemon: DaemonFactory, tmp_path: Path, name: str, data: bytes, code: int
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    one = daemon(tmp_path / name, start=False)
+    assert one.run_to_end() == code
+    assert name in one.log
+
+
+def cache_of(one: DaemonProcess) -> Path:
+    """Where a daemon keeps its divided cloud."""
+    (found,) = (one.cache_dir / "shmmap" / "divided").iterdir()
+    return found
