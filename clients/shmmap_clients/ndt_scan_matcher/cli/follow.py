@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap-ndt follow``: localize a stream of scans in the daemon's map."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shmmap_clients.command_line import numbers, print_json
+from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, matcher_from
+
+if TYPE_CHECKING:
+    from shmmap_clients.ndt_scan_matcher.drive_summary import DriveSummary
+    from shmmap_clients.ndt_scan_matcher.follower import Frame
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = subparsers.add_parser(
+        "follow",
+        help="localize a stream of scans in the daemon's map",
+        description="Localize scan after scan in the map that a daemon serves.  Scans come from a directory"
+        " (PCD, NPZ, KITTI .bin; by name) or a ZeroMQ endpoint; the map around the vehicle is kept by"
+        " Autoware's rules in a thread of its own.",
+        epilog="JSON: frames, converged, trustworthy, waited, too_slow, cut_frames, errors (null, or ate_m,"
+        " ate_deg, ate_rmse_m, rte by metres), transform_probability, nvtl, iterations, latency_ms, align_ms,"
+        " thin_ms, map_ms, map_updates, cells_added, cells_removed, map_request_ms, map_build_ms,"
+        " map_private_bytes; a spread is mean, variance, p50, p99, max.  Exit code 1: a scan could not be"
+        " trusted, or the map did not keep up.",
+    )
+    parser.add_argument("--scans", required=True, metavar="DIR|ENDPOINT")
+    parser.add_argument("--endpoint", metavar="PATH", help="the daemon's (default: found as by shmmap)")
+    parser.add_argument(
+        "--truth", metavar="FILE", help="TUM poses of the scans, to start from and compare with"
+    )
+    parser.add_argument(
+        "--init", type=numbers(6), metavar="X,Y,Z,ROLL,PITCH,YAW", help="where to start (default: the truth)"
+    )
+    parser.add_argument("--odometry", metavar="FILE|ENDPOINT", help="TUM file, or poses over ZeroMQ")
+    parser.add_argument(
+        "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m; 0: all)"
+    )
+    parser.add_argument("--frames", type=int, metavar="N", help="stop after so many scans")
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ", help="hold scans of a directory back to this rate"
+    )
+    window = parser.add_argument_group("map window, as in Autoware")
+    window.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
+    window.add_argument("--update-distance", type=float, default=20.0, metavar="M", help="default 20")
+    window.add_argument("--map-radius", type=float, default=150.0, metavar="M", help="default 150")
+    window.add_argument("--lidar-radius", type=float, default=100.0, metavar="M", help="default 100")
+    add_alignment_options(parser)
+    out = parser.add_argument_group("output")
+    out.add_argument("--tum", metavar="FILE", help="write poses in the TUM format")
+    out.add_argument("--publish", metavar="ENDPOINT", help="bind a ZeroMQ publisher of poses")
+    out.add_argument("--plot", metavar="FILE", help="write an SVG of way, errors and latency")
+    out.add_argument("--json", action="store_true", help="print the summary as one JSON document")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Follow, then print the summary."""
+    import numpy as np
+
+    from shmmap import BadRequest
+    from shmmap_clients.ndt_scan_matcher.angles import matrix_from_pose
+    from shmmap_clients.ndt_scan_matcher.drive_plot import drive_svg
+    from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
+    from shmmap_clients.ndt_scan_matcher.follower import Follower
+    from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
+    from shmmap_clients.ndt_scan_matcher.pose_stream import OdometryListener, PosePublisher
+    from shmmap_clients.ndt_scan_matcher.prediction import ConstantVelocity, Odometry, Prediction
+    from shmmap_clients.scans.trajectory import read_trajectory, tum_line
+
+    frames: list[Frame] = []
+    with contextlib.ExitStack() as stack:
+        scans = _scans(args, stack)
+        first = next(scans, None)
+        if first is None:
+            raise BadRequest("there are no scans")
+        if args.init is not None:
+            T_first = matrix_from_pose(np.array(args.init))
+        elif first.T_map_sensor is not None:
+            T_first = first.T_map_sensor
+        else:
+            raise BadRequest("where does the drive begin?", hint="give --init, or poses with --truth")
+        prediction: Prediction
+        if args.odometry is None:
+            prediction = ConstantVelocity(T_first)
+        elif "://" in args.odometry:
+            listener = OdometryListener(args.odometry)
+            stack.callback(listener.close)
+            prediction = Odometry(T_first, lambda: listener.trajectory)
+        else:
+            read = read_trajectory(args.odometry)
+            prediction = Odometry(T_first, lambda: read)
+        matcher = stack.enter_context(matcher_from(args))
+        rules = MapRules(
+            args.update_distance, args.map_radius, args.lidar_radius, args.leaf, matcher.caps.voxels
+        )
+        maps = stack.enter_context(MapUpdater(args.endpoint, rules, prepare=matcher.prepare))
+        follower = Follower(matcher, maps, prediction, thin=args.thin or None)
+        publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
+        tum = stack.enter_context(open(args.tum, "w", encoding="utf-8")) if args.tum else None
+        told = 0
+        scan = first
+        while scan is not None and (args.frames is None or len(frames) < args.frames):
+            frame = follower.follow(scan)
+            frames.append(frame)
+            if publisher is not None:
+                publisher.send(frame)
+            if tum is not None:
+                tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
+            if maps.too_slow > told:
+                told = maps.too_slow
+                _say(f"shmmap-ndt: error: the map is not keeping up at {frame.name}; the scan waited for it")
+            _progress(len(frames), frame)
+            scan = next(scans, None)
+        summary = summarize(frames, list(maps.updates), maps.too_slow)
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    if args.plot:
+        Path(args.plot).write_text(drive_svg(frames), encoding="utf-8")
+    if args.json:
+        print_json(summary.as_document())
+    else:
+        _print(summary)
+    return 0 if summary.trustworthy == summary.frames and not summary.too_slow else 1
+
+
+def _scans(args: argparse.Namespace, stack: contextlib.ExitStack) -> Any:
+    from shmmap_clients.scans.scan_sequence import ScanSequence
+    from shmmap_clients.scans.scan_stream import ScanSubscriber
+    from shmmap_clients.scans.trajectory import read_trajectory
+
+    if "://" in args.scans:
+        return iter(stack.enter_context(ScanSubscriber(args.scans)))
+    sequence = ScanSequence(args.scans, read_trajectory(args.truth) if args.truth else None)
+    return _paced(sequence, args.rate) if args.rate else iter(sequence)
+
+
+def _paced(scans: Any, rate: float) -> Any:
+    import time
+
+    begin = time.monotonic()
+    for number, scan in enumerate(scans):
+        time.sleep(max(0.0, begin + number / rate - time.monotonic()))
+        yield scan
+
+
+def _say(text: str) -> None:
+    print(("\n" if sys.stderr.isatty() else "") + text, file=sys.stderr)
+
+
+def _progress(number: int, frame: Frame) -> None:
+    if sys.stderr.isatty():
+        x, y = frame.result.T_map_base[:2, 3]
+        state = "ok" if frame.result.trustworthy else "NOT TO BE TRUSTED"
+        line = (
+            f"\r{number:6} {frame.name:20.20} ({x:9.2f}, {y:9.2f}) NVTL {frame.result.nvtl:5.2f}"
+            f" {frame.result.iterations:3} it {frame.latency_s * 1e3:7.1f} ms {state:18}"
+        )
+        print(line, end="", file=sys.stderr, flush=True)
+
+
+def _print(summary: DriveSummary) -> None:
+    s = summary
+    print(
+        f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} to be trusted,"
+        f" {s.cut_frames} cut by caps"
+    )
+    print(
+        f"map             {s.map_updates} updates, +{s.cells_added} -{s.cells_removed} cells;"
+        f" {s.waited} scans waited"
+    )
+    print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most")
+    if s.errors is not None:
+        e = s.errors
+        print(
+            f"error           ATE {e.ate_rmse_m:.3f} m RMSE, p50 {e.ate_m.p50:.3f} p99 {e.ate_m.p99:.3f}"
+            f" max {e.ate_m.max:.3f} m; p50 {e.ate_deg.p50:.3f} max {e.ate_deg.max:.3f} deg"
+        )
+        words = [f"{value:.2f} per 100 m over {metres:.0f} m" for metres, value in e.rte.items()]
+        if words:
+            print(f"  relative      {'; '.join(words)}")
+    for name, spread in (
+        ("TP", s.transform_probability),
+        ("NVTL", s.nvtl),
+        ("iterations", s.iterations),
+        ("latency ms", s.latency_ms),
+        ("  thin ms", s.thin_ms),
+        ("  map ms", s.map_ms),
+        ("  align ms", s.align_ms),
+        ("update ask ms", s.map_request_ms),
+        ("update make ms", s.map_build_ms),
+    ):
+        print(
+            f"{name:15} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
+            f"  p99 {spread.p99:8.3f}  max {spread.max:8.3f}"
+        )

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses over ZeroMQ, one msgpack message each: what localization publishes, and odometry that it hears.
+
+A message is ``{"shmmap_pose": 1, "name", "stamp_s", "T" (16 numbers, rows of T_map_base), "converged",
+"trustworthy", "iterations", "transform_probability", "nvtl"}``; of odometry only ``stamp_s`` and ``T`` are
+read.
+"""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+
+import msgspec
+import numpy as np
+import zmq
+
+from shmmap import BadRequest
+from shmmap_clients.ndt_scan_matcher.follower import Frame
+from shmmap_clients.scans.trajectory import Trajectory
+
+__all__ = ["OdometryListener", "PoseMessage", "PosePublisher", "decode_pose"]
+
+_VERSION = 1
+_LINGER_MS = 2000
+_POLL_MS = 100
+_KEPT = 10_000  # odometry entries
+
+
+class PoseMessage(msgspec.Struct):
+    """One pose."""
+
+    stamp_s: float
+    T: list[float]
+    shmmap_pose: int = _VERSION
+    name: str = ""
+    converged: bool = True
+    trustworthy: bool = True
+    iterations: int = 0
+    transform_probability: float = 0.0
+    nvtl: float = 0.0
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(PoseMessage)
+
+
+def decode_pose(message: bytes) -> PoseMessage:
+    """Return the pose of a message.
+
+    Raises
+    ------
+    BadRequest
+        It is none.
+    """
+    try:
+        pose = _decoder.decode(message)
+    except msgspec.DecodeError as error:
+        raise BadRequest(f"a message that is no pose: {error}") from None
+    if pose.shmmap_pose != _VERSION or len(pose.T) != 16 or not np.isfinite(pose.T).all():
+        raise BadRequest("a message that is no pose: 16 finite numbers are wanted, and version 1")
+    return pose
+
+
+class PosePublisher:
+    """Binds an endpoint and publishes a message per scan.
+
+    Raises
+    ------
+    BadRequest
+        The address cannot be bound.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.XPUB)
+        self._socket.linger = _LINGER_MS
+        try:
+            self._socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise BadRequest(f"cannot bind {endpoint}: {error}") from None
+
+    def __enter__(self) -> PosePublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def wait_for_listener(self, timeout_s: float) -> bool:
+        """Wait until somebody has subscribed; False if nobody has in time."""
+        if not self._socket.poll(int(timeout_s * 1000)):
+            return False
+        self._socket.recv()
+        return True
+
+    def close(self) -> None:
+        """Deliver what is queued and close."""
+        self._socket.close()
+        self._context.term()
+
+    def send(self, frame: Frame) -> None:
+        """Publish a frame's pose."""
+        result = frame.result
+        message = PoseMessage(
+            frame.stamp_s,
+            [float(value) for value in result.T_map_base.ravel()],
+            name=frame.name,
+            converged=result.converged,
+            trustworthy=result.trustworthy,
+            iterations=result.iterations,
+            transform_probability=result.transform_probability,
+            nvtl=result.nvtl,
+        )
+        self._socket.send(_encoder.encode(message))
+
+
+class OdometryListener:
+    """Collects odometry from an endpoint in a thread of its own.
+
+    Raises
+    ------
+    BadRequest
+        The address makes no sense.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.linger = 0
+        try:
+            self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self._socket.close()
+            self._context.term()
+            raise BadRequest(f"cannot connect to {endpoint}: {error}") from None
+        self._socket.subscribe(b"")
+        self._entries: list[PoseMessage] = []
+        self._closing = threading.Event()
+        self._heard = threading.Condition()
+        self._thread = threading.Thread(target=self._listen, name="ndt-odometry", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._closing.set()
+        self._thread.join()
+        self._socket.close()
+        self._context.term()
+
+    def wait_for(self, entries: int, timeout_s: float) -> bool:
+        """Wait until so many entries were heard; False if they were not in time."""
+        with self._heard:
+            return self._heard.wait_for(lambda: len(self._entries) >= entries, timeout_s)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """What was heard so far, in order of time."""
+        with self._heard:
+            entries = sorted(self._entries, key=lambda entry: entry.stamp_s)
+        poses = np.array([entry.T for entry in entries]).reshape(-1, 4, 4)
+        return Trajectory(np.array([entry.stamp_s for entry in entries]), poses)
+
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            if self._socket.poll(_POLL_MS):
+                try:
+                    entry = decode_pose(self._socket.recv())
+                except BadRequest:
+                    continue  # somebody else's message
+                with self._heard:
+                    self._entries.append(entry)
+                    del self._entries[:-_KEPT]
+                    self._heard.notify_all()

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Localization with a real daemon: a drive whose window moves, and many clients on one map."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
+from shmmap_clients.ndt_scan_matcher.follower import Follower, Frame
+from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
+from shmmap_clients.ndt_scan_matcher.prediction import ConstantVelocity
+from shmmap_clients.scans.scan_sequence import ScanSequence
+from shmmap_clients.scans.trajectory import read_trajectory
+
+import shmmap
+from tests.process.conftest import DaemonFactory
+from tests.support.town_drive import TownDrive, make_town_drive
+
+PROGRAM = [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher"]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
+    return make_town_drive(tmp_path_factory.mktemp("drive"), blocks=(3, 3), density=5.0, frames=36, step=2.0)
+
+
+def test_a_drive_whose_window_moves(drive: TownDrive, daemon: DaemonFactory) -> None:
+    one = daemon(drive.map_dir)
+    rules = MapRules(update_distance=10.0, map_radius=60.0, lidar_radius=40.0)
+    frames: list[Frame] = []
+    with (
+        NdtMatcher(Settings(mode="coarse_fine")) as matcher,
+        MapUpdater(one.endpoint, rules, prepare=matcher.prepare) as maps,
+    ):
+        follower = Follower(matcher, maps, ConstantVelocity(matrix_from_pose(drive.poses[0])), thin=0.5)
+        for scan in ScanSequence(drive.scans, read_trajectory(drive.truth)):
+            frames.append(follower.follow(scan))
+            assert maps.wait_until_current(60.0)  # a drive at full speed would outrun the map
+        assert maps.error is None
+        summary = summarize(frames, maps.updates, maps.too_slow)
+    assert summary.frames == summary.converged == summary.trustworthy == 36
+    assert summary.too_slow == 0
+    assert summary.waited == 1  # the first: there was no map before
+    assert summary.map_updates >= 3
+    assert summary.cells_removed > 0
+    assert summary.errors is not None
+    assert summary.errors.ate_m.max < 0.15
+    assert summary.errors.ate_deg.max < 0.5
+    assert summary.nvtl.p50 > 2.3
+
+
+def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
+    one = daemon(drive.map_dir)
+    words = ["follow", "--endpoint", one.endpoint, "--scans", str(drive.scans), "--truth", str(drive.truth)]
+    # the drive is 72 m long: no map is outrun, however fast
+    words += ["--update-distance", "20", "--map-radius", "200", "--lidar-radius", "100", "--thin", "0.5"]
+    words += ["--steady", "--odometry", str(drive.truth), "--tum", str(tmp_path / "out.tum")]
+    words += ["--plot", str(tmp_path / "out.svg"), "--publish", f"ipc://{tmp_path}/poses", "--json"]
+    done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr + done.stdout
+    summary = json.loads(done.stdout)
+    assert summary["frames"] == summary["trustworthy"] == 36
+    assert summary["errors"]["ate_m"]["max"] < 0.2
+    assert summary["errors"]["rte"]["10.0"] < 2.0
+    assert len(read_trajectory(tmp_path / "out.tum")) == 36
+    ElementTree.parse(tmp_path / "out.svg")
+
+
+def test_a_map_that_cannot_keep_up_is_an_error(drive: TownDrive, daemon: DaemonFactory) -> None:
+    one = daemon(drive.map_dir)
+    rules = MapRules(update_distance=5.0, map_radius=50.0, lidar_radius=45.0)
+    x, y = drive.poses[0, :2]
+    with MapUpdater(one.endpoint, rules) as maps:
+        first, waited = maps.map_at(x, y)
+        assert waited
+        same, waited = maps.map_at(x + 4.0, y)
+        assert same is first
+        assert not waited
+        assert maps.too_slow == 0
+        # a jump beyond what the map reaches: waited for, and told
+        other, waited = maps.map_at(x + 40.0, y + 40.0)
+        assert waited
+        assert maps.too_slow == 1
+        assert other.cells.keys() != first.cells.keys()
+    assert first.voxels > 0  # what was taken stays readable
+
+
+def test_rules_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(shmmap.BadRequest, match="cannot keep"):
+        MapRules(update_distance=20.0, map_radius=100.0, lidar_radius=90.0)
+
+
+def test_without_a_daemon_the_program_says_so(drive: TownDrive, tmp_path: Path) -> None:
+    words = ["follow", "--endpoint", str(tmp_path / "none.sock"), "--scans", str(drive.scans)]
+    done = subprocess.run([*PROGRAM, *words, "--truth", str(drive.truth)], capture_output=True, text=True)
+    assert done.returncode == 69
+    assert "shmmap-ndt:" in done.stderr
+    assert subprocess.run([*PROGRAM, *words], capture_output=True).returncode == 2  # and where to start?
+
+
+def test_many_clients_share_one_map(daemon: DaemonFactory, tmp_path: Path) -> None:
+    town = make_town_drive(tmp_path, blocks=(4, 4), density=4.0, frames=8, step=12.0)
+    one = daemon(town.map_dir)
+    clients = []
+    for number, pose in enumerate(town.poses):
+        guess = pose + np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.02])
+        words = ",".join(repr(float(value)) for value in guess)
+        scan = str(town.scans / f"scan_{number:04}.npz")
+        clients.append(
+            (
+                words,
+                scan,
+                subprocess.Popen(
+                    [sys.executable, "-m", "tests.support.ndt_client", one.endpoint, scan, words, "1000"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                ),
+            )
+        )
+    found = []
+    for _, _, client in clients:
+        assert client.stdout is not None
+        assert client.stdout.readline().strip() == "ready"
+    for _, _, client in clients:
+        assert client.stdin is not None
+        client.stdin.write("go\n")
+        client.stdin.flush()
+    for _, _, client in clients:
+        assert client.stdout is not None
+        found.append(json.loads(client.stdout.readline()))
+    with shmmap.connect(one.endpoint) as session:
+        loads = session.stats().counters["loads_finished"]
+    for _, _, client in clients:
+        client.communicate()
+        assert client.returncode == 0
+    np.savez(tmp_path / "whole.npz", xyz=town.points)
+    for seen in found:
+        assert seen["cells"] == 256
+        assert seen["converged"]
+        assert seen["growth_bytes"] <= 8 << 20
+    assert loads == 256  # one per cell and layer, not per client
+    words, scan, _ = clients[0]
+    align = ["align", "--map", str(tmp_path / "whole.npz"), "--scan", scan, "--guess", words, "--json"]
+    alone = json.loads(subprocess.run([*PROGRAM, *align], capture_output=True, text=True, check=True).stdout)
+    np.testing.assert_allclose(found[0]["T_map_base"], alone["T_map_base"], atol=1e-6)
+    assert found[0]["iterations"] == alone["iterations"]
+    assert found[0]["voxels"] == alone["voxels"]

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A localizing process: ``python -m tests.support.ndt_client ENDPOINT SCAN X,Y,Z,R,P,Y RADIUS``.
+
+Prints ``ready``, waits for a line, attaches the whole window, aligns, prints what it found and how much
+memory of its own that took, and keeps the map until its input ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
+from shmmap_clients.ndt_scan_matcher.smallest_alignment import align_smallest
+from shmmap_clients.scans.scan_file import read_scan
+
+from shmmap.testing.process_memory import process_memory
+
+
+def main() -> None:
+    """Align once."""
+    endpoint, scan_file, words, radius = sys.argv[1:5]
+    scan = read_scan(scan_file)
+    guess = np.array([float(word) for word in words.split(",")])
+    align_smallest()  # loads the compiled kernels
+    with NdtMatcher() as matcher:
+        matcher.align(scan, matrix_from_pose(guess))  # touches the buffers
+        print("ready", flush=True)
+        sys.stdin.readline()
+        before = process_memory(os.getpid()).private_bytes
+        rules = MapRules(map_radius=float(radius), lidar_radius=50.0)
+        with MapUpdater(endpoint, rules, prepare=matcher.prepare) as maps:
+            voxel_map, _ = maps.map_at(float(guess[0]), float(guess[1]))
+            matcher.set_map(voxel_map)
+            result = matcher.align(scan, matrix_from_pose(guess))
+            found = {
+                "cells": len(voxel_map.cells),
+                "voxels": voxel_map.voxels,
+                "T_map_base": result.T_map_base.tolist(),
+                "iterations": result.iterations,
+                "nvtl": result.nvtl,
+                "converged": result.converged,
+                "growth_bytes": process_memory(os.getpid()).private_bytes - before,
+            }
+            print(json.dumps(found), flush=True)
+            sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()
