@@ -43,6 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print every finding."""
+    from shmmap.cli import daemon_address
     from shmmap.daemon.config import load_config
     from shmmap.daemon.settings_file import installed_config_file
     from shmmap.doctor.checks import diagnose
@@ -50,7 +51,11 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.doctor.patient import examine
 
     file = args.config or installed_config_file()
-    flags = {name: getattr(args, name) for name in ("instance", "endpoint", "runtime_dir", "shm_dir")}
+    flags = {
+        "instance": daemon_address.instance(args) if args.instance or daemon_address.endpoint(args) else None,
+        "endpoint": daemon_address.endpoint(args),
+        "shm_dir": args.shm_dir,
+    }
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
         print_json({"worst": worst(findings), "findings": [asdict(one) for one in findings]})

@@ -90,7 +90,7 @@ def check_socket(path: str, deadline_s: float) -> None:
     SocketPermission
         This user may not connect.
     StaleSocket
-        Nobody listens any more.
+        Nobody listens any more, or the one who did ended before it answered.
     NoAnswer
         Somebody listens, but did not say a word before the deadline.
     ProtocolMismatch
@@ -118,6 +118,11 @@ def check_socket(path: str, deadline_s: float) -> None:
             except ConnectionError:
                 part = b""
             heard += part
+            if not heard:  # a connection that had waited, for a daemon that ended or never started
+                raise StaleSocket(
+                    f"{path}: the connection was closed without a word, by a daemon that ended",
+                    hint="see `systemctl status shmmapd` or its log: did it fail to start?",
+                )
             if not part or heard[0] != 0xFF or (len(heard) == _SIGNATURE_BYTES and heard[9] != 0x7F):
                 raise ProtocolMismatch(
                     f"{path}: who listens there does not speak ZeroMQ",

@@ -11,7 +11,10 @@ __all__ = ["notify"]
 
 
 def notify(*lines: str) -> None:
-    """Send ``KEY=value`` lines to ``NOTIFY_SOCKET``, if there is one."""
+    """Send ``KEY=value`` lines to ``NOTIFY_SOCKET``, if there is one.
+
+    A line break inside a value (a path may have one) becomes a blank: it would start another line.
+    """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return
@@ -21,4 +24,5 @@ def notify(*lines: str) -> None:
         contextlib.suppress(OSError),
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
     ):
-        channel.sendto("\n".join(lines).encode(), address)
+        text = "\n".join(line.replace("\n", " ") for line in lines)
+        channel.sendto(text.encode(errors="replace"), address)

@@ -100,4 +100,4 @@ class ServiceManager:
 
     def failed(self, message: str) -> None:
         """Serving cannot start; the message stays visible in ``systemctl status``."""
-        self._tell("STATUS=" + message.replace("\n", " "))
+        self._tell(f"STATUS={message}")

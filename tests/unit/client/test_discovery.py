@@ -121,7 +121,7 @@ def test_a_full_queue_of_connections_is_no_answer(place: Path) -> None:
             one.close()
 
 
-@pytest.mark.parametrize("words", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"", b"\xff\0\0\0\0\0\0\0\x01\x01"])
+@pytest.mark.parametrize("words", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff\0\0\0\0\0\0\0\x01\x01"])
 def test_another_program_is_a_protocol_mismatch(place: Path, words: bytes) -> None:
     with listening(place / "s.sock") as server:
 
@@ -133,6 +133,16 @@ def test_another_program_is_a_protocol_mismatch(place: Path, words: bytes) -> No
         thread = threading.Thread(target=speak)
         thread.start()
         with pytest.raises(ProtocolMismatch, match="does not speak ZeroMQ"):
+            connect(place / "s.sock")
+        thread.join()
+
+
+def test_a_daemon_that_ends_before_it_answers(place: Path) -> None:
+    """A socket that was made for it: the connection waited, and nobody ever accepted it."""
+    with listening(place / "s.sock") as server:
+        thread = threading.Thread(target=lambda: server.accept()[0].close())
+        thread.start()
+        with pytest.raises(StaleSocket, match="without a word"):
             connect(place / "s.sock")
         thread.join()
 

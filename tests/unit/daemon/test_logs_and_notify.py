@@ -66,9 +66,9 @@ def test_notify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind("\0" + name if abstract else name)
         monkeypatch.setenv("NOTIFY_SOCKET", "@" + name if abstract else name)
-        notify("READY=1", "STATUS=serving 5 cells")
+        notify("READY=1", "STATUS=serving 5 cells of a\nMAINPID=1")
         manager.settimeout(10)
-        assert manager.recv(100) == b"READY=1\nSTATUS=serving 5 cells"
+        assert manager.recv(100) == b"READY=1\nSTATUS=serving 5 cells of a MAINPID=1"
 
 
 @pytest.mark.parametrize(

@@ -73,11 +73,11 @@ def test_start_stop_and_failure() -> None:
     one, heard = manager()
     one.ready("serving")
     one.stopping("freeing memory")
-    one.failed("no map\nat all")
+    one.failed("no map")
     assert heard == [
         ("READY=1", "STATUS=serving", f"MAINPID={os.getpid()}"),
         ("STOPPING=1", "STATUS=freeing memory"),
-        ("STATUS=no map at all",),
+        ("STATUS=no map",),
     ]
 
 
