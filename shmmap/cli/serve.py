@@ -57,7 +57,15 @@ def add_parser(subparsers: Subparsers) -> None:
         "--load-timeout", metavar="SECONDS", dest="load_timeout_s", help="deadline of one load (default: 60)"
     )
     limits.add_argument("--eviction", metavar="POLICY", help="distance or lru (default: distance)")
-    parser.add_argument("--cache-dir", metavar="DIR", help="where the map's index is kept between starts")
+    parser.add_argument(
+        "--cache-dir", metavar="DIR", help="where the map's index and computed layers are kept between starts"
+    )
+    parser.add_argument(
+        "--cache-size",
+        metavar="SIZE",
+        dest="cache_bytes",
+        help="most disk space of kept layers, 0: keep none (default: 8G)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

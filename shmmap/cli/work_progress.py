@@ -25,12 +25,24 @@ class StageProgress:
         Where to; stderr by default.
     quiet
         Show nothing.
+    unit, scale
+        What is counted, and how much of it is shown as 1.
     """
 
-    def __init__(self, stream: TextIO | None = None, *, quiet: bool = False) -> None:
+    def __init__(
+        self,
+        stream: TextIO | None = None,
+        *,
+        quiet: bool = False,
+        unit: str = "M points",
+        scale: float = 1e6,
+    ) -> None:
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._quiet = quiet
+        self._unit = unit
+        self._scale = scale
+        self._digits = 1 if scale > 1 else 0
         self._began_s = time.monotonic()
         self._name = ""
         self._total = self._points = self._counted_from = 0
@@ -62,13 +74,18 @@ class StageProgress:
     def text(self, now: float) -> str:
         """The line as it would be shown at ``now``, `time.monotonic`."""
         part = f"{self._points / self._total:4.0%}  " if self._total else ""
-        text = f"{self._name}  {part}{self._points / 1e6:.1f} of {self._total / 1e6:.1f} M points"
+        text = f"{self._name}  {part}{self._number(self._points)} of {self._number(self._total)} {self._unit}"
         spent = now - self._stage_s
         if spent < _SETTLE_S or self._points <= self._counted_from:
             return text
         rate = (self._points - max(0, self._counted_from)) / spent
         left = (self._total - self._points) / rate
-        return f"{text}  {rate / 1e6:.1f} M/s  {format_duration(left)} left"
+        return (
+            f"{text}  {rate / self._scale:.1f}{' M' if self._digits else ''}/s  {format_duration(left)} left"
+        )
+
+    def _number(self, count: float) -> str:
+        return f"{count / self._scale:,.{self._digits}f}"
 
     def _show(self) -> None:
         if self._quiet:

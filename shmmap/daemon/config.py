@@ -65,7 +65,10 @@ class DaemonConfig:
     strict
         Accept only what Autoware's own loader accepts.
     cache_dir
-        Where the prepared catalogue is kept; empty: the user's cache directory.
+        Where the prepared catalogue and computed layers are kept; empty: the service's or the user's
+        cache directory.
+    cache_bytes
+        Most disk space of computed and prepared layers; 0: none are kept.
     eviction
         ``distance`` or ``lru``.
     """
@@ -84,6 +87,7 @@ class DaemonConfig:
     load_timeout_s: float = 60.0
     strict: bool = False
     cache_dir: str = ""
+    cache_bytes: int = 8 << 30
     eviction: str = "distance"
 
     def socket(self) -> str:
@@ -129,7 +133,7 @@ def _convert(name: str, value: Any, origin: str) -> Any:
     """Check one setting's type and range."""
     kind = type(getattr(DaemonConfig(), name))
     try:
-        if name == "budget_bytes":
+        if name in ("budget_bytes", "cache_bytes"):
             value = parse_bytes(value) if isinstance(value, str) else value
         if name == "session_quota" and isinstance(value, str) and not value.replace(".", "").isdigit():
             value = float(parse_bytes(value))
@@ -156,6 +160,7 @@ def _convert(name: str, value: Any, origin: str) -> Any:
         "workers": lambda v: 0 <= v <= 64,
         "load_timeout_s": lambda v: 0 < v <= 86400,
         "budget_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
+        "cache_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
         "eviction": lambda v: v in ("distance", "lru"),
     }
     if name in allowed and not allowed[name](value):

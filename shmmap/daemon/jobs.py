@@ -92,7 +92,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
 
     That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
     ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the source's points; ``neighbours`` are
-    the stamps of the job's, as they were read.
+    the stamps of the job's, as they were read; ``cached``: it came out of the disk cache.
     """
 
     number: int
@@ -105,6 +105,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     load_ns: int
     warnings: tuple[str, ...] = ()
     neighbours: tuple[tuple[int, int, int], ...] = ()
+    cached: bool = False
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):

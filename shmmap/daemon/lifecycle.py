@@ -74,6 +74,7 @@ from shmmap.daemon.store import Store
 from shmmap.daemon.workers import WorkerPool
 from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.sidecar import default_cache_directory
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 from shmmap.segment.crash_steps import step
@@ -216,6 +217,8 @@ class _Life:
             config.load_timeout_s,
             watch=lambda fd: self._running.watch_worker(fd),
             unwatch=lambda fd: self._running.unwatch(fd),
+            cache_dir=config.cache_dir or default_cache_directory(),
+            cache_bytes=config.cache_bytes,
         )
         self._store = Store(
             catalogue,

@@ -264,6 +264,8 @@ class Store:
         self._enter(resident, index)
         took_ns = int((now_s - load.started_s) * 1e9)
         self.events.loaded(resident, took_ns, replaces=old.version if old is not None else 0)
+        self._statistics.add("loads_from_cache", done.cached)
+        self._statistics.add("layers_computed", not done.cached and resident.key.layer != LAYER)
         for warning in done.warnings:
             _log.info("%s: %s", load.key.cell_id, warning)
         if done.dropped:

@@ -8,7 +8,6 @@ the finished, unnamed segment to the daemon, so that an orphan leaves nothing be
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import os
 import signal
@@ -21,13 +20,16 @@ from typing import Final
 from shmmap.daemon import jobs
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS
 from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
-from shmmap.layers.derive import CellJob, derive
-from shmmap.layers.points import LAYER, build_points
+from shmmap.layers.derive import CellJob
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.making import Made, make_layer
+from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, is_full
-from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.layout import SourceStamp
+from shmmap.segment.parent import die_with
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.verify import verify_file
 
@@ -35,7 +37,6 @@ __all__ = ["main"]
 
 _NICENESS: Final = 10  # a warm request never waits for a load
 _OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a worker, not the daemon
-_PR_SET_PDEATHSIG: Final = 1
 _PAGE_BYTES: Final = 4096
 
 
@@ -44,9 +45,12 @@ class _Refused(Exception):
 
 
 class _Worker:
-    def __init__(self, channel: socket.socket, directory: ShmDirectory) -> None:
+    def __init__(
+        self, channel: socket.socket, directory: ShmDirectory, cache: LayerCache | None = None
+    ) -> None:
         self._channel = channel
         self._directory = directory
+        self._cache = cache
         self._waiting: list[jobs.Job | jobs.Check] = []
 
     def run(self) -> None:
@@ -92,12 +96,12 @@ class _Worker:
     def _load(self, job: jobs.Job) -> None:
         started_ns = time.monotonic_ns()
         _test_hook(job.path)
-        warnings: list[str] = []
         try:
             fd = self._directory.create()
             try:
                 step("worker.alloc")
-                header, neighbours = self._build(job, fd, warnings)
+                made = self._make(job, fd)
+                header = made.header
                 done = jobs.Done(
                     job.number,
                     header.header_bytes,
@@ -107,8 +111,9 @@ class _Worker:
                     header.z_max,
                     header.source,
                     time.monotonic_ns() - started_ns,
-                    tuple(warning[:500] for warning in warnings[:20]),
-                    neighbours,
+                    tuple(warning[:500] for warning in made.warnings[:20]),
+                    made.neighbours,
+                    made.cached,
                 )
                 step("worker.pass")
                 self._send(jobs.Segment(), fd)
@@ -129,37 +134,23 @@ class _Worker:
         except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one cell
             self._fail(job, "load_failed", f"{job.path}: building {job.layer} failed: {error!r}")
 
-    def _build(
-        self, job: jobs.Job, fd: int, warnings: list[str]
-    ) -> tuple[SegmentHeader, tuple[SourceStamp, ...]]:
-        """Fill the segment; returns its header and the stamps of the neighbours that were read."""
-        if job.layer == LAYER:
-            header = build_points(
-                job.path,
-                fd,
-                cell_id=job.cell_id,
-                box=job.box,
-                frame_id=job.frame_id,
-                reserve=lambda nbytes: self._reserve(job, nbytes),
-                warn=warnings.append,
-            )
-            return header, ()
+    def _make(self, job: jobs.Job, fd: int) -> Made:
+        """Fill the segment."""
         if len(job.neighbours) > MAX_NEIGHBOURS:
             raise MapDataError(
                 f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one", path=job.path,
                 cause="unsupported_format", hint="use a smaller radius, or larger cells",
             )  # fmt: skip
         spec = layer_spec(job.layer)
-        cell = CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours)
-        done = derive(
+        return make_layer(
             spec,
-            cell,
+            CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
             fd,
-            source=self._points_in_memory(job, spec),
+            cache=self._cache,
+            keep=job.layer != LAYER,  # the source itself is as quick to read, and on this disk already
+            source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )
-        warnings += done.warnings
-        return done.header, done.neighbours
 
     def _points_in_memory(self, job: jobs.Job, spec: LayerSpec) -> CellSource | None:
         """The cell's points out of their segment, if that is still there and of this state of the file."""
@@ -212,18 +203,10 @@ def _test_hook(path: str) -> None:
             signal.pause()
 
 
-def _live_and_die_with(parent: int) -> None:
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    if os.getppid() != parent:
-        os._exit(0)  # the daemon was gone before the kernel knew that we care
-
-
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR``."""
+    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR [CACHE_DIR CACHE_BYTES]``."""
     channel_fd, parent, shm_dir = int(arguments[0]), int(arguments[1]), arguments[2]
-    _live_and_die_with(parent)
+    die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     signal.signal(signal.SIGIO, signal.SIG_IGN)
     os.nice(_NICENESS)
@@ -231,7 +214,8 @@ def main(arguments: list[str]) -> int:
         score.write(_OOM_SCORE)
     channel = socket.socket(fileno=channel_fd)
     try:
-        _Worker(channel, ShmDirectory(shm_dir)).run()
+        cache = LayerCache(arguments[3], limit_bytes=int(arguments[4])) if len(arguments) > 4 else None
+        _Worker(channel, ShmDirectory(shm_dir), cache).run()
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.ECONNRESET):
             raise

@@ -60,6 +60,8 @@ class WorkerPool:
         Where they make segments.
     deadline_s
         How long one load may take; then its worker is killed.
+    cache_dir, cache_bytes
+        Where finished layers are kept, and at most how much of them; empty or 0: nowhere.
     watch, unwatch
         Called with a worker's descriptor when it comes and goes, for the caller's poller.
 
@@ -77,12 +79,15 @@ class WorkerPool:
         *,
         watch: Callable[[int], None],
         unwatch: Callable[[int], None],
+        cache_dir: str = "",
+        cache_bytes: int = 0,
     ) -> None:
         self._limit = limit
         self._shm_dir = shm_dir
         self._deadline_s = deadline_s
         self._watch = watch
         self._unwatch = unwatch
+        self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
         self._workers: dict[int, Worker] = {}
         self.failed_starts = 0
 
@@ -110,7 +115,7 @@ class WorkerPool:
             process = subprocess.Popen(
                 [
                     sys.executable, "-m", "shmmap.daemon.worker",
-                    str(theirs.fileno()), str(os.getpid()), self._shm_dir,
+                    str(theirs.fileno()), str(os.getpid()), self._shm_dir, *self._cache,
                 ],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,

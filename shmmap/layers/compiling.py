@@ -5,8 +5,9 @@ Kernels live in modules of their own that only builders import, so that nothing 
 unless it builds a layer.  Every signature takes read-only arrays (writable ones fit it too; the
 reverse would compile once more, for seconds, on the first array out of shared memory).
 
-The cache is ``NUMBA_CACHE_DIR`` where that is set, else ``$XDG_CACHE_HOME/shmmap/kernels``; where it
-cannot be written, kernels are compiled in each process.
+The cache is ``NUMBA_CACHE_DIR`` where that is set, else ``$CACHE_DIRECTORY/kernels`` (a service),
+``$XDG_CACHE_HOME/shmmap/kernels`` or ``~/.cache/shmmap/kernels``; where it cannot be written, kernels are
+compiled in each process.
 """
 
 from __future__ import annotations
@@ -27,10 +28,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 def kernel_cache_directory() -> Path | None:
     """Directory of compiled kernels, made if missing; None where none can be written."""
     named = os.environ.get("NUMBA_CACHE_DIR")
+    service = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
     base = os.environ.get("XDG_CACHE_HOME", "")
     try:
         if named:
             path = Path(named)
+        elif service:
+            path = Path(service) / "kernels"
         else:
             path = (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "kernels"
         path.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -81,6 +81,8 @@ COUNTERS: Final = (
     Counter("last_reload_failed", "gauge", "", "1 if the last attempt to read the catalogue again failed"),
     Counter("loads_after_eviction", "counter", "", WINDOWED["loads_after_eviction"]),
     Counter("segments_pinned", "gauge", "", "Segments somebody maps, as last probed"),
+    Counter("layers_computed", "counter", "", "Loads that computed a layer"),
+    Counter("loads_from_cache", "counter", "", "Loads that found their layer in the disk cache"),
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
     *(
         Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")

@@ -17,7 +17,7 @@ CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evic
 CONTRACT += ["pin", "unpin", "stop"]
 CONTRACT += ["config", "unit", "doctor"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
-CONTRACT += ["divide", "merge"]
+CONTRACT += ["divide", "merge", "prepare"]
 CONTRACT += ["top", "tail", "map", "metrics"]
 
 

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finished layers on disk, so that nothing is computed twice: not after a restart, not by another daemon.
+
+An entry is the bytes of a segment, its publish block empty.  It has two names, both hard links to one
+file: one for the *content* it was computed from (digest of the source, layer, builder version, box),
+one for the *state* of the files it was found for (cell, stamps).  Loading asks by state and reads no
+source; where a map was copied or touched, `LayerCache.recognise` finds the entry by content and gives
+it its new state.  ::
+
+    DIRECTORY/layers/content/ab/<digest><hash>.layer
+    DIRECTORY/layers/state/cd/<hash>.layer
+
+Entries appear whole, by renaming; nothing is synced, since every column is compared with its checksum
+when it is loaded, and an entry that does not match is removed and built anew.  Entries that others could
+have written are not used.  The least recently used go first when `trim` brings the cache under its limit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import xxhash
+
+from shmmap.errors import SegmentCorrupt
+from shmmap.layers.contract import Box
+from shmmap.layers.spec import LayerSpec
+from shmmap.segment.layout import (
+    LAYOUT_VERSION,
+    NO_SOURCE,
+    PAGE_BYTES,
+    SegmentHeader,
+    SourceStamp,
+    header_size,
+    pack_header,
+    unpack_header,
+)  # fmt: skip
+from shmmap.segment.writer import write_all
+
+__all__ = ["CacheKey", "LayerCache", "neighbour_states"]
+
+_BLOCK_BYTES: Final = 1 << 18  # stays in the second-level cache while it is hashed and written
+_TOUCH_AGE_S: Final = 3600.0
+_STALE_INTERIM_S: Final = 3600.0
+_SPARE_SHARE: Final = 0.05
+"""Part of the file system that the cache leaves free."""
+
+
+@dataclass(frozen=True, slots=True)
+class CacheKey:
+    """What an entry is of.
+
+    Attributes
+    ----------
+    stamp, neighbours
+        State of the cell's file, and paths and states of those around it for a layer with a halo.
+    """
+
+    spec: LayerSpec
+    cell_id: str
+    box: Box
+    frame_id: str
+    stamp: SourceStamp
+    neighbours: tuple[tuple[str, SourceStamp], ...] = ()
+
+    def _layer(self) -> bytes:
+        version = struct.pack("<IHH4d", self.spec.builder_version, *LAYOUT_VERSION, *self.box)
+        return str(self.spec).encode() + b"\0" + version
+
+    def state_name(self) -> str:
+        """Name of the entry for this state of the files."""
+        words = [self._layer()]
+        for path, stamp in ((self.cell_id, self.stamp), *self.neighbours):
+            words.append(os.fsencode(path) + b"\0" + struct.pack("<Qqq", *stamp))
+        name: str = xxhash.xxh3_128_hexdigest(b"".join(words))
+        return name
+
+    def content_name(self, digest: bytes) -> str:
+        """Name of the entry for what was computed from, by `shmmap.layers.derive.combined_digest`."""
+        name: str = digest.hex() + xxhash.xxh3_64_hexdigest(self._layer())
+        return name
+
+
+class LayerCache:
+    """The cache in one directory.
+
+    Parameters
+    ----------
+    directory
+        Made when the first entry is stored.
+    limit_bytes
+        What `trim` keeps it under.
+
+    Attributes
+    ----------
+    stored_bytes
+        Bytes stored by this object since its last `trim`.
+    """
+
+    def __init__(self, directory: str, *, limit_bytes: int) -> None:
+        self.directory = os.path.join(directory, "layers")
+        self.limit_bytes = limit_bytes
+        self.stored_bytes = 0
+
+    def _state_path(self, name: str) -> str:
+        return os.path.join(self.directory, "state", name[:2], f"{name}.layer")
+
+    def _content_path(self, name: str) -> str:
+        return os.path.join(self.directory, "content", name[:2], f"{name}.layer")
+
+    # --- looking --------------------------------------------------------------------------------
+
+    def has(self, key: CacheKey) -> bool:
+        """Whether there is an entry for this state, whole by its header and size."""
+        return self.size_of(key) > 0
+
+    def size_of(self, key: CacheKey) -> int:
+        """Bytes of the entry for this state; 0 where there is none."""
+        opened = self._open(key)
+        if opened is None:
+            return 0
+        os.close(opened[0])
+        return opened[1].total_bytes
+
+    def _open(self, key: CacheKey) -> tuple[int, SegmentHeader] | None:
+        path = self._state_path(key.state_name())
+        try:
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        except OSError:
+            return None
+        try:
+            status = os.fstat(fd)
+            if status.st_uid in (0, os.geteuid()) and not status.st_mode & 0o022:
+                header = _read_header(fd, status.st_size)
+                if header.layer == str(key.spec) and header.builder_version == key.spec.builder_version:
+                    if time.time() - status.st_mtime > _TOUCH_AGE_S:
+                        with contextlib.suppress(OSError):
+                            os.utime(fd)
+                    return fd, header
+        except (OSError, SegmentCorrupt, UnicodeDecodeError):
+            self._remove(path)
+        os.close(fd)
+        return None
+
+    def load(
+        self, key: CacheKey, fd: int, *, reserve: Callable[[int], None] | None = None
+    ) -> SegmentHeader | None:
+        """Copy an entry into an empty segment file, compared with its checksums on the way.
+
+        Parameters
+        ----------
+        fd
+            Empty file, open for writing; empty again where there is no entry to load.
+        reserve
+            Called with the segment's size in bytes before anything is written; it refuses by raising.
+
+        Returns
+        -------
+        The segment's header, publish block empty; None where there is no entry, or a damaged one,
+        which is removed.
+
+        Raises
+        ------
+        OSError
+            ENOSPC if there is no room for the segment.
+        """
+        opened = self._open(key)
+        if opened is None:
+            return None
+        entry, found = opened
+        try:
+            header = replace(found, cell_id=key.cell_id, frame_id=key.frame_id, source=key.stamp)
+            needed = header_size(len(header.columns), header.cell_id, header.layer, header.frame_id)
+            if needed != found.header_bytes:
+                return None  # the columns would have to move
+            if reserve is not None:
+                reserve(header.total_bytes)
+            os.ftruncate(fd, header.total_bytes)
+            if not _copy_columns(entry, fd, header):
+                self._remove(self._state_path(key.state_name()))
+                self._remove(self._content_path(key.content_name(header.source_digest)))
+                os.ftruncate(fd, 0)
+                return None
+            write_all(fd, memoryview(pack_header(header)), 0)
+            return header
+        finally:
+            os.close(entry)
+
+    def recognise(self, key: CacheKey, digest: bytes) -> bool:
+        """Give an entry computed from the same content, if there is one, the name of this state."""
+        with contextlib.suppress(OSError):
+            self._link(self._content_path(key.content_name(digest)), self._state_path(key.state_name()))
+        return self.has(key)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to recognise."""
+        try:
+            return not os.listdir(os.path.join(self.directory, "content"))
+        except OSError:
+            return True
+
+    # --- storing --------------------------------------------------------------------------------
+
+    def store(self, key: CacheKey, header: SegmentHeader, fd: int) -> bool:
+        """Keep a finished segment whose publish block is still empty; False where there is no room for it.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        os.makedirs(self.directory, mode=0o755, exist_ok=True)
+        room = os.statvfs(self.directory)
+        spare = int(room.f_blocks * room.f_frsize * _SPARE_SHARE)
+        if header.total_bytes > min(self.limit_bytes, room.f_bavail * room.f_frsize - spare):
+            return False
+        interim_fd, interim = tempfile.mkstemp(prefix=".new-", dir=self.directory)
+        try:
+            try:
+                _copy_all(fd, interim_fd, header.total_bytes)
+                os.fchmod(interim_fd, 0o644)
+            finally:
+                os.close(interim_fd)
+            state = self._state_path(key.state_name())
+            content = self._content_path(key.content_name(header.source_digest))
+            with contextlib.suppress(OSError):  # a file system without hard links: found by state alone
+                self._remove(content)
+                self._link(interim, content)
+            os.makedirs(os.path.dirname(state), mode=0o755, exist_ok=True)
+            os.rename(interim, state)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(interim)
+            raise
+        self.stored_bytes += header.total_bytes
+        return True
+
+    def _link(self, old: str, new: str) -> None:
+        os.makedirs(os.path.dirname(new), mode=0o755, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.link(old, new)
+
+    def _remove(self, path: str) -> None:
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+
+    # --- bounds -----------------------------------------------------------------------------------
+
+    def _files(self) -> Iterator[tuple[str, os.stat_result]]:
+        for folder, _, names in os.walk(self.directory):
+            for name in names:
+                path = os.path.join(folder, name)
+                with contextlib.suppress(OSError):
+                    yield path, os.lstat(path)
+
+    def trim(self) -> int:
+        """Remove what was used least recently until the cache is under its limit; returns its bytes.
+
+        What a killed process left half written goes too, an hour later.
+        """
+        self.stored_bytes = 0
+        names: dict[int, list[str]] = {}
+        entries: dict[int, tuple[float, int]] = {}
+        for path, status in self._files():
+            if os.path.basename(path).startswith(".new-"):
+                if time.time() - status.st_mtime > _STALE_INTERIM_S:
+                    self._remove(path)
+                continue
+            names.setdefault(status.st_ino, []).append(path)
+            entries[status.st_ino] = (status.st_mtime, status.st_size)
+        total = sum(size for _, size in entries.values())
+        for inode, (_, size) in sorted(entries.items(), key=lambda item: item[1][0]):
+            if total <= self.limit_bytes:
+                break
+            for path in names[inode]:
+                self._remove(path)
+            total -= size
+        return total
+
+
+def _read_header(fd: int, available: int) -> SegmentHeader:
+    page = os.pread(fd, PAGE_BYTES, 0)
+    header_bytes = int.from_bytes(page[16:24], "little")
+    if PAGE_BYTES < header_bytes <= available:
+        page = os.pread(fd, header_bytes, 0)
+    return unpack_header(memoryview(page), available)
+
+
+def _copy_columns(entry: int, fd: int, header: SegmentHeader) -> bool:
+    """Copy every column, hashing it on the way; False where one does not match its checksum."""
+    buffer = memoryview(bytearray(_BLOCK_BYTES))
+    for column in header.columns:
+        digest = xxhash.xxh3_64()
+        at, end = column.offset, column.offset + column.nbytes
+        while at < end:
+            got = os.preadv(entry, [buffer[: min(_BLOCK_BYTES, end - at)]], at)
+            if not got:
+                return False
+            block = buffer[:got]
+            digest.update(block)
+            write_all(fd, block, at)
+            at += got
+        if digest.intdigest() != column.checksum:
+            return False
+    return True
+
+
+def _copy_all(source: int, target: int, nbytes: int) -> None:
+    at = 0
+    while at < nbytes:
+        block = os.pread(source, min(_BLOCK_BYTES * 4, nbytes - at), at)
+        if not block:
+            raise OSError("the segment is shorter than its header says")
+        write_all(target, memoryview(block), at)
+        at += len(block)
+
+
+def neighbour_states(paths: Sequence[str]) -> tuple[tuple[str, SourceStamp], ...]:
+    """Return paths with the stamps of what lies there now; zeros where nothing does."""
+    return tuple((path, _state_of(path)) for path in paths)
+
+
+def _state_of(path: str) -> SourceStamp:
+    try:
+        return SourceStamp.of(os.stat(path))
+    except OSError:
+        return NO_SOURCE

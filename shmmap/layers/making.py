@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One layer of one cell into a segment file: out of the disk cache where it is there, else built and kept."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from shmmap.layers.derive import CellJob, derive
+from shmmap.layers.disk_cache import CacheKey, LayerCache, neighbour_states
+from shmmap.layers.points import LAYER, build_points
+from shmmap.layers.sources import CellSource
+from shmmap.layers.spec import LayerSpec
+from shmmap.segment.layout import SegmentHeader, SourceStamp
+
+__all__ = ["Made", "cache_key", "make_layer"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A finished segment.
+
+    Attributes
+    ----------
+    neighbours
+        States of the neighbours' files that it stands for.
+    cached
+        It came out of the cache.
+    """
+
+    header: SegmentHeader
+    neighbours: tuple[SourceStamp, ...] = ()
+    warnings: tuple[str, ...] = ()
+    cached: bool = False
+
+
+def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
+    """Key of a layer for the files as they are now; None where the cell's own cannot be looked at."""
+    try:
+        stamp = SourceStamp.of(os.stat(job.path))
+    except OSError:
+        return None
+    return CacheKey(spec, job.cell_id, job.box, job.frame_id, stamp, neighbour_states(job.neighbours))
+
+
+def make_layer(
+    spec: LayerSpec,
+    job: CellJob,
+    fd: int,
+    *,
+    cache: LayerCache | None = None,
+    keep: bool = False,
+    source: Callable[[], CellSource | None] | None = None,
+    reserve: Callable[[int], None] | None = None,
+) -> Made:
+    """Fill an empty segment file with a layer.
+
+    Parameters
+    ----------
+    fd
+        Empty file, open for reading and writing; after an error its contents mean nothing.
+    cache, keep
+        Where to look first, and whether to store what was built.
+    source
+        Returns the cell's points where they are at hand, else None; asked only for computed layers.
+    reserve
+        Called with the segment's size in bytes before anything is written; it refuses by raising.
+
+    Raises
+    ------
+    MapDataError
+        If a file cannot be read, or its points cannot become this layer.
+    OSError
+        ENOSPC if the file system is full.
+    """
+    key = cache_key(spec, job) if cache is not None else None
+    if cache is not None and key is not None:
+        header = cache.load(key, fd, reserve=reserve)
+        if header is not None:
+            return Made(header, tuple(stamp for _, stamp in key.neighbours), cached=True)
+    if spec.kind.name == LAYER:
+        warnings: list[str] = []
+        header = build_points(
+            job.path,
+            fd,
+            cell_id=job.cell_id,
+            box=job.box,
+            frame_id=job.frame_id,
+            reserve=reserve,
+            warn=warnings.append,
+        )
+        made = Made(header, warnings=tuple(warnings))
+    else:
+        derived = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
+        made = Made(derived.header, derived.neighbours, derived.warnings)
+    if keep and cache is not None and key is not None:
+        states = tuple(zip(job.neighbours, made.neighbours, strict=True))
+        _keep(cache, replace(key, stamp=made.header.source, neighbours=states), made.header, fd)
+    return made
+
+
+def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> None:
+    try:
+        cache.store(key, header, fd)
+    except OSError as error:  # the cache is a convenience: a full disk costs nobody a layer
+        _log.warning("%s cannot be kept in %s: %s", key.spec, cache.directory, error)
+    if cache.stored_bytes > cache.limit_bytes // 16:
+        with contextlib.suppress(OSError):
+            cache.trim()

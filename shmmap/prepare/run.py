@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Preparing a whole map: every cell to a worker, on all cores, until nothing is missing.
+
+Workers are processes that the kernel ends with this one.  A worker that dies costs the cell it worked
+on; another takes its place.  Stopped at any moment and started again, the run goes on where it was:
+what is in the cache is only looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import msgspec
+
+from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
+from shmmap.errors import InternalError
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.spec import canonical_layers
+from shmmap.origin.catalogue import Catalogue
+from shmmap.prepare import work
+
+__all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map"]
+
+_FAILED_STARTS: Final = 3
+
+
+class PrepareProgress(Protocol):
+    """Hears how far a run is."""
+
+    def stage(self, name: str, total: int) -> None:
+        """A stage of so many cells begins."""
+
+    def advance(self, cells: int) -> None:
+        """So many more cells are done."""
+
+    def done(self, cells: int) -> None:
+        """Everything is done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A layer that could not be prepared."""
+
+    cell_id: str
+    layer: str
+    message: str
+
+
+@dataclass(slots=True)
+class Prepared:
+    """What a run came to; layers are counted by how they got there, ``bytes`` are those of all of them."""
+
+    cells: int
+    kept: int = 0
+    recognised: int = 0
+    built: int = 0
+    bytes: int = 0
+    cache_bytes: int = 0
+    failures: list[Failure] = field(default_factory=list)
+
+
+@dataclass(eq=False, slots=True)
+class _Worker:
+    process: subprocess.Popen[bytes]
+    channel: socket.socket
+    task: work.CellWork | None = None
+    ready: bool = False
+
+
+class _Run:
+    def __init__(
+        self,
+        tasks: Sequence[work.CellWork],
+        cache: LayerCache,
+        cache_dir: str,
+        limit: int,
+        progress: PrepareProgress,
+    ) -> None:
+        self._waiting = deque(tasks)
+        self._cache = cache
+        self._arguments = [cache_dir, str(cache.limit_bytes)]
+        self._limit = min(limit, len(tasks))
+        self._progress = progress
+        self._selector = selectors.DefaultSelector()
+        self._workers: list[_Worker] = []
+        self._failed_starts = 0
+        self._added_bytes = 0
+        self.result = Prepared(len(tasks))
+
+    def run(self) -> None:
+        try:
+            while self._waiting or any(worker.task for worker in self._workers):
+                while self._waiting and len(self._workers) < self._limit:
+                    self._start()
+                for key, _ in self._selector.select():
+                    self._hear(key.data)
+        finally:
+            for worker in list(self._workers):
+                self._end(worker)
+            self._selector.close()
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            process = subprocess.Popen(
+                [
+                    sys.executable, "-m", "shmmap.prepare.worker",
+                    str(theirs.fileno()), str(os.getpid()), *self._arguments,
+                ],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env={
+                    "OMP_NUM_THREADS": "1",
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+                },
+                cwd="/",
+            )  # fmt: skip
+        worker = _Worker(process, ours)
+        self._workers.append(worker)
+        self._selector.register(ours, selectors.EVENT_READ, worker)
+        self._feed(worker)
+
+    def _feed(self, worker: _Worker) -> None:
+        worker.task = None
+        if self._waiting:
+            worker.task = self._waiting.popleft()
+            with contextlib.suppress(OSError):  # its end is reported by its channel
+                worker.channel.send(work.encode(worker.task))
+
+    def _hear(self, worker: _Worker) -> None:
+        try:
+            data = worker.channel.recv(work.MAX_PACKET_BYTES)
+            message = work.decode_done(data) if data else None
+        except (OSError, msgspec.MsgspecError):
+            message = None
+        if message is None:
+            self._died(worker)
+        elif isinstance(message, work.Ready):
+            worker.ready = True
+            self._failed_starts = 0
+        else:
+            self._count(message, worker)
+            self._feed(worker)
+
+    def _count(self, done: work.CellDone, worker: _Worker) -> None:
+        result = self.result
+        for layer in done.layers:
+            result.kept += layer.how == "kept"
+            result.recognised += layer.how == "recognised"
+            result.built += layer.how == "built"
+            result.bytes += layer.bytes
+            if layer.how == "built":
+                self._added_bytes += layer.bytes
+            elif layer.how == "failed" and worker.task is not None:
+                result.failures.append(Failure(worker.task.cell_id, layer.layer, layer.message))
+        if self._added_bytes > self._cache.limit_bytes // 16:
+            self._added_bytes = 0
+            self._cache.trim()
+        self._progress.advance(1)
+
+    def _died(self, worker: _Worker) -> None:
+        task, ready = worker.task, worker.ready
+        how = self._end(worker)
+        if not ready:
+            self._failed_starts += 1
+            if self._failed_starts >= _FAILED_STARTS:
+                raise InternalError(f"no worker can be started: {how}")
+            if task is not None:
+                self._waiting.appendleft(task)
+            return
+        if task is not None:
+            message = f"{task.path}: the worker died of it ({how})"
+            self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
+            self._progress.advance(1)
+
+    def _end(self, worker: _Worker) -> str:
+        self._workers.remove(worker)
+        self._selector.unregister(worker.channel)
+        worker.channel.close()
+        worker.process.kill()
+        code = worker.process.wait()
+        return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+def prepare_map(
+    catalogue: Catalogue,
+    layers: Sequence[str],
+    *,
+    cache_dir: str,
+    cache_bytes: int,
+    workers: int,
+    progress: PrepareProgress,
+) -> Prepared:
+    """Have layers of every cell of a map in the disk cache.
+
+    Parameters
+    ----------
+    layers
+        Specs, in any form.
+    cache_dir, cache_bytes
+        Where, and at most how much; what was used least recently makes room.
+    workers
+        How many processes.
+
+    Raises
+    ------
+    BadRequest
+        If a layer is unknown.
+    """
+    names = canonical_layers(layers)
+    cache = LayerCache(cache_dir, limit_bytes=cache_bytes)
+    versions = LayerVersions(lambda: catalogue)
+    recognise = not cache.is_empty
+    tasks, failures = [], []
+    for index in range(len(catalogue)):
+        around = [[catalogue.path(n) for n in versions.neighbours(index, name)] for name in names]
+        crowded = [name for name, some in zip(names, around, strict=True) if len(some) > MAX_NEIGHBOURS]
+        cell_id = catalogue.id(index)
+        failures += [
+            Failure(cell_id, name, f"{name} looks into more than {MAX_NEIGHBOURS} cells around one")
+            for name in crowded
+        ]
+        kept = [number for number, name in enumerate(names) if name not in crowded]
+        tasks.append(
+            work.CellWork(
+                index,
+                cell_id,
+                catalogue.path(index),
+                catalogue.box(index),
+                catalogue.frame_id,
+                tuple(names[number] for number in kept),
+                tuple(tuple(around[number]) for number in kept),
+                recognise,
+            )
+        )
+    progress.stage("prepare", len(tasks))
+    run = _Run(tasks, cache, cache_dir, max(1, workers), progress)
+    run.run()
+    run.result.failures += failures
+    run.result.cache_bytes = cache.trim()
+    progress.done(len(tasks))
+    return run.result

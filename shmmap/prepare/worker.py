@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A preparing worker: a process of its own that builds the layers of one cell after the other.
+
+A file that crashes it costs that one cell; it dies with the process that started it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+from dataclasses import replace
+from typing import Final
+
+import xxhash
+
+from shmmap.errors import ShmmapError
+from shmmap.layers.derive import CellJob, combined_digest
+from shmmap.layers.disk_cache import CacheKey, LayerCache
+from shmmap.layers.making import cache_key, make_layer
+from shmmap.layers.points import LAYER
+from shmmap.layers.sources import CellSource, read_source
+from shmmap.layers.spec import LayerSpec, layer_spec
+from shmmap.prepare import work
+from shmmap.segment.parent import die_with
+
+__all__ = ["main", "prepare_cell"]
+
+_NICENESS: Final = 5
+_BLOCK_BYTES: Final = 1 << 20
+
+
+def prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
+    """Have every layer of a cell in the cache; the file is read once for all computed layers."""
+    done: dict[str, work.LayerDone] = {}
+    missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []
+    for name, around in zip(task.layers, task.around, strict=True):
+        spec = layer_spec(name)
+        job = CellJob(task.cell_id, task.path, task.box, task.frame_id, around)
+        key = cache_key(spec, job)
+        if key is None:
+            done[name] = work.LayerDone(name, "failed", 0, f"{task.path}: it cannot be looked at")
+        elif cache.has(key):
+            done[name] = work.LayerDone(name, "kept", cache.size_of(key))
+        else:
+            missing.append((spec, job, key))
+    if missing and task.recognise:
+        digests: dict[str, bytes] = {}
+        for entry in list(missing):
+            spec, job, key = entry
+            if cache.recognise(key, _content(job, digests)):
+                done[str(spec)] = work.LayerDone(str(spec), "recognised", cache.size_of(key))
+                missing.remove(entry)
+    source = _Source(task, [spec for spec, _, _ in missing])
+    for spec, job, _ in missing:
+        done[str(spec)] = _build(spec, job, cache, source)
+    return work.CellDone(task.number, tuple(done[name] for name in task.layers))
+
+
+class _Source:
+    """The cell's points, read when first asked for, with the columns that all layers need together."""
+
+    def __init__(self, task: work.CellWork, specs: list[LayerSpec]) -> None:
+        self._task = task
+        self._read: CellSource | None = None
+        needs = [spec.source_columns for spec in specs if spec.kind.name != LAYER]
+        self._needs: tuple[str, ...] | None = (
+            None if None in needs else tuple({name for some in needs if some is not None for name in some})
+        )
+
+    def points(self, spec: LayerSpec) -> CellSource:
+        """The columns that one layer takes: exactly those, whatever the others need."""
+        if self._read is None:
+            self._read = read_source(self._task.path, self._task.box, self._needs)
+        names = spec.source_columns
+        table = self._read.points
+        columns = {n: c for n, c in table.columns.items() if names is None or n in names}
+        units = {n: u for n, u in table.units.items() if n in columns}
+        return replace(self._read, points=replace(table, columns=columns, units=units))
+
+
+def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: _Source) -> work.LayerDone:
+    name = str(spec)
+    try:
+        fd = os.memfd_create("layer", os.MFD_CLOEXEC)
+        try:
+            made = make_layer(spec, job, fd, source=lambda: source.points(spec))
+            states = tuple(zip(job.neighbours, made.neighbours, strict=True))
+            key = CacheKey(spec, job.cell_id, job.box, job.frame_id, made.header.source, states)
+            if not cache.store(key, made.header, fd):
+                return work.LayerDone(name, "failed", 0, f"{cache.directory}: there is no room for it")
+            return work.LayerDone(name, "built", made.header.total_bytes)
+        finally:
+            os.close(fd)
+    except ShmmapError as error:
+        message = str(error)
+    except OSError as error:
+        message = f"{job.path}: {error.strerror or error}"
+    except MemoryError:
+        message = f"{job.path}: building {name} ran out of memory"
+    except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one layer
+        message = f"{job.path}: building {name} failed: {error!r}"
+    return work.LayerDone(name, "failed", 0, message[:2000])
+
+
+def _content(job: CellJob, known: dict[str, bytes]) -> bytes:
+    """Digest of the files that a layer is computed from, each read once; zeros where one cannot be."""
+    for path in (job.path, *job.neighbours):
+        if path not in known:
+            known[path] = _digest(path)
+    return combined_digest(known[job.path], [known[path] for path in job.neighbours])
+
+
+def _digest(path: str) -> bytes:
+    digest = xxhash.xxh3_128()
+    try:
+        with open(path, "rb", buffering=0) as file:
+            while block := file.read(_BLOCK_BYTES):
+                digest.update(block)
+    except OSError:
+        return bytes(16)
+    return digest.digest()
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID CACHE_DIR CACHE_BYTES``."""
+    channel = socket.socket(fileno=int(arguments[0]))
+    die_with(int(arguments[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    os.nice(_NICENESS)
+    cache = LayerCache(arguments[2], limit_bytes=int(arguments[3]))
+    try:
+        channel.send(work.encode(work.Ready()))
+        while data := channel.recv(work.MAX_PACKET_BYTES):
+            channel.send(work.encode(prepare_cell(work.decode_work(data), cache)))
+    except (BrokenPipeError, ConnectionResetError):
+        pass
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

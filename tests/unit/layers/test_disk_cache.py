@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The disk cache: the same bytes back, nothing damaged or foreign served, never more than its limit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shmmap.layers.derive import CellJob
+from shmmap.layers.disk_cache import CacheKey, LayerCache
+from shmmap.layers.making import Made, cache_key, make_layer
+from shmmap.layers.spec import parse_layer
+from shmmap.segment.layout import SourceStamp
+from tests.support.divided_map import random_points
+from tests.support.pcd_files import write_pcd
+
+BOX = (0.0, 0.0, 20.0, 20.0)
+LAYERS = ["points", "ndt(leaf=2.0,min_points=3)", "voxel(leaf=0.5)", "elevation(resolution=1.0)"]
+
+
+class Bench:
+    """One cell, one cache, and segments in memory."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.cache = LayerCache(str(directory / "cache"), limit_bytes=1 << 30)
+        self.path = directory / "cell.pcd"
+        self.write(300)
+
+    def write(self, points: int) -> None:
+        write_pcd(self.path, random_points(np.random.default_rng(points), (0, 0), points))
+
+    @property
+    def job(self) -> CellJob:
+        return CellJob(str(self.path), str(self.path), BOX)
+
+    def make(self, layer: str, job: CellJob | None = None) -> tuple[Made, bytes]:
+        """One layer as a loader makes it, and its bytes."""
+        fd = os.memfd_create("segment")
+        try:
+            made = make_layer(parse_layer(layer), job or self.job, fd, cache=self.cache, keep=True)
+            return made, os.pread(fd, os.fstat(fd).st_size, 0)
+        finally:
+            os.close(fd)
+
+    def key(self, layer: str) -> CacheKey:
+        key = cache_key(parse_layer(layer), self.job)
+        assert key is not None
+        return key
+
+    def files(self) -> list[Path]:
+        return sorted((self.directory / "cache").rglob("*.layer"))
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_the_same_bytes_come_back(one: Bench, layer: str) -> None:
+    built, first = one.make(layer)
+    assert not built.cached
+    found, again = one.make(layer)
+    assert found.cached
+    assert again == first
+    assert repr(found.header) == repr(built.header)
+    state = Path(one.cache._state_path(one.key(layer).state_name()))
+    assert state.read_bytes() == first  # a prepared file has the segment's bytes, its publish block empty
+    assert len(one.files()) == 2
+
+
+def test_layers_and_states_are_apart(one: Bench) -> None:
+    for layer in LAYERS:
+        one.make(layer)
+    assert len(one.files()) == 2 * len(LAYERS)
+    one.write(301)
+    for layer in LAYERS:
+        assert not one.make(layer)[0].cached
+        assert one.make(layer)[0].cached
+    key = one.key(LAYERS[1])
+    assert not one.cache.has(replace(key, box=(0.0, 0.0, 20.0, 21.0)))
+    newer = replace(key.spec, kind=replace(key.spec.kind, builder_version=2))
+    assert not one.cache.has(replace(key, spec=newer))
+
+
+def test_any_damage_is_noticed_and_built_anew(one: Bench) -> None:
+    layer = "ndt(leaf=4.0,min_points=3)"
+    _, true = one.make(layer)
+    size = len(true)
+    rng = np.random.default_rng(2)
+    columns = one.make(layer)[0].header.columns
+    inside = [at for c in columns for at in range(c.offset, c.offset + c.nbytes)]
+    places = [*range(0, 288, 37), 4095 - 70, *rng.choice(inside, 20).tolist()]
+    for at in places:
+        state = Path(one.cache._state_path(one.key(layer).state_name()))
+        with state.open("r+b") as file:
+            file.seek(at)
+            byte = file.read(1)
+            file.seek(at)
+            file.write(bytes([byte[0] ^ 0x20]))
+        made, data = one.make(layer)
+        assert not made.cached, at
+        assert data == true, at
+        assert one.make(layer)[0].cached
+    for length in (0, 100, 4096, size - 1):
+        state = Path(one.cache._state_path(one.key(layer).state_name()))
+        os.truncate(state, length)
+        made, data = one.make(layer)
+        # what lies after the last column is padding
+        assert made.cached is False or length >= columns[-1].offset + columns[-1].nbytes
+        assert data[: len(true)] == true
+
+
+def test_what_others_could_have_written_is_not_used(one: Bench) -> None:
+    layer = LAYERS[1]
+    _, true = one.make(layer)
+    state = Path(one.cache._state_path(one.key(layer).state_name()))
+    os.chmod(state, 0o666)
+    made, data = one.make(layer)
+    assert not made.cached
+    assert data == true
+    outside = one.directory / "elsewhere.layer"
+    shutil.move(state, outside)
+    os.symlink(outside, state)
+    assert not one.cache.has(one.key(layer))
+
+
+@pytest.mark.root
+def test_a_stranger_s_file_is_not_used(one: Bench) -> None:
+    one.make(LAYERS[1])
+    os.chown(one.cache._state_path(one.key(LAYERS[1]).state_name()), 12345, -1)
+    assert not one.cache.has(one.key(LAYERS[1]))
+
+
+def test_a_copied_map_is_recognised_by_content(one: Bench) -> None:
+    _, first = one.make(LAYERS[1])
+    digest = one.make(LAYERS[1])[0].header.source_digest
+    moved = one.directory / "moved.pcd"
+    shutil.copy(one.path, moved)
+    job = CellJob(str(moved), str(moved), BOX)
+    key = cache_key(parse_layer(LAYERS[1]), job)
+    assert key is not None
+    assert not one.cache.has(key)
+    assert not one.cache.recognise(replace(key, box=(0.0, 0.0, 1.0, 1.0)), digest)
+    assert not one.cache.recognise(key, bytes(16))
+    assert one.cache.recognise(key, digest)
+    made, data = one.make(LAYERS[1], job)
+    assert made.cached
+    # the header names the new cell and its state, everything else is the same
+    assert (made.header.cell_id, made.header.source) == (str(moved), SourceStamp.of(os.stat(moved)))
+    assert data[made.header.header_bytes :] == first[made.header.header_bytes :]
+    fresh = LayerCache(str(one.directory / "other"), limit_bytes=1 << 30)
+    one.cache = fresh
+    rebuilt, built = one.make(LAYERS[1], job)
+    assert not rebuilt.cached
+    assert built == data
+
+
+def test_an_id_that_needs_a_longer_header_is_built(one: Bench) -> None:
+    one.make(LAYERS[1])
+    digest = one.make(LAYERS[1])[0].header.source_digest
+    job = replace(one.job, cell_id="/" + "long" * 1000)
+    key = cache_key(parse_layer(LAYERS[1]), job)
+    assert key is not None
+    assert one.cache.recognise(key, digest)
+    made, _ = one.make(LAYERS[1], job)
+    assert not made.cached
+    assert made.header.header_bytes == 8192
+
+
+def test_the_least_recently_used_go_first(one: Bench) -> None:
+    sizes = {}
+    for number, layer in enumerate(LAYERS):
+        sizes[layer] = one.make(layer)[0].header.total_bytes
+        os.utime(one.cache._state_path(one.key(layer).state_name()), (number, number))
+    interim = Path(one.cache.directory) / ".new-killed"
+    interim.write_bytes(b"half")
+    os.utime(interim, (1, 1))
+    fresh = Path(one.cache.directory) / ".new-running"
+    fresh.write_bytes(b"half")
+    one.cache.limit_bytes = sum(sizes.values()) - 1
+    assert one.cache.trim() == sum(sizes.values()) - sizes[LAYERS[0]]
+    assert [one.cache.has(one.key(layer)) for layer in LAYERS] == [False, True, True, True]
+    assert not interim.exists()
+    assert fresh.exists()
+    assert len(one.files()) == 6  # both names of what went are gone
+    one.cache.limit_bytes = 0
+    assert one.cache.trim() == 0
+    assert one.files() == []
+
+
+def test_what_is_larger_than_the_limit_is_not_stored(one: Bench) -> None:
+    one.cache.limit_bytes = 5000
+    made, _ = one.make(LAYERS[1])
+    assert not made.cached
+    assert one.files() == []
+
+
+def test_trims_as_it_grows(one: Bench) -> None:
+    one.cache.limit_bytes = 60_000
+    for points in range(300, 330):
+        one.write(points)
+        one.make("voxel(leaf=0.5)")
+    stored = sum(path.stat().st_size for path in one.files()) // 2
+    assert 0 < stored <= 60_000 + 60_000 // 16 + 20_000
+
+
+def test_a_cache_that_cannot_be_written_costs_nothing(one: Bench) -> None:
+    (one.directory / "cache").write_text("a file where the directory should be")
+    made, _ = one.make(LAYERS[1])
+    assert made.header.rows > 0
+    assert not one.cache.has(one.key(LAYERS[1]))
+    assert one.cache.is_empty
