@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process that holds an area's cells with the client library and tells exactly what it holds.
 
-As a program: ``python -m tests.support.holding_client ENDPOINT`` prints ``connected``.  For each line of JSON it reads, one
-of [x, y, radius] (hold that area, drop the rest), [] (drop everything) and null (change nothing), it
-prints what it holds now: rows [id, version, segment, stale, CRC-32 of xyz], and the codes of what failed.
+As a program: ``python -m tests.support.holding_client ENDPOINT`` prints ``connected``.  For each line of
+JSON it reads, one of [x, y, radius] (hold that area, drop the rest), [] (drop everything) and null
+(change nothing), it prints what it holds now: rows [id, version, segment, stale, CRC-32 of xyz], and
+the codes of what failed.
 """
 
 from __future__ import annotations
