@@ -32,6 +32,10 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["CellRequests", "Wanted"]
 
 MAX_WAIT_S: Final = 3600.0
+PROMISED: Final = 1e9
+"""Priority of a load that only a "pending" speaks of: behind the distances of all that is asked for."""
+MOST_CELLS: Final = 20_000
+"""Cells, in all layers together, of one request: about half a second of the loop when all are cold."""
 
 
 @dataclass(eq=False, slots=True)
@@ -184,6 +188,11 @@ class CellRequests:
     # --- waiting and answering ------------------------------------------------------------------
 
     def _begin(self, wanted: Wanted, wait_s: float | None, area: Area | None, now_s: float) -> None:
+        if len(wanted.cells) > MOST_CELLS:
+            raise BadRequest(
+                f"{len(wanted.cells)} cells in one request; {MOST_CELLS} is the most",
+                hint="ask for a smaller area, or for some ids at a time",
+            )
         warm = self._store.warm
         find = self._store.find_warm
         cold = [
@@ -214,7 +223,7 @@ class CellRequests:
             key = Key(store.catalogue.id(index), layer)
             if key in wanted.refused:
                 continue
-            if store.want(index, layer, distance, now_s).load is not None:
+            if store.want(index, layer, distance, now_s, wanted.session.asker).load is not None:
                 wanted.outstanding.add(key)
 
     def _check_quota(self, wanted: Wanted, cold: Sequence[tuple[int, str]]) -> None:
@@ -407,7 +416,7 @@ class CellRequests:
             answer.failed.append(FailedCell(wire_id, layer, slot.failure.code, slot.failure.message, holders))
         elif not current:
             if slot.load is None:  # evicted, or no longer out of room: "pending" promises a load
-                store.want(index, layer, float("inf"), now_s)
+                store.want(index, layer, PROMISED, now_s, wanted.session.asker)
             answer.pending.append(PendingCell(wire_id, layer))
         store.books.forget_if_empty(key)
 

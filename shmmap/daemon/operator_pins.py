@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
+from shmmap.daemon.load_queue import BACKGROUND
 from shmmap.daemon.residency import Key
 from shmmap.daemon.store import Store
 from shmmap.errors import OverBudget
@@ -22,8 +23,6 @@ __all__ = ["OperatorPins"]
 
 LOOKS_AT_ONCE: Final = 64
 """Pins looked at per beat: about a fifth of a millisecond."""
-_LAST: Final = 1e12
-"""Whoever waits comes first: further away than any cell that is asked for."""
 
 
 class OperatorPins:
@@ -96,7 +95,7 @@ class OperatorPins:
         store = self._store
         index = store.index_of(key.cell_id)
         if index is not None and store.find_warm(index, key.layer, now_s) is None:
-            store.want(index, key.layer, _LAST, now_s)
+            store.want(index, key.layer, BACKGROUND, now_s)
 
     def _keys_of(self, ids: Iterable[str], layers: tuple[str, ...] | None) -> tuple[set[Key], list[str]]:
         """Keys of cells by id, in these layers (None: in those that are pinned), and ids unknown."""

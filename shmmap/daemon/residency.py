@@ -10,10 +10,11 @@ Times are seconds on any one clock, injected by the caller.
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
+
+from shmmap.daemon.load_queue import LoadQueue
 
 __all__ = ["Failure", "Key", "Load", "Residency", "Resident", "Slot", "Zombie"]
 
@@ -76,6 +77,7 @@ class Load:
     estimate: int
     priority: float
     number: int
+    asker: Hashable = None
     running: bool = False
     reserved: int = 0
     started_s: float = 0.0
@@ -131,7 +133,7 @@ class Residency:
         self.unchecked_count = 0
         self._by_name: dict[str, Resident] = {}
         self._failed: set[Key] = set()
-        self._queue: list[tuple[float, int, Load]] = []
+        self._queue: LoadQueue[Load] = LoadQueue()
         self._numbers = 0
 
     # --- sums ---------------------------------------------------------------------------------
@@ -181,35 +183,33 @@ class Residency:
     @property
     def queued(self) -> int:
         """How many loads wait for a worker or for room."""
-        return len({load.number for _, _, load in self._queue if not load.running and self._is_current(load)})
+        return len(self._queue)
 
-    def _is_current(self, load: Load) -> bool:
-        slot = self.slots.get(load.key)
-        return slot is not None and slot.load is load
+    def want(self, key: Key, estimate: int, priority: float, asker: Hashable = None) -> Load:
+        """Queue a load, or move a queued one forward; however many ask, there is one load.
 
-    def want(self, key: Key, estimate: int, priority: float) -> Load:
-        """Queue a load, or move a queued one forward; however many ask, there is one load."""
+        Those who ask take turns, in `LoadQueue`.
+        """
         slot = self.slot(key)
         load = slot.load
         if load is None:
             self._numbers += 1
-            load = slot.load = Load(key, estimate, priority, self._numbers)
-            heapq.heappush(self._queue, (priority, load.number, load))
+            load = slot.load = Load(key, estimate, priority, self._numbers, asker=asker)
+            self._queue.push(load, priority, asker)
             return load
         load.wanted = True
-        if load.running or priority >= load.priority:
-            return load
-        load.priority = priority
-        heapq.heappush(self._queue, (priority, load.number, load))
+        if not load.running:
+            load.priority = min(load.priority, priority)
+            self._queue.push(load, priority, asker)
         return load
 
     def next_queued(self) -> Load | None:
-        """The queued load nearest to whoever asked, or None."""
-        while self._queue:
-            priority, _, load = self._queue[0]
-            if not load.running and priority == load.priority and self._is_current(load):
+        """The queued load nearest to whose turn it is, or None."""
+        while (load := self._queue.next()) is not None:
+            slot = self.slots.get(load.key)
+            if slot is not None and slot.load is load and not load.running:
                 return load
-            heapq.heappop(self._queue)
+            self._queue.discard(load)  # given up meanwhile
         return None
 
     def start(self, load: Load, now_s: float) -> None:
@@ -222,8 +222,7 @@ class Residency:
         """
         if load.estimate and self.shortage(load.estimate) > 0:
             raise ValueError("the reservation exceeds the budget")
-        if self._queue and self._queue[0][2] is load:
-            heapq.heappop(self._queue)
+        self._queue.started(load)
         load.running = True
         load.started_s = now_s
         load.reserved = load.estimate
@@ -243,7 +242,7 @@ class Residency:
         """Put a running load back (its worker died before its turn)."""
         self._unreserve(load)
         load.running = False
-        heapq.heappush(self._queue, (load.priority, load.number, load))
+        self._queue.push(load, load.priority, load.asker)
 
     def _unreserve(self, load: Load) -> None:
         self.reserved_bytes -= load.reserved
@@ -286,6 +285,7 @@ class Residency:
     def failed(self, load: Load, failure: Failure | None) -> None:
         """The load ended without a segment; ``failure`` stands until it succeeds or is cleared."""
         self._unreserve(load)
+        self._queue.discard(load)
         slot = self.slots.get(load.key)
         if slot is not None and slot.load is load:
             slot.load = None
@@ -301,6 +301,7 @@ class Residency:
             return
         slot.failure = None
         if slot.load is not None and not slot.load.running:
+            self._queue.discard(slot.load)
             slot.load = None
         self.forget_if_empty(key)
 

@@ -69,6 +69,11 @@ class Session:
     fd: int = -1
     unread_bytes: int = 0
 
+    @property
+    def asker(self) -> int:
+        """Whose turn its requests and loads count for: the process's, else the session's own."""
+        return self.peer.pid or -self.slot
+
     def asked_about(self, area: Area) -> None:
         """The session asked for an area: in the middle of it is where it is, unless it says."""
         self.area = area

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Final
 
 import msgspec
@@ -155,7 +155,7 @@ class Store:
                 self.events.revived(resident)
         return resident
 
-    def want(self, index: int, layer: str, priority: float, now_s: float) -> Slot:
+    def want(self, index: int, layer: str, priority: float, now_s: float, asker: Hashable = None) -> Slot:
         """Make sure that a load of a cold cell is under way, unless it failed too recently."""
         key = Key(self.catalogue.id(index), layer)
         slot = self.books.slot(key)
@@ -167,7 +167,7 @@ class Store:
             return slot
         if slot.load is None and slot.failure is not None:
             self.events.retried(key, slot.failure)
-        self.books.want(key, self.estimate(index, layer), priority)
+        self.books.want(key, self.estimate(index, layer), priority, asker)
         return slot
 
     def estimate(self, index: int, layer: str) -> int:
