@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.hillshade import hillshade
 from shmmap_clients.elevation_map.holes import fill_holes
@@ -48,7 +50,6 @@ def test_npz(made: Made, tmp_path: Path) -> None:
 
 
 def test_geotiff(made: Made, tmp_path: Path) -> None:
-    tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed (extra geotiff)")
     grid, expected = made
     write_elevation(tmp_path / "e.tif", grid, 0.6, DOCUMENT, epsg=32632)
     with tifffile.TiffFile(tmp_path / "e.tif") as file:
@@ -63,10 +64,9 @@ def test_geotiff(made: Made, tmp_path: Path) -> None:
 
 
 def test_png_with_a_world_file(made: Made, tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image", reason="pillow is not installed")
     grid, expected = made
     write_elevation(tmp_path / "e.png", grid, 0.6, DOCUMENT)
-    with image.open(tmp_path / "e.png") as read:
+    with Image.open(tmp_path / "e.png") as read:
         levels = np.asarray(read).astype(np.int64)[::-1]
     about = json.loads((tmp_path / "e.png.json").read_text())
     assert about["step"] == 0.001
@@ -78,10 +78,9 @@ def test_png_with_a_world_file(made: Made, tmp_path: Path) -> None:
 
 
 def test_hillshade(made: Made, tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image", reason="pillow is not installed")
     grid, expected = made
     write_hillshade(tmp_path / "h.png", grid, 0.6)
-    with image.open(tmp_path / "h.png") as read:
+    with Image.open(tmp_path / "h.png") as read:
         pixels = np.asarray(read)[::-1]
     assert np.array_equal(pixels[:, :, 1] == 0, np.isnan(expected))
     whole = hillshade(np.pad(expected, ((1, 1), (0, 0)), constant_values=np.nan), 0.3)
