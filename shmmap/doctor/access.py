@@ -8,6 +8,7 @@ import os
 import pwd
 import stat
 import time
+from itertools import islice
 from typing import Final
 
 from shmmap.doctor.finding import Finding, fail, ok, warn
@@ -17,6 +18,8 @@ from shmmap.errors import DaemonUnreachable, NoAnswer, NoSocket, ProtocolMismatc
 __all__ = ["check_group", "check_map_access", "check_socket"]
 
 ANSWER_S: Final = 2.0
+LOOKED_AT: Final = 256
+"""Files of a map whose permissions are looked at: those of one map are rarely different."""
 _UNITS: Final = "/etc/systemd/system"
 
 
@@ -185,7 +188,8 @@ def _closed_to(uid: int, path: str, *, parents: bool) -> str:
     try:
         wanted.append((real, 5 if os.path.isdir(real) else 4))
         if os.path.isdir(real):
-            wanted += [(entry.path, 5 if entry.is_dir() else 4) for entry in os.scandir(real)]
+            with os.scandir(real) as entries:
+                wanted += [(entry.path, 5 if entry.is_dir() else 4) for entry in islice(entries, LOOKED_AT)]
         for place, bits in wanted:
             status = os.stat(place)
             shift = 6 if status.st_uid == uid else 3 if status.st_gid in groups else 0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pwd
 import re
@@ -62,9 +63,12 @@ def check_leftovers(patient: Patient) -> Finding:
     try:
         with os.scandir(patient.machine.path(patient.shm_dir)) as entries:
             for entry in entries:
-                if match := _SEGMENT.fullmatch(entry.name):
-                    count, nbytes = found.get(match[1], (0, 0))
-                    found[match[1]] = (count + 1, nbytes + entry.stat(follow_symlinks=False).st_blocks * 512)
+                match = _SEGMENT.fullmatch(entry.name)
+                with contextlib.suppress(FileNotFoundError):  # a daemon that lives frees some meanwhile
+                    if match:
+                        held = entry.stat(follow_symlinks=False).st_blocks * 512
+                        count, nbytes = found.get(match[1], (0, 0))
+                        found[match[1]] = (count + 1, nbytes + held)
     except OSError as error:
         return warn(name, f"{patient.shm_dir}: {error.strerror}", "run it with sudo")
     orphans = {name: held for name, held in found.items() if not _looked_after(patient, name)}

@@ -61,6 +61,7 @@ ln -s pts/ptmx "$R/dev/ptmx"; ln -s /proc/self/fd "$R/dev/fd"
 mount --bind "$exchange/shared" "$R/exchange"
 echo 0123456789abcdef0123456789abcdef >"$R/etc/machine-id"
 : >"$R/etc/fstab"
+mkdir -p "$R/etc/tmpfiles.d"; ln -sf /dev/null "$R/etc/tmpfiles.d/tmp.conf" # empties /tmp, too
 rm -rf "$R/etc/shmmap" "$R/etc/sysusers.d/shmmap.conf" "$R/etc/tmpfiles.d/shmmap.conf"
 # what would look for hardware, change the kernel's settings or start on a clock
 for unit in systemd-sysctl.service systemd-modules-load.service systemd-remount-fs.service \

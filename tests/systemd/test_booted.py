@@ -82,6 +82,8 @@ def segments(machine: BootedSystemd, instance: str = "default", *, at: str = "/d
 
 
 def test_it_serves_the_members_of_the_group_and_nobody_else(fresh: BootedSystemd) -> None:
+    said = fresh.run("systemd-analyze", "verify", "--man=no", "shmmapd.service", "shmmapd.socket")
+    assert (said.stdout, said.stderr) == ("", "")  # as installed, drop-ins included
     fresh.run("systemctl", "start", "shmmapd")
     unit = fresh.properties("shmmapd")
     assert (unit["ActiveState"], unit["SubState"], unit["NRestarts"]) == ("active", "running", "0")
