@@ -16,10 +16,11 @@ AGAIN_COUNT: Final = 10
 
 
 class Verdict(NamedTuple):
-    """Whether the budget is too small, and what makes one think so."""
+    """Whether the budget is too small, what makes one think so, and what to do."""
 
     too_small: bool
     why: str
+    hint: str = ""
 
 
 def cache_verdict(counters: Mapping[str, int]) -> Verdict:
@@ -32,14 +33,16 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
     if refused:
         return Verdict(
             True,
-            f"{refused:,} cells refused in 10 min, clients map {format_bytes(pinned)} of"
-            f" {format_bytes(budget)}: raise --budget, or see `shmmap clients` for who holds it",
+            f"{refused:,} cells refused in 10 min; clients map {format_bytes(pinned)} of"
+            f" {format_bytes(budget)}",
+            "raise --budget; `shmmap clients` says who holds what",
         )
     if again >= AGAIN_COUNT and again > AGAIN_SHARE * misses:
         share = 100 * again / misses
         return Verdict(
             True,
-            f"{again:,} loads in 10 min ({share:.0f} % of all) were of cells evicted before: raise --budget",
+            f"{again:,} loads in 10 min ({share:.0f} % of all) were of cells evicted before",
+            "raise --budget",
         )
     if evicted:
         return Verdict(False, f"{evicted:,} evictions in 10 min, and hardly any were asked for again")

@@ -151,7 +151,8 @@ def svg(scene: Scene) -> str:
             windows.append(WindowBox((x - half_x, y - half_y, x + half_x, y + half_y), title))
         if client.pose is not None:
             radius = window.half_x if window is not None and circle else 0.0
-            vehicles.append(Vehicle(*client.pose, client.heading, radius, title))
+            label = client.client or client.command
+            vehicles.append(Vehicle(*client.pose, client.heading, radius, title, label))
     return top_view_svg(
         scene.bounds, cells, title=scene.title, note=scene.note, others=vehicles, windows=windows
     )

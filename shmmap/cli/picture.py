@@ -23,6 +23,7 @@ CAPTION_PX: Final = 72.0
 
 _STYLE: Final = """
   text { font-family: system-ui, "DejaVu Sans", sans-serif; font-size: 14px; fill: #1f2933; }
+  .label { font-size: 13px; stroke: #fff; stroke-width: 3; paint-order: stroke; }
   .title { font-size: 17px; font-weight: 600; }
   .cell { fill: none; stroke: #52606d; stroke-opacity: .28; stroke-width: .6; }
   .resident { fill: #0b7285; fill-opacity: .20; stroke: #0b7285; stroke-opacity: .75; stroke-width: .9; }
@@ -57,7 +58,7 @@ class Raster:
 class Vehicle:
     """Where a vehicle is (metres), where it heads (radians from x to y), how far it looks; a tooltip.
 
-    ``heading`` None is not known, ``radius`` 0 draws no window.
+    ``heading`` None is not known, ``radius`` 0 draws no window; ``label`` is written beside it.
     """
 
     x: float
@@ -65,6 +66,7 @@ class Vehicle:
     heading: float | None
     radius: float
     title: str = ""
+    label: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +187,8 @@ def _vehicle(page: _Page, vehicle: Vehicle) -> list[str]:
             f'<path class="vehicle" transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})"'
             f' d="M 12 0 L -8 7 L -4 0 L -8 -7 Z">{tooltip}</path>'
         )
+    if vehicle.label:
+        parts.append(f'<text class="label" x="{x + 12:.1f}" y="{y - 8:.1f}">{escape(vehicle.label)}</text>')
     return parts
 
 

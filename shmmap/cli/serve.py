@@ -35,6 +35,12 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--strict", action="store_true", default=None, help="refuse what Autoware's own loader refuses"
     )
+    parser.add_argument(
+        "--watch",
+        action="store_true",
+        default=None,
+        help="reload when the map's files change (not on NFS)",
+    )
     parser.add_argument("--config", metavar="FILE", default="", help="TOML file of settings")
     place = parser.add_argument_group("where it is found")
     place.add_argument("--instance", metavar="NAME", help="instance name (default: default)")

@@ -117,6 +117,8 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     )
     verdict = cache_verdict(count)
     lines.append(("cache", f"{'TOO SMALL' if verdict.too_small else 'large enough'}: {verdict.why}"))
+    if verdict.hint:
+        lines.append(("", verdict.hint))
     if {evicted, over_budget, quota} != {"0"}:
         text = f"{evicted} evicted, {over_budget} refused for the budget, {quota} for a quota"
         lines.append(("pressure", text))

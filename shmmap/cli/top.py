@@ -28,8 +28,8 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"state": as in `shmmap status`, "beat_age_s",
-   "budget": {"pinned", "idle", "zombie", "loading", "free"} in bytes,
-   "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why,
+   "budget": {"pinned", "idle", "zombie", "reserved", "free"} in bytes,
+   "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
    "latency_s": {"request", "wait", "load": {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
    "evictions", "refused_over_budget", "refused_quota",
    "clients": [{"client", "command", "pid", "uid", "cells", "bytes", "requests", "idle_s", "pose"}]}
@@ -133,6 +133,7 @@ def _live(reader: StatisticsReader, interval_s: float) -> int:
 
 
 def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
+    from rich.console import Group
     from rich.text import Text
 
     from shmmap.cli.top_screen import screen
@@ -152,7 +153,7 @@ def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
     )
     if not earlier or found.beat_monotonic_ns - earlier[-1].beat_monotonic_ns > 1e9:
         earlier.append(found)
-    return Text("\n").join(_styled(line) for line in lines[: height - 1])
+    return Group(*(_styled(line) for line in lines[: height - 1]))
 
 
 def _styled(line: Line) -> Any:
@@ -179,6 +180,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
         "hit_ratio": ratios,
         "cache_too_small": verdict.too_small,
         "cache": verdict.why,
+        "hint": verdict.hint,
         "latency_s": {
             name: {"p50": h.quantile_s(0.5), "p99": h.quantile_s(0.99), "count": h.total}
             for name, h in found.histograms.items()

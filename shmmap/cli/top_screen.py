@@ -33,13 +33,16 @@ _PARTS: Final = (
     ("pinned", "█", "cyan"),
     ("idle", "▓", "green"),
     ("zombie", "▒", "yellow"),
-    ("loading", "░", "magenta"),
+    ("reserved", "░", "magenta"),
     ("free", "·", "bright_black"),
 )
 
 
 def budget_parts(counters: dict[str, int]) -> dict[str, int]:
-    """Split the budget: bytes pinned and idle (both can be handed out), zombie, loading, free."""
+    """Split the budget: bytes pinned and idle (both can be handed out), zombie, reserved, free.
+
+    Reserved is what loads under way and the statistics themselves take.
+    """
     resident, zombie = counters["bytes_resident"], counters["bytes_zombie"]
     # retired segments are there only because somebody maps them
     pinned = min(max(counters["bytes_pinned"] - zombie, 0), resident)
@@ -47,7 +50,7 @@ def budget_parts(counters: dict[str, int]) -> dict[str, int]:
         "pinned": pinned,
         "idle": resident - pinned,
         "zombie": zombie,
-        "loading": counters["bytes_reserved"] + counters["bytes_statistics"],
+        "reserved": counters["bytes_reserved"] + counters["bytes_statistics"],
     }
     parts["free"] = max(counters["budget_bytes"] - sum(parts.values()), 0)
     return parts
@@ -80,6 +83,8 @@ def screen(
     verdict = cache_verdict(counters)
     cache = ("too small", "bold red") if verdict.too_small else ("large enough", "green")
     lines.append(_labelled("cache", [cache, (f": {verdict.why}", "")]))
+    if verdict.hint:
+        lines.append(_labelled("", [(verdict.hint, "")]))
     lines += _latencies(found, earlier)
     lines.append(_labelled("loads", _loads(counters)))
     lines.append(_labelled("pressure", _pressure(counters)))

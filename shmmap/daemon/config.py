@@ -64,6 +64,8 @@ class DaemonConfig:
         How long loading one cell may take.
     strict
         Accept only what Autoware's own loader accepts.
+    watch
+        Read the map again when its files change (inotify: not on NFS).
     cache_dir
         Where the prepared catalogue and computed layers are kept; empty: the service's or the user's
         cache directory.
@@ -86,6 +88,7 @@ class DaemonConfig:
     workers: int = 0
     load_timeout_s: float = 60.0
     strict: bool = False
+    watch: bool = False
     cache_dir: str = ""
     cache_bytes: int = 8 << 30
     eviction: str = "distance"

@@ -52,6 +52,7 @@ from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import Leftovers
 from shmmap.daemon.listening import bind_socket
 from shmmap.daemon.logs import set_up_logging
+from shmmap.daemon.map_watch import MapWatch, directories_of
 from shmmap.daemon.own_names import lock_name, stopped_early, take_away
 from shmmap.daemon.pin_support import Rung
 from shmmap.daemon.pin_watch import PinWatch
@@ -174,6 +175,7 @@ class _Life:
         self._privileges = Privileges(config.admin_group)
         self._epoch = secrets.randbits(63) | 1
         self._event_log = EventLog(self._epoch)
+        self._map_watch: MapWatch | None = None
         self._directory = directory
         self._catalogue = catalogue
         self._identity = DaemonIdentity(
@@ -289,6 +291,7 @@ class _Life:
             on_beat=self._beat,
         )
         try:
+            self._watch_map(server)
             with self._signal_descriptor() as fd:
                 server.watch(fd, lambda: self._on_signals(signals))
                 if activated is not None:
@@ -319,9 +322,18 @@ class _Life:
             socket.close()
             context.term()
             reloader.close()
+            if self._map_watch is not None:
+                self._map_watch.close()
             if self._owns_socket:
                 Path(self._socket_path).unlink(missing_ok=True)
             Path(events_path(self._socket_path)).unlink(missing_ok=True)
+
+    def _watch_map(self, server: Server) -> None:
+        config = self._config
+        if config.watch:
+            watch = MapWatch(directories_of(config.map_path, config.metadata, self._store.catalogue))
+            server.watch(watch.fd, lambda: watch.drain(time.monotonic()))
+            self._map_watch = watch
 
     def _tell_epoch(self, what: str) -> None:
         catalogue = self._store.catalogue
@@ -333,6 +345,8 @@ class _Life:
         self._manager.beat(time.monotonic(), self._status)
         self._pins.keep(time.monotonic())
         self._running.watch_crowd(time.monotonic())
+        if self._map_watch is not None and self._map_watch.due(time.monotonic()):
+            self._reload()
         version = self._store.catalogue.map_version
         if version != self._identity.map_version:
             self._identity = _with_map_version(self._identity, version)
@@ -358,6 +372,8 @@ class _Life:
         if isinstance(result, ShmmapError):
             self._manager.reloaded(f"reload failed, the old map stays: {result.message}")
         else:
+            if self._map_watch is not None:  # the metadata may name another directory now
+                self._map_watch.follow(directories_of(self._config.map_path, self._config.metadata, result))
             self._manager.reloaded(f"map read again: {len(result)} cells")
 
     # --- signals ----------------------------------------------------------------------------------

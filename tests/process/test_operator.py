@@ -96,7 +96,7 @@ def test_six_questions(tight: Shmmap) -> None:
             assert re.search(r"^cache +too small: [\d,]+ cells refused", tight(verb), re.MULTILINE | re.I)
         judged = tight.json("top")
         assert judged["cache_too_small"]
-        assert "--budget" in judged["cache"]
+        assert "--budget" in judged["hint"]
         assert sum(judged["budget"].values()) == 1 << 20
         del held
 

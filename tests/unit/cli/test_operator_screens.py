@@ -57,7 +57,7 @@ FULL = counters(
 def test_the_budget_is_split_without_a_rest() -> None:
     parts = budget_parts(FULL)
     assert parts == {
-        "pinned": 40 * MIB, "idle": 20 * MIB, "zombie": 10 * MIB, "loading": 5 * MIB, "free": 25 * MIB,
+        "pinned": 40 * MIB, "idle": 20 * MIB, "zombie": 10 * MIB, "reserved": 5 * MIB, "free": 25 * MIB,
     }  # fmt: skip
     crowded = counters(budget_bytes=MIB, bytes_resident=MIB, bytes_pinned=5 * MIB, bytes_statistics=MIB)
     assert budget_parts(crowded)["free"] == 0
