@@ -21,7 +21,7 @@ _CAPTION_PX: Final = 64.0
 _MARGIN: Final = 2.0  # metres
 _REMOVED: Final = (178, 186, 194)
 _KEPT: Final = (214, 40, 40)
-_OFFSET: Final = 1 << 31
+_OFFSET: Final = 1 << 30  # makes indices positive; two of them fit one int64
 
 
 class TopView:

@@ -18,7 +18,7 @@ __all__ = ["FILLED", "MEASURED", "NOTHING", "ElevationGrid"]
 
 NOTHING, MEASURED, FILLED = range(3)
 _NAN_BITS: Final = np.float32(np.nan).view(np.uint32)
-_BLOCK_BYTES: Final = 1 << 20
+_BLOCK_BYTES: Final = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,9 +67,11 @@ def test_png_row_by_row() -> None:
     assert read_png(file.getvalue())[:, 0].tolist() == [0, 0, 0, 9]
 
 
-def test_kept_points_are_red_on_top_of_grey() -> None:
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (-2.0, -50.0), (89_000.0, -1.0)])
+def test_kept_points_are_red_on_top_of_grey(shift: tuple[float, float]) -> None:
     view = TopView(0.5)
     xyz = np.array([[0.1, 0.1, 0], [0.2, 0.2, 0], [5.1, 0.1, 0], [0.1, 3.1, 0], [np.nan, 0, 0], [1e30, 0, 0]])
+    xyz[:, :2] += shift
     view.add(xyz, np.array([True, False, False, False, True, True]), (2.0, 1.0))
     text = view.svg("a < b", "note")
     root = ElementTree.fromstring(text)
@@ -77,6 +79,7 @@ def test_kept_points_are_red_on_top_of_grey() -> None:
     match = re.search(r"base64,([^\"]+)", text)
     assert match is not None
     image = read_png(base64.b64decode(match.group(1)))
+    assert image.shape[:2] == (15, 19)
     colours = {tuple(colour) for colour in image.reshape(-1, 3).tolist()}
     assert colours == {(255, 255, 255), (178, 186, 194), (214, 40, 40)}
     reds = np.argwhere((image == (214, 40, 40)).all(axis=2))
