@@ -34,6 +34,8 @@ MEMORY_ALLOWANCE_BYTES: Final = 192 << 20
 TRIM_BYTES: Final = 16 << 20
 """When memory has grown by this much, what is free of it goes back to the kernel."""
 TRIM_INTERVAL_S: Final = 2.0
+LEAST_WEIGHT_BYTES: Final = 1 << 18
+"""A process that takes less than this is never the culprit."""
 CENSUSES: Final = 8
 """How often the connections are looked at before one is judged by what arrives on it."""
 _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
@@ -50,8 +52,13 @@ class CrowdControl:
         Gives the bytes of requests that wait, by process id.
     unread_bytes
         Gives the bytes of replies that were sent and perhaps not read, by process id.
-    has_session
-        Whether a descriptor is that of a session's connection.
+    session_descriptors
+        Gives the descriptors of connections that have a session.
+
+    Attributes
+    ----------
+    ended : int
+        Connections ended so far.
     """
 
     def __init__(
@@ -140,10 +147,12 @@ class CrowdControl:
         for pid, fds in connections.items():
             if len(fds) > LEAST_SHARE:
                 weights[pid] += len(fds) << 16
-        culprits = [pid for pid, _ in weights.most_common() if connections.get(pid) and weights[pid] > 0]
-        if culprits:
-            pid = culprits[0]
+        guilty = [pid for pid in connections if weights[pid] >= LEAST_WEIGHT_BYTES]
+        if guilty:
+            pid = max(guilty, key=lambda one: weights[one])
             self._end(pid, connections[pid], "it made the daemon take too much memory")
+        else:  # no client's doing: the map grew, say
+            self._first_bytes = memory_bytes()
         self._libc.malloc_trim(0)
 
     def _end(self, pid: int, descriptors: Collection[int], why: str) -> None:

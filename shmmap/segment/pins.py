@@ -23,6 +23,7 @@ from shmmap.segment.crash_steps import step
 __all__ = ["LOADER_SLOT", "MAX_SLOT", "holders", "is_pinned", "lock_slot", "prepare_process"]
 
 MAX_SLOT: Final = (1 << 62) - 1
+MOST_RANGES: Final = 32
 PATIENCE_S: Final = 0.02
 """Time of the processor that asking for one segment's holders may take; 100 of them take 0.5 ms."""
 LOADER_SLOT: Final = 0
@@ -63,13 +64,13 @@ def holders(fd: int, *, limit: int = 1024) -> list[int]:
     Pins without a lock are not among them.  The kernel answers with *some* conflicting lock of the
     range asked about, so the range is split around each answer.  A reader may hold locks without
     number, and each question takes the kernel longer the more there are: asking ends after
-    `PATIENCE_S`, with what was found by then.
+    `PATIENCE_S` or `MOST_RANGES` locks that are nobody's, with what was found by then.
     """
     found: list[int] = []
     ranges = [(0, MAX_SLOT)]
     end_s = time.thread_time() + PATIENCE_S  # of work: a busy machine does not make the answer shorter
-    asked_times = 0
-    while ranges and len(found) < limit:
+    asked_times = strange = 0
+    while ranges and len(found) < limit and strange < MOST_RANGES:
         asked_times += 1
         if asked_times % 16 == 0 and time.thread_time() > end_s:
             break
@@ -80,7 +81,9 @@ def holders(fd: int, *, limit: int = 1024) -> list[int]:
             continue
         end = at + length - 1 if length else MAX_SLOT
         if length == 1:
-            found.append(at)  # a lock over a range is nobody's slot
+            found.append(at)
+        else:
+            strange += 1  # a lock over a range is nobody's slot
         if at > first:
             ranges.append((first, at - 1))
         if end < last:

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looking at libzmq's own connections, on a real ROUTER in this process; and the gate before them."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from shmmap.daemon.connections import Census, end_connection, unread_bytes
+from shmmap.daemon.listen_gate import ListenGate
+from shmmap.daemon.own_sockets import looked_at, open_descriptors
+
+WAIT_MS = 30_000
+
+
+class Router:
+    """A ROUTER, a loop that a gate can use, and one client."""
+
+    def __init__(self, directory: str) -> None:
+        self.path = f"{directory}/s.sock"
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.socket = self.context.socket(zmq.ROUTER)
+        self.socket.bind(f"ipc://{self.path}")
+        self.clients: list[Any] = []
+        self.epoll = select.epoll()
+        self.callbacks: dict[int, Callable[[], None]] = {}
+
+    def watch(self, fd: int, callback: Callable[[], None]) -> None:
+        self.callbacks[fd] = callback
+        self.epoll.register(fd, select.EPOLLIN)
+
+    def unwatch(self, fd: int) -> None:
+        del self.callbacks[fd]
+        self.epoll.unregister(fd)
+
+    def connect(self) -> None:
+        client = self.context.socket(zmq.DEALER)
+        client.linger = 0
+        client.connect(f"ipc://{self.path}")
+        client.send(b"x")
+        self.clients.append(client)
+
+    def hear(self) -> int:
+        """Wait for a message; returns the descriptor it came on."""
+        assert self.socket.poll(WAIT_MS)
+        self.socket.recv()
+        return int(self.socket.recv(copy=False).get(2))
+
+    def close(self) -> None:
+        for one in (*self.clients, self.socket):
+            one.close(linger=0)
+        self.context.term()
+        self.epoll.close()
+
+
+@pytest.fixture
+def router() -> Iterator[Router]:
+    with tempfile.TemporaryDirectory(dir="/tmp") as directory:
+        one = Router(directory)
+        yield one
+        one.close()
+
+
+def test_a_look_leaves_no_descriptor_behind() -> None:
+    reading, writing = os.pipe()
+    before = len(open_descriptors())
+    with pytest.raises(OSError, match="socket"), looked_at(reading):
+        pass
+    with pytest.raises(OSError, match="descriptor"), looked_at(10**6):
+        pass
+    assert len(open_descriptors()) == before
+    os.close(reading)
+    os.close(writing)
+
+
+def test_whose_connection_and_the_end_of_it(router: Router) -> None:
+    router.connect()
+    fd = router.hear()
+    me = os.getpid()
+    assert unread_bytes(fd, me, [router.path]) == 0
+    assert unread_bytes(fd, me + 1, [router.path]) is None  # another process's
+    assert unread_bytes(fd, me, ["/elsewhere"]) is None
+    assert not end_connection(fd, me + 1, [router.path])
+    listening = [n for n in open_descriptors() if _listens(n)]
+    assert all(not end_connection(n, me, [router.path]) for n in listening)
+    assert not end_connection(10**6, me, [router.path])
+    with socket.socket(socket.AF_UNIX) as stranger:
+        stranger.connect(router.path)
+        stranger.settimeout(WAIT_MS / 1000)
+        assert stranger.recv(10)  # it is accepted: libzmq greets
+        (other,) = {*census(router)[me]} - {fd}
+        assert end_connection(other, me, [router.path])
+        while stranger.recv(4096):
+            pass
+    assert unread_bytes(fd, me, [router.path]) == 0  # that one lives
+
+
+def census(router: Router) -> dict[int, list[int]]:
+    """Descriptors of all connections, by process."""
+    counting = Census([router.path])
+    while not counting.step():
+        pass
+    assert not counting.arriving.total()
+    return counting.connections
+
+
+def _listens(fd: int) -> bool:
+    try:
+        with looked_at(fd) as view:
+            return view.family == socket.AF_UNIX and bool(
+                view.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+            )
+    except OSError:
+        return False
+
+
+def test_a_census(router: Router) -> None:
+    for _ in range(3):
+        router.connect()
+        router.hear()
+    assert {pid: len(fds) for pid, fds in census(router).items()} == {os.getpid(): 3}
+
+
+def test_the_gate_lets_in_one_by_one(router: Router) -> None:
+    """Nobody is accepted unless the loop says so, and then one."""
+    gate = ListenGate(router.watch, router.unwatch)
+    gate.close_behind()
+    assert gate.paths == {router.path}
+    knocking = [socket.socket(socket.AF_UNIX) for _ in range(3)]
+    for one in knocking:
+        one.connect(router.path)
+    assert len(router.epoll.poll(WAIT_MS / 1000)) == 1
+
+    def accepted() -> int:
+        return sum(map(len, census(router).values()))
+
+    assert accepted() == 0
+    for number in (1, 2, 3):
+        ((fd, _),) = router.epoll.poll(WAIT_MS / 1000)
+        router.callbacks[fd]()
+        while accepted() < number:
+            pass
+        assert accepted() == number
+    assert router.epoll.poll(0) == []
+    for one in knocking:
+        one.close()
+    gate.release()
+    assert router.callbacks == {}
+
+
+def test_the_gate_stays_shut_without_descriptors(router: Router, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = ListenGate(router.watch, router.unwatch)
+    gate.close_behind()
+    used = len(open_descriptors())
+    monkeypatch.setattr("resource.getrlimit", lambda _: (used + 20, used + 20))
+    with socket.socket(socket.AF_UNIX) as one:
+        one.connect(router.path)
+        ((fd, _),) = router.epoll.poll(WAIT_MS / 1000)
+        router.callbacks[fd]()
+        states = [gate.short]
+        assert router.callbacks == {}
+        gate.look_again(1e12)
+        states.append(gate.short)
+        monkeypatch.setattr("resource.getrlimit", lambda _: (used + 2000, used + 2000))
+        gate.look_again(2e12)
+        assert [*states, gate.short] == [True, True, False]
+        assert set(router.callbacks) == {fd}
+    gate.release()
+    assert Path(router.path).exists()
