@@ -98,6 +98,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Divide, and say what came out."""
+    import sys
     import time
 
     from shmmap.cli.work_progress import StageProgress
@@ -126,7 +127,11 @@ def run(args: argparse.Namespace) -> int:
         check=args.check,
     )
     began_s = time.monotonic()
-    made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
+    try:
+        made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
+    except KeyboardInterrupt:
+        print("shmmap: interrupted\nhint: the same command with --resume goes on", file=sys.stderr)
+        raise
     seconds = time.monotonic() - began_s
     if args.json:
         from dataclasses import asdict
