@@ -75,13 +75,13 @@ def test_wrong_usage(cloud: Path, tmp_path: Path, words: list[str], code: int, s
 
 
 def test_a_killed_run_leaves_no_half_map(tmp_path: Path) -> None:
-    columns = xyzircaedt(800_000, reach=300.0)
+    columns = xyzircaedt(300_000, reach=200.0)
     # far from the origin in float64, so that every stage takes its time
     for axis in "xyz":
         columns[axis] = columns[axis].astype(np.float64) + 100_000
     write_pcd(tmp_path / "cloud.pcd", columns)
-    words = ("divide", tmp_path / "cloud.pcd", tmp_path / "map", "--quiet", "--check", "--force")
-    words = (*words, "--leaf", "0.5")
+    words: list[str | Path] = ["divide", tmp_path / "cloud.pcd", tmp_path / "map"]
+    words += ["--quiet", "--check", "--force", "--leaf", "0.5"]
     began = time.monotonic()
     assert shmmap(*words).returncode == 0
     whole_s = time.monotonic() - began
