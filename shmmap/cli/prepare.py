@@ -32,7 +32,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Compute layers of every cell of a map into the disk cache, on all cores.",
         epilog=_EPILOG,
     )
-    parser.add_argument("map_path", metavar="MAP", help="a divided map's directory, or one PCD file")
+    parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
     parser.add_argument(
         "--layer", metavar="SPEC", nargs="+", action="extend", default=[], dest="layers",
         help="layers, such as 'ndt(leaf=2.0)' or points",
@@ -55,10 +55,10 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.work_progress import StageProgress
-    from shmmap.daemon.config import parse_bytes
+    from shmmap.daemon.config import DaemonConfig, parse_bytes
+    from shmmap.daemon.divided_cloud import find_origin
     from shmmap.errors import BadRequest
     from shmmap.layers.spec import canonical_layers
-    from shmmap.origin.map_directory import open_map
     from shmmap.origin.sidecar import default_cache_directory
     from shmmap.prepare.run import prepare_map
 
@@ -67,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     layers = canonical_layers(args.layers)
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
-    origin = open_map(args.map_path, metadata=args.metadata, strict=args.strict, cache_dir=cache_dir)
+    origin = find_origin(
+        DaemonConfig(args.map_path, args.metadata or "", strict=args.strict, cache_dir=cache_dir)
+    )
     catalogue = origin.load(fresh=True)
     done = prepare_map(
         catalogue,
@@ -101,6 +103,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
     if len(done.failures) > _SHOWN_FAILURES:
         print(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
+    if done.bytes > parse_bytes(args.cache_size):
+        print("note: the layers are larger than --cache-size: some had to leave the cache again")
     print_pairs(
         [
             ("map", f"{origin.path}, {done.cells:,} cells"),

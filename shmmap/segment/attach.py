@@ -227,6 +227,7 @@ def attach(
     finally:
         os.close(fd)
     raw: NDArray[np.uint8] = np.asarray(mapping)
+    del mapping.__array_interface__  # it has done its work, and windows have hundreds of mappings
     if offset:
         raw = raw[offset:]
     return AttachedSegment(columns, raw)

@@ -350,12 +350,12 @@ def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[Colu
             raise SegmentCorrupt(f"column {len(rows)} ({bytes(name)!r}) contradicts the layout")
         rows.append(
             (
-                _text(name.rstrip(b"\0")),
+                _shared_text(name.rstrip(b"\0")),
                 kind,
                 shape,
                 offset,
                 nbytes,
-                _text(unit.rstrip(b"\0")),
+                _shared_text(unit.rstrip(b"\0")),
                 checksum,
             )
         )
@@ -407,6 +407,11 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
         frame_id=_text(page[frame_at : frame_at + frame_bytes]),
         lattice=_unpack_lattice(page),
     )
+
+
+@lru_cache(maxsize=256)  # hundreds of attached segments have the same few names of columns
+def _shared_text(raw: bytes) -> str:
+    return _text(raw)
 
 
 def _text(raw: bytes | memoryview) -> str:
