@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv))
     try:
-        args = build_parser().parse_args(words)
+        args = build_parser(words).parse_args(words)
         code: int = args.run(args)
         sys.stdout.flush()
     except ShmmapError as error:

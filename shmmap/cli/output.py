@@ -43,13 +43,13 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         _print_rich(columns, rows)
         return
     cells = [[column.name for column in columns], *rows]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
-    for row in cells:
-        padded = (
-            text.rjust(width) if column.align == "right" else text.ljust(width)
-            for text, width, column in zip(row, widths, columns, strict=True)
-        )
-        print("  ".join(padded).rstrip())
+    widths = [max(map(len, texts)) for texts in zip(*cells, strict=True)]
+    # one format for the whole line: thousands of rows are printed in the time of an eye's blink
+    line = "  ".join(
+        f"{{:{'>' if column.align == 'right' else '<'}{width}}}"
+        for column, width in zip(columns, widths, strict=True)
+    )
+    print("\n".join([line.format(*row).rstrip() for row in cells]))
 
 
 def wants_style() -> bool:

@@ -4,70 +4,45 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import re
 import sys
 from collections.abc import Sequence
 from typing import Any, Final, NoReturn
 
-from shmmap.cli import (
-    clients,
-    config,
-    demo,
-    divide,
-    doctor,
-    evict,
-    export,
-    health,
-    inspect,
-    ls,
-    map_view,
-    merge,
-    metrics,
-    pin,
-    prepare,
-    query,
-    reload,
-    serve,
-    show,
-    status,
-    stop,
-    tail,
-    top,
-    unit,
-    unpin,
-    version,
-)
+from shmmap.cli.version import installed_version
 
 __all__ = ["VERBS", "build_parser", "join_negative_values", "verb_first"]
 
-VERBS: Final = (
-    demo,
-    divide,
-    merge,
-    prepare,
-    serve,
-    status,
-    ls,
-    show,
-    clients,
-    top,
-    tail,
-    map_view,
-    metrics,
-    query,
-    export,
-    inspect,
-    reload,
-    evict,
-    pin,
-    unpin,
-    stop,
-    doctor,
-    config,
-    unit,
-    health,
-    version,
-)
+VERBS: Final = {
+    "demo": "demo",
+    "divide": "divide",
+    "merge": "merge",
+    "prepare": "prepare",
+    "serve": "serve",
+    "status": "status",
+    "ls": "ls",
+    "show": "show",
+    "clients": "clients",
+    "top": "top",
+    "tail": "tail",
+    "map": "map_view",
+    "metrics": "metrics",
+    "query": "query",
+    "export": "export",
+    "inspect": "inspect",
+    "reload": "reload",
+    "evict": "evict",
+    "pin": "pin",
+    "unpin": "unpin",
+    "stop": "stop",
+    "doctor": "doctor",
+    "config": "config",
+    "unit": "unit",
+    "health": "health",
+    "version": "version",
+}
+"""Modules by verb, in the order of the help; one is imported when its verb is used, all for the help."""
 
 _OWN_OPTIONS: Final = frozenset({"--help", "--version"})
 _FLAGS: Final = frozenset({"--json"})  # common options without a value
@@ -112,16 +87,20 @@ def verb_first(words: Sequence[str]) -> list[str]:
     return list(words)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser; the namespace it gives has ``run``, the verb's function."""
+def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Return the parser; the namespace it gives has ``run``, the verb's function.
+
+    Given the words to parse, it knows only the verb they begin with, if there is such a verb.
+    """
     parser = _Parser(
         prog="shmmap",
         description="Serve a vehicle's point-cloud map to every process of the machine from one copy in "
         "shared memory.",
         epilog="Try `shmmap demo`: it needs no map.  `shmmap VERB --help` explains a verb and its JSON.",
     )
-    parser.add_argument("--version", action="version", version=f"shmmap {version.installed_version()}")
+    parser.add_argument("--version", action="version", version=f"shmmap {installed_version()}")
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_Parser)
-    for verb in VERBS:
-        verb.add_parser(subparsers)
+    wanted = words[:1] if words and words[0] in VERBS else tuple(VERBS)
+    for verb in wanted:
+        importlib.import_module(f"shmmap.cli.{VERBS[verb]}").add_parser(subparsers)
     return parser
