@@ -90,6 +90,8 @@ def check_socket(patient: Patient) -> Finding:
     from shmmap.client.discovery import check_socket as connect
 
     name, path = "socket", patient.socket
+    if patient.awaits_first_client:
+        return ok(name, f"{path} waits for the first client: {_access(path)}")
     try:
         connect(path, time.monotonic() + ANSWER_S)
     except NoSocket as error:

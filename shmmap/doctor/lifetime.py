@@ -32,6 +32,8 @@ def check_daemon(patient: Patient) -> Finding:
         return warn(name, patient.unreadable, "join its group, or run it with sudo")
     identity, state = patient.seen.identity, patient.seen.state
     instance = patient.config.instance
+    if patient.awaits_first_client:
+        return ok(name, f"instance {instance} does not run; its first client starts it")
     if identity is None:
         return warn(
             name, f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`"

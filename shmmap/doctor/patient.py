@@ -7,6 +7,7 @@ import os
 import pwd
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.errors import ShmmapError
@@ -65,6 +66,17 @@ class Patient:
         return self.seen is not None and self.seen.state in ("healthy", "stopped", "hung")
 
     @property
+    def awaits_first_client(self) -> bool:
+        """Whether no daemon lives, and somebody else (the service manager) listens for it.
+
+        Connecting would start it, and who only looks must not do that.
+        """
+        if self.alive or self.seen is None:
+            return False
+        rows = (line.split(maxsplit=7) for line in self.machine.text("/proc/net/unix").splitlines())
+        return any(len(row) == 8 and row[7] == self.socket and int(row[3], 16) & _LISTENS for row in rows)
+
+    @property
     def shm_dir(self) -> str:
         """Where the segments are."""
         told = self.seen.identity.shm_dir if self.seen is not None and self.seen.identity else ""
@@ -104,7 +116,8 @@ class Patient:
         return self.uid
 
 
-_UNIT = "/etc/systemd/system/shmmapd.service"
+_UNIT: Final = "/etc/systemd/system/shmmapd.service"
+_LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
 
 def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Patient:

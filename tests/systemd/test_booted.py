@@ -204,6 +204,8 @@ def test_a_restart_keeps_the_cells_and_a_stop_does_not(fresh: BootedSystemd) -> 
 
 def test_the_first_client_starts_it(fresh: BootedSystemd) -> None:
     fresh.run("systemctl", "start", "shmmapd.socket")
+    told = shmmap(fresh, "doctor", user="alice").stdout
+    assert "waits for the first client" in told
     assert fresh.properties("shmmapd")["ActiveState"] == "inactive"
     made = fresh.shell("stat -c '%i %a %U:%G' /run/shmmap/default.sock")
     assert made.split()[1:] == ["660", "shmmap:shmmap"]

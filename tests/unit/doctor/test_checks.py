@@ -213,6 +213,22 @@ def test_sockets(tmp_path: Path, ward: Ward, monkeypatch: pytest.MonkeyPatch) ->
         assert "does not answer" in access.check_socket(ward.patient(endpoint=str(path))).fact
 
 
+def test_a_socket_that_waits_for_the_first_client(tmp_path: Path) -> None:
+    """Nobody connects to it: that would start the daemon."""
+    path = str(tmp_path / "s")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(path)
+        patient = Patient(Machine(), DaemonConfig(endpoint=path), "", path, told("absent"))
+        bound_alone = patient.awaits_first_client
+        listener.listen()
+        listener.setblocking(False)
+        assert (bound_alone, patient.awaits_first_client) == (False, True)
+        assert not dataclasses.replace(patient, seen=told()).awaits_first_client
+        assert access.check_socket(patient).state == lifetime.check_daemon(patient).state == "ok"
+        with pytest.raises(BlockingIOError):
+            listener.accept()
+
+
 def test_maps(tmp_path: Path, ward: Ward) -> None:
     made = make_map(tmp_path / "map", columns=2, rows=1, points=3)
     path = str(made.root)
