@@ -13,7 +13,7 @@ from typing import Any, Final, NoReturn, Protocol
 
 from shmmap import InternalError, ShmmapError
 
-__all__ = ["Verb", "numbers", "print_json", "run_program"]
+__all__ = ["Verb", "numbers", "print_json", "run_command", "run_program"]
 
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_BROKEN_PIPE: Final = 141
@@ -75,6 +75,38 @@ def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequenc
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_Parser)
     for verb in verbs:
         verb.add_parser(subparsers)
+    return _guarded(name, parser, argv)
+
+
+def run_command(
+    name: str,
+    description: str,
+    add_options: Callable[[argparse.ArgumentParser], None],
+    run: Callable[[argparse.Namespace], int],
+    argv: Sequence[str] | None = None,
+    *,
+    epilog: str = "",
+) -> int:
+    """Run a program that has no verbs; returns the exit code.
+
+    Parameters
+    ----------
+    name, description, epilog
+        For the help.
+    add_options
+        Adds the options to a parser.
+    run
+        Does the work.
+    argv
+        Words after the program's name; those of this process by default.
+    """
+    parser = _Parser(prog=name, description=description, epilog=epilog)
+    add_options(parser)
+    parser.set_defaults(run=run)
+    return _guarded(name, parser, argv)
+
+
+def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     try:
         args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
         code: int = args.run(args)

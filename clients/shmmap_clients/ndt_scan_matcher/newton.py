@@ -20,7 +20,7 @@ __all__ = ["Ascent", "StepRule", "ascend"]
 # what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
 _SINGULAR: Final = 6 * np.finfo(np.float64).eps
 
-_BACK: Final = -0.5  # cosine between steps below which one goes back on the other
+_SAME_WAY: Final = 0.5  # cosine between steps that go the same way; negated: one goes back on the other
 _FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
 
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
@@ -91,7 +91,10 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
         direction = step / length
         if rule.steady:
             cosine = float(direction @ before)
-            longest = longest / 2 if cosine < _BACK else min(2 * longest, rule.max_step)
+            if cosine < -_SAME_WAY:
+                longest /= 2
+            elif cosine > _SAME_WAY:
+                longest = min(2 * longest, rule.max_step)
         length, direction, at = _take_step(ascent, at, length, direction, evaluate, rule, longest)
         before, step = direction, direction * length
         ascent.pose = ascent.pose + step

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a vehicle is, from a rough pose (GNSS, a click on a map) and one scan.
+
+::
+
+    from shmmap_clients.pose_initializer import PoseInitializer, RoughPose
+
+    with PoseInitializer(endpoint) as initializer:
+        found = initializer.initialize(scan, RoughPose(x, y, yaw=0.3, sigma_m=2.0))
+"""
+
+from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
+from shmmap_clients.pose_initializer.initializer import InitializerRules, PoseInitializer
+from shmmap_clients.pose_initializer.rough_pose import RoughPose
+
+__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "RoughPose"]

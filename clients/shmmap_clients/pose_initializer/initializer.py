@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The initialization: the map around the place, the ground's height, candidates, alignments."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest, MapWindow, NoAnswer, canonical_layer
+from shmmap_clients.ndt_scan_matcher import (
+    Caps,
+    NdtMatcher,
+    Settings,
+    VoxelCell,
+    VoxelMap,
+    cell_from_layer,
+    matrix_from_pose,
+)
+from shmmap_clients.ndt_scan_matcher.result import Result
+from shmmap_clients.pose_initializer.height import ground_heights
+from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
+from shmmap_clients.pose_initializer.parzen import ParzenEstimator
+from shmmap_clients.pose_initializer.rough_pose import RoughPose
+
+__all__ = ["InitializerRules", "PoseInitializer"]
+
+_APART_M: Final = 1.0
+_APART_YAW: Final = math.radians(10.0)
+_SEED_APART_M: Final = 0.5
+_SEED_APART_YAW: Final = math.radians(3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class InitializerRules:
+    """How to search.
+
+    Attributes
+    ----------
+    map_radius
+        Of the map that is asked for, metres (a square of that half-side).
+    leaf
+        Edge of a voxel, metres.
+    height
+        Of the scan's frame above the ground, metres; 0 for Autoware's base_link.
+    candidates
+        Poses that are scored: half drawn from the rough pose, half where good ones are expected.
+    starts
+        The best of them that are aligned.
+    finals
+        The best of those that are aligned with the whole scan.
+    scoring_points
+        Points of the scan that score candidates and align the starts.
+    wait_s
+        How long the map may take.
+    seed
+        The same seed searches the same way.
+    """
+
+    map_radius: float = 150.0
+    leaf: float = 2.0
+    height: float = 0.0
+    candidates: int = 200
+    starts: int = 10
+    finals: int = 3
+    scoring_points: int = 500
+    wait_s: float = 60.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.candidates, self.starts, self.finals, self.scoring_points) < 1:
+            raise BadRequest("numbers of candidates, starts, finals and points must be positive")
+
+
+class PoseInitializer:
+    """Finds initial poses; keeps its map, so that the next one costs no loading.
+
+    Parameters
+    ----------
+    endpoint
+        As in `shmmap.connect`.
+    rules
+    caps
+        Of the final alignments.
+    backend, threads
+        As in `NdtMatcher`.
+
+    Raises
+    ------
+    ShmmapError
+        The daemon cannot be reached.
+    """
+
+    def __init__(
+        self,
+        endpoint: str | os.PathLike[str] | None = None,
+        rules: InitializerRules | None = None,
+        *,
+        caps: Caps | None = None,
+        backend: str = "numba",
+        threads: int = 1,
+    ) -> None:
+        self.rules = rules if rules is not None else InitializerRules()
+        self._voxels = canonical_layer(f"ndt(leaf={self.rules.leaf!r})")
+        self._ground = canonical_layer("ground")
+        few = Caps(source_points=self.rules.scoring_points)
+        self._coarse = NdtMatcher(
+            Settings(steady=True, epsilon=0.05), caps=few, backend=backend, threads=threads
+        )
+        self._fine = NdtMatcher(Settings(mode="coarse_fine"), caps=caps, backend=backend, threads=threads)
+        self._window = MapWindow(
+            endpoint,
+            self.rules.map_radius,
+            layers=(self._voxels, self._ground),
+            shape="square",
+            update_distance=0.0,
+            background=False,
+            name="shmmap-pose-init",
+        )
+        self._map = VoxelMap({})
+        self._versions: dict[tuple[str, str], int] = {}
+
+    def __enter__(self) -> PoseInitializer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the session with the daemon."""
+        self._window.close()
+        self._coarse.close()
+        self._fine.close()
+
+    def initialize(self, points: NDArray[np.floating], rough: RoughPose) -> InitialPose:
+        """Find where a scan was taken.
+
+        Parameters
+        ----------
+        points : (N, 3)
+            The scan, base frame, metres.
+        rough
+            Where it was probably taken.
+
+        Raises
+        ------
+        NoAnswer
+            There is no map around the place.
+        ShmmapError
+            The daemon cannot be asked.
+        """
+        began = time.perf_counter()
+        ground_z, grounds = self._take_map(rough)
+        had_map = time.perf_counter()
+        # the rough z is a guess of GNSS; the ground of the map is known to centimetres
+        heights = [z + self.rules.height for z in grounds] or [rough.z]
+
+        def pose_of(candidate: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+            x, y, yaw = candidate
+            return np.array([x, y, z, rough.roll, rough.pitch, yaw])
+
+        def scores(batch: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+            found = self._coarse.evaluate(points, np.array([pose_of(one, z) for one in batch]))
+            return np.array([at.score for at in found])
+
+        estimator = ParzenEstimator(rough, self.rules.seed)
+        half = max(1, self.rules.candidates // 2)
+        batches = [half, *(_split(self.rules.candidates - half, 4))]
+        first = estimator.first(half)
+        by_height = [scores(first, z) for z in heights]
+        best_height = int(np.argmax([one.max() for one in by_height]))
+        z = heights[best_height]
+        estimator.learn(first, by_height[best_height])
+        for size in batches[1:]:
+            batch = estimator.next(size)
+            estimator.learn(batch, scores(batch, z))
+        starts = estimator.best(self.rules.starts, _SEED_APART_M, _SEED_APART_YAW)
+        near = [self._coarse.align(points, matrix_from_pose(pose_of(start, z))) for start in starts]
+        near.sort(key=lambda result: -result.transform_probability)
+        finals = [self._fine.align(points, one.T_map_base) for one in _apart(near)[: self.rules.finals]]
+        finals.sort(key=lambda result: -result.transform_probability)
+        best = finals[0]
+        others = [
+            Alternative(one.T_map_base, one.transform_probability, one.nvtl) for one in _apart(finals)[1:]
+        ]
+        return InitialPose(
+            result=best,
+            score=best.transform_probability,
+            reliable=best.trustworthy,
+            ground_z=ground_z,
+            alternatives=tuple(others),
+            candidates=sum(batches),
+            map_s=had_map - began,
+            search_s=time.perf_counter() - had_map,
+        )
+
+    def _take_map(self, rough: RoughPose) -> tuple[float | None, list[float]]:
+        """Have the map around a place, and return the heights of its ground there."""
+        self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)
+        cells = self._window.cells
+        voxels = {cell.id: cell for cell in cells if cell.layer == self._voxels}
+        if not voxels:
+            raise NoAnswer(
+                f"no map around ({rough.x:.1f}, {rough.y:.1f})",
+                hint="`shmmap query --circle X,Y,R` tells which cells there are",
+            )
+        versions = self._window.versions()
+        if versions != self._versions:
+            known = self._map.cells
+            kept: dict[str, VoxelCell] = {}
+            for key, cell in voxels.items():
+                same = self._versions.get((key, self._voxels)) == versions[(key, self._voxels)]
+                kept[key] = known[key] if same and key in known else cell_from_layer(cell)
+            self._map = self._fine.prepare(VoxelMap(kept, previous=self._map))
+            self._coarse.prepare(self._map)
+            self._coarse.set_map(self._map)
+            self._fine.set_map(self._map)
+            self._versions = versions
+        return ground_heights([cell for cell in cells if cell.layer == self._ground], rough.x, rough.y)
+
+
+def _split(count: int, parts: int) -> list[int]:
+    sizes = [count * (part + 1) // parts - count * part // parts for part in range(parts)]
+    return [size for size in sizes if size]
+
+
+def _apart(results: list[Result]) -> list[Result]:
+    """Leave out what is near a better one."""
+    kept: list[Result] = []
+    for result in results:
+        T = result.T_map_base
+        for other in kept:
+            off = np.linalg.inv(other.T_map_base) @ T
+            turned = math.acos(max(-1.0, min(1.0, (float(np.trace(off[:3, :3])) - 1.0) / 2.0)))
+            if float(np.linalg.norm(off[:3, 3])) < _APART_M and turned < _APART_YAW:
+                break
+        else:
+            kept.append(result)
+    return kept

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where to look next: a tree-structured Parzen estimator over (x, y, yaw), as Autoware's initializer has one.
+
+The first candidates are drawn from the rough pose's own distribution.  Then of 100 draws the one is taken
+that is most like the best tenth of what was tried and least like the rest (Bergstra et al. 2011;
+the weight 5 of the rest, the kernels' widths and the number of draws are Autoware's).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.pose_initializer.rough_pose import RoughPose
+
+__all__ = ["ParzenEstimator"]
+
+_DRAWS: Final = 100
+_MOST_GOOD: Final = 10
+_REST_WEIGHT: Final = 5.0
+_KERNEL: Final = np.array([0.25, 0.25, math.radians(2.5)])
+
+
+class ParzenEstimator:
+    """Proposes candidates in batches, and learns their scores.
+
+    Parameters
+    ----------
+    rough
+        Distribution of the candidates.
+    seed
+        The same seed gives the same candidates.
+    """
+
+    def __init__(self, rough: RoughPose, seed: int = 0) -> None:
+        self._rough = rough
+        self._rng = np.random.default_rng(seed)
+        self._tried = np.empty((0, 3))
+        self._scores = np.empty(0)
+
+    def first(self, count: int) -> NDArray[np.float64]:
+        """Return (count, 3) candidates of the prior; the rough pose itself is the first."""
+        drawn = self._draw(count)
+        drawn[0] = self._rough.mean
+        return drawn
+
+    def next(self, count: int) -> NDArray[np.float64]:
+        """Return (count, 3) candidates where good ones are expected."""
+        drawn = self._draw(count * _DRAWS)
+        good = min(_MOST_GOOD, len(self._scores) // 10)
+        if not good:
+            return drawn[:count]
+        order = np.argsort(-self._scores, kind="stable")
+        ratio = self._density(drawn, order[:good]) - _REST_WEIGHT * self._density(drawn, order[good:])
+        chosen = ratio.reshape(count, _DRAWS).argmax(axis=1) + np.arange(count) * _DRAWS
+        return np.asarray(drawn[chosen], np.float64)
+
+    def learn(self, candidates: NDArray[np.float64], scores: NDArray[np.float64]) -> None:
+        """Add what candidates were worth; more is better."""
+        self._tried = np.concatenate([self._tried, candidates])
+        self._scores = np.concatenate([self._scores, scores])
+
+    def best(self, count: int, apart_m: float, apart_yaw: float) -> NDArray[np.float64]:
+        """Return the best candidates, no two of them near each other in place and heading."""
+        kept: list[NDArray[np.float64]] = []
+        for index in np.argsort(-self._scores, kind="stable"):
+            one = self._tried[index]
+            if all(
+                math.hypot(*(one[:2] - other[:2])) >= apart_m or abs(_wrapped(one[2] - other[2])) >= apart_yaw
+                for other in kept
+            ):
+                kept.append(one)
+                if len(kept) == count:
+                    break
+        return np.array(kept).reshape(-1, 3)
+
+    def _draw(self, count: int) -> NDArray[np.float64]:
+        drawn = self._rough.mean + self._rng.normal(size=(count, 3)) @ self._rough.factor.T
+        if self._rough.heading_unknown:
+            drawn[:, 2] = self._rng.uniform(-math.pi, math.pi, count)
+        return np.asarray(drawn, np.float64)
+
+    def _density(self, at: NDArray[np.float64], which: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Logarithm of the mean of the kernels on what was tried, up to a constant."""
+        off = at[:, None, :] - self._tried[which][None, :, :]
+        off[..., 2] = _wrapped(off[..., 2])
+        exponent = -0.5 * ((off / _KERNEL) ** 2).sum(axis=2)
+        most = exponent.max(axis=1)
+        return np.asarray(most + np.log(np.exp(exponent - most[:, None]).mean(axis=1)), np.float64)
+
+
+def _wrapped(angle: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    return np.asarray((np.asarray(angle) + math.pi) % (2 * math.pi) - math.pi, np.float64)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial poses with a real daemon: found, repeated without loading, and as a program."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
+from shmmap_clients.scans.scan_file import read_scan
+
+import shmmap
+from tests.process.conftest import DaemonFactory
+from tests.support.town_drive import TownDrive, make_town_drive
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
+    return make_town_drive(tmp_path_factory.mktemp("town"), blocks=(3, 3), density=5.0, frames=5, step=15.0)
+
+
+def rough(town: TownDrive, index: int, seed: int) -> RoughPose:
+    x, y, _, _, _, yaw = town.poses[index]
+    dx, dy, turn = np.random.default_rng(seed).uniform(-1.5, 1.5, 3)
+    return RoughPose(x + dx, y + dy, z=500.0, yaw=yaw + turn * 0.08)
+
+
+def test_poses_are_found_and_cost_no_loading(town: TownDrive, daemon: DaemonFactory) -> None:
+    one = daemon(town.map_dir)
+    rules = InitializerRules(map_radius=60.0, height=1.8)
+    with (
+        PoseInitializer(one.endpoint, rules) as initializer,
+        shmmap.connect(one.endpoint) as session,
+    ):
+        loads = 0
+        for index in range(len(town.poses)):
+            scan = read_scan(town.scans / f"scan_{index:04}.npz")
+            found = initializer.initialize(scan, rough(town, index, index))
+            assert found.reliable
+            np.testing.assert_allclose(found.T_map_base[:3, 3], town.poses[index, :3], atol=0.3)
+            assert found.ground_z == pytest.approx(town.poses[index, 2] - 1.8, abs=0.5)
+            assert all(other.score <= found.score for other in found.alternatives)
+            loads = session.stats().counters["loads_started"]
+            again = initializer.initialize(scan, rough(town, index, index))
+            assert (again.T_map_base == found.T_map_base).all()
+            assert session.stats().counters["loads_started"] == loads
+
+
+def test_a_place_without_map_is_no_answer(town: TownDrive, daemon: DaemonFactory) -> None:
+    one = daemon(town.map_dir)
+    with PoseInitializer(one.endpoint, InitializerRules(map_radius=60.0, wait_s=5.0)) as initializer:
+        scan = read_scan(town.scans / "scan_0000.npz")
+        for x in (5000.0, 9e7):
+            with pytest.raises(shmmap.NoAnswer, match="no map around"):
+                initializer.initialize(scan, RoughPose(x, 0.0))
+
+
+def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
+    one = daemon(town.map_dir)
+    x, y, z, _, _, yaw = town.poses[2]
+    program = [sys.executable, "-m", "shmmap_clients.pose_initializer", "--endpoint", one.endpoint]
+    words = [
+        "--scan",
+        str(town.scans / "scan_0002.npz"),
+        "--pose",
+        f"{x + 1},{y - 1},{yaw}",
+        "--height",
+        "1.8",
+    ]
+    done = subprocess.run([*program, *words, "--json"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    np.testing.assert_allclose(np.array(document["T_map_base"])[:3, 3], [x, y, z], atol=0.3)
+    assert document["reliable"] is True
+    done = subprocess.run([*program, *words], capture_output=True, text=True)
+    assert ": reliable" in done.stdout
+    missing = [*program, "--scan", str(tmp_path / "none.npz"), "--pose", "0,0,0"]
+    assert subprocess.run(missing, capture_output=True).returncode == 66
+    assert subprocess.run([*program, "--scan", "x"], capture_output=True).returncode == 2
