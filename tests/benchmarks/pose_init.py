@@ -88,7 +88,8 @@ def main() -> None:
                     assert not opened, opened
             print(
                 f"ten at one place: first {times[0]:.2f} s ({loads[0]} loads), others"
-                f" {min(times[1:]):.3f} to {max(times[1:]):.3f} s, {loads[-1] - loads[0]} loads, no file opened"
+                f" {min(times[1:]):.3f} to {max(times[1:]):.3f} s, {loads[-1] - loads[0]} loads,"
+                " no file opened"
             )
             found, reliable, took = [], [], []
             for number in range(args.poses):
