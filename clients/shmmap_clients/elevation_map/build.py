@@ -112,9 +112,10 @@ def build_elevation_map(
     if not len(listing):
         raise MapMissing("the map has no cells")
     # row after row: only the strip between two rows has to wait
-    cells = sorted(listing, key=lambda cell: (cell.box[1], cell.box[0], cell.id))
+    # (numbers alone: the listing keeps a cell in a fraction of what its `CellInfo` takes)
+    order = sorted(range(len(listing)), key=lambda n: _place(listing[n]))
     directory = cache / map_key(listing.map_version, rule)
-    boxes = [ColumnBox.of_box(cell.box, rule.resolution) for cell in cells]
+    boxes = [ColumnBox.of_box(listing[n].box, rule.resolution) for n in order]
     first = (min(box.i0 for box in boxes), min(box.j0 for box in boxes))
     shape = (max(box.j1 for box in boxes) - first[1], max(box.i1 for box in boxes) - first[0])
     grid = ElevationGrid(directory / "heights", rule.resolution, first, shape)
@@ -128,10 +129,10 @@ def build_elevation_map(
         state = Checkpoint()
     failed: list[CellError] = []
     begun = state.done
-    for number in range(state.done, len(cells)):
-        if number + 1 < len(cells):  # the daemon loads it while we compute
-            client.selected((cells[number + 1].id,), rule.layer, wait=None)
-        cell = _load(client, cells[number], rule.layer, wait_s, failed)
+    for number in range(state.done, len(order)):
+        if number + 1 < len(order):  # the daemon loads it while we compute
+            client.selected((listing[order[number + 1]].id,), rule.layer, wait=None)
+        cell = _load(client, listing[order[number]], rule.layer, wait_s, failed)
         rows = None
         if cell is not None:
             rows = columns_of(cell, rule)
@@ -145,13 +146,17 @@ def build_elevation_map(
         if complete is not None:
             grid.put(*heights_of(complete, rule))
         state.done = number + 1
-        if not failed and (state.done % _EVERY == 0 or state.done == len(cells)):
+        if not failed and (state.done % _EVERY == 0 or state.done == len(order)):
             journal.write(state, seams)
         if progress is not None:
-            progress(BuildProgress(state.done, len(cells), state.rows))
+            progress(BuildProgress(state.done, len(order), state.rows))
     client.release()
-    loaded = len(cells) - begun
-    return BuiltElevation(grid, listing.map_version, len(cells), loaded, state.stray, tuple(failed))
+    loaded = len(order) - begun
+    return BuiltElevation(grid, listing.map_version, len(order), loaded, state.stray, tuple(failed))
+
+
+def _place(cell: CellInfo) -> tuple[float, float, str]:
+    return cell.box[1], cell.box[0], cell.id
 
 
 def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:
