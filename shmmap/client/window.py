@@ -302,7 +302,7 @@ class MapWindow:
         x, y, radius
             Metres, map frame; what lies beyond the window is not there.
         layer
-            Which one, by default the window's first.
+            Which one, as `Cell.layer` names it (`shmmap.canonical_layer`); by default the window's first.
 
         Raises
         ------
@@ -311,6 +311,8 @@ class MapWindow:
         """
         state = self._current
         name = layer if layer is not None else self._layers[0]
+        if layer is None and len(self._layers) == 1:
+            name = next(iter(state.by_layer), name)  # cells have the canonical form, whatever was asked for
         cells = state.by_layer.get(name)
         if not cells:
             Circle(x, y, radius)

@@ -48,10 +48,10 @@ def test_links_lead_somewhere() -> None:
 
 def test_every_block_is_tested() -> None:
     assert set(re.findall(r"^<!-- (.+) -->$", README, re.MULTILINE)) == {
-        "server", "user", "points", "window", "client-only", "benchmarks",
+        "server", "user", "points", "window", "layers", "client-only", "benchmarks",
     }  # fmt: skip
     # the two lines have no name
-    assert README.count("\n```sh\n") + README.count("\n```python\n") == 6 + 2
+    assert README.count("\n```sh\n") + README.count("\n```python\n") == 7 + 2
 
 
 def test_benchmarks_start() -> None:
@@ -82,6 +82,7 @@ class Reader:
             "PATH": f"{cwd / 'bin'}:{os.environ['PATH']}",
             "PYTHONPATH": str(ROOT),
             "XDG_RUNTIME_DIR": str(cwd / "run"),
+            "XDG_CACHE_HOME": str(cwd / "cache"),
             "SHMMAP_SHM_DIR": str(self.shm_dir),
             "SHMMAP_TEST_RUN": self.mark,
         }
@@ -167,3 +168,12 @@ def test_following_a_vehicle(reader: Reader) -> None:
     assert numbers is not None
     assert int(numbers[1]) > 50
     assert int(numbers[2]) > 10_000
+
+
+def test_layers(reader: Reader) -> None:
+    told = reader.python(block("layers")).splitlines()
+    assert len(told) >= 4
+    for line in told:
+        found = re.fullmatch(r"\((\d+), 3\) \((\d+), 6\) Lattice\(leaf=\(2.0, 2.0, 2.0\), .*\)", line)
+        assert found is not None, line
+        assert found[1] == found[2]
