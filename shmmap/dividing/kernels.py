@@ -2,7 +2,7 @@
 """The inner loops of dividing, compiled: which cell each point is in, and points sorted by cell.
 
 They release the interpreter's lock, so that blocks are worked on in parallel.  Compiled code is kept
-on the disk where numba finds a place for it; else it is compiled at each start, a few seconds.
+in the cache directory where that can be written; else it is compiled at each start, for a second or two.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
 import numba
+import numba.core.config
 import numpy as np
 from numpy.typing import NDArray
+
+from shmmap.layers.compiling import kernel_cache_directory
 
 __all__ = ["NOWHERE", "assign_cells", "count_cells", "scatter_rows"]
 
@@ -27,10 +30,14 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def _compiled(function: _Function) -> _Function:
     compiler: Any = numba.njit  # its types say that a function becomes something else
+    config: Any = numba.core.config
+    directory, before = kernel_cache_directory(), config.CACHE_DIR
     try:
-        made: _Function = compiler(nogil=True, cache=True)(function)
-    except RuntimeError:  # no directory to keep the code in
-        made = compiler(nogil=True)(function)
+        # numba chooses a function's cache when it is decorated, by this process-wide setting
+        config.CACHE_DIR = str(directory) if directory is not None else before
+        made: _Function = compiler(nogil=True, cache=directory is not None)(function)
+    finally:
+        config.CACHE_DIR = before
     return made
 
 

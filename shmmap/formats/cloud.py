@@ -152,7 +152,7 @@ def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -
 
 
 def describe(path: str | os.PathLike[str]) -> CloudDescription:
-    """Read a file to its end and say what it holds; a PCD in bounded memory.
+    """Read a file to its end and say what it holds; PCD, LAS and LAZ in bounded memory.
 
     Raises
     ------
@@ -160,6 +160,8 @@ def describe(path: str | os.PathLike[str]) -> CloudDescription:
         As `read_cloud`.
     """
     suffix = _suffix(path)
+    if suffix in LAS_SUFFIXES:
+        return _describe_las(path, suffix)
     if suffix != ".pcd":
         cloud = read_cloud(path)
         specs = tuple(
@@ -201,6 +203,27 @@ def describe(path: str | os.PathLike[str]) -> CloudDescription:
             viewpoint=header.viewpoint,
             warnings=reader.warnings,
             digest=reader.digest,
+        )
+
+
+def _describe_las(path: str | os.PathLike[str], suffix: str) -> CloudDescription:
+    bounds, dropped = Bounds(), 0
+    with LasReader(path) as reader:
+        for block in reader.blocks(_LAS_BLOCK_POINTS):
+            mask = bounds.add(block["xyz"])
+            dropped += 0 if mask is None else int(np.count_nonzero(~mask))
+        return CloudDescription(
+            path=reader.path,
+            format=suffix[1:],
+            encoding="",
+            version=reader.version,
+            file_bytes=os.stat(path).st_size,
+            points=reader.points,
+            dropped=dropped,
+            width=reader.points,
+            height=1,
+            columns=reader.columns,
+            bounds=bounds.result(),
         )
 
 

@@ -143,7 +143,7 @@ def _served(reader: Reader, serve: str) -> Iterator[Reader]:
 
 def test_commands_of_a_user(reader: Reader) -> None:
     told = [reader.run(command) for command in block("user")]
-    status, query, ls, show, clients, export, inspect = told
+    status, query, ls, show, clients, export, inspect, divide, merge = told
     assert "healthy" in status
     assert "town_160_160.pcd" in query
     assert "resident" in ls
@@ -153,6 +153,8 @@ def test_commands_of_a_user(reader: Reader) -> None:
     exported = re.search(r"([\d,]+) points of", export)
     assert exported is not None
     assert f"points  {exported[1]}" in inspect
+    assert f"{exported[1]} of {exported[1]}" in divide
+    assert f"{exported[1]} of" in merge
 
 
 def test_three_lines_of_python(reader: Reader) -> None:

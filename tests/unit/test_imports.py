@@ -29,7 +29,7 @@ LAYERS = {
     "statistics": {"errors", "columns", "geometry", "segment"},
     "layers": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
     "origin": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
-    "dividing": {"errors", "columns", "geometry", "formats", "origin"},
+    "dividing": {"errors", "columns", "geometry", "formats", "layers", "origin"},
     "daemon": {
         "errors", "columns", "geometry", "formats", "segment", "protocol", "statistics", "layers", "origin",
         "dividing",
