@@ -302,9 +302,26 @@ class CellRequests:
         """A load ended: answer the requests it was the last one for."""
         for wanted in self._waiting.pop(key, ()):
             wanted.outstanding.discard(key)
-            if not wanted.outstanding:
+            if not wanted.outstanding and not self._goes_on_waiting(wanted):
                 self._stop_waiting(wanted)
                 self._answer(wanted, self._now_s())
+
+    def _goes_on_waiting(self, wanted: Wanted) -> bool:
+        """Whether a cell that had settled is cold again, or may fit now, and there is time to load it."""
+        now_s = self._now_s()
+        if now_s >= wanted.deadline_s:
+            return False
+        for index, layer in wanted.cells:
+            key = Key(self._store.catalogue.id(index), layer)
+            if key in wanted.refused or self._store.find_warm(index, layer, now_s) is not None:
+                continue
+            if (
+                self._store.books.slot(key).failure is None
+                and self._store.want(index, layer, 0.0, now_s).load
+            ):
+                wanted.outstanding.add(key)
+                self._waiting.setdefault(key, []).append(wanted)
+        return bool(wanted.outstanding)
 
     def next_deadline_s(self) -> float:
         """When the next client's patience ends; infinity when nobody waits."""

@@ -12,11 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.reclaim import Reclaimer
+from shmmap.daemon.reclaim import UNKNOWN_SLOT, Reclaimer
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.errors import Busy
-from shmmap.segment.pins import LOADER_SLOT
 
 __all__ = ["PinSurvey", "Pinned", "Share"]
 
@@ -134,16 +133,15 @@ class PinSurvey:
             if time.thread_time() > end_s:
                 break  # somebody holds very many locks
             resident = self._left.pop()
-            slots = self._slots_of(resident)
-            known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
-            if known:
+            users = self._reclaimer.users_among(resident, self._slots_of(resident))
+            if users:
                 found.pinned_bytes += resident.nbytes
-                for slot in known:
+            for slot in users:
+                if slot == UNKNOWN_SLOT:
+                    found.unknown += 1
+                    found.unknown_bytes += resident.nbytes
+                else:
                     self._add(found.shares.setdefault(slot, Share()), resident)
-            elif LOADER_SLOT not in slots and self._reclaimer.is_pinned(resident):
-                found.pinned_bytes += resident.nbytes
-                found.unknown += 1
-                found.unknown_bytes += resident.nbytes
 
     def _add(self, share: Share, resident: Resident) -> None:
         share.mapped_bytes += resident.nbytes

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from shmmap.daemon.eviction import EvictionPolicy
@@ -25,7 +25,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import zombie_name
 from shmmap.segment.pins import LOADER_SLOT, holders
 
-__all__ = ["Outcome", "Reclaimer"]
+__all__ = ["UNKNOWN_SLOT", "Outcome", "Reclaimer"]
 
 TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
@@ -42,6 +42,8 @@ PROBES_AT_ONCE: Final = 64
 """Looks per turn of the serving loop (about 15 us each)."""
 HOLDERS_S: Final = 0.03
 """Time of the processor that finding out who holds what may take for one reply."""
+UNKNOWN_SLOT: Final = 0
+"""Stands for whoever uses a segment without being a session."""
 PIN_MEMO_S: Final = 0.2
 """How long a segment found pinned is not considered again for eviction."""
 
@@ -288,6 +290,18 @@ class Reclaimer:
         except OSError:
             return None
 
+    def users_among(self, resident: Resident, slots: Sequence[int]) -> list[int]:
+        """Slots of sessions, of those that have a segment locked, and 0 if somebody unknown uses it, too.
+
+        Unknown is whose lock no session of ours has (a client of an earlier life that we have not heard
+        of), and a pin without any lock.  Our own loaders look at segments, too, and do not count.
+        """
+        known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
+        ours = slots.count(LOADER_SLOT)
+        if len(slots) > len(known) + ours or (not known and not ours and self.is_pinned(resident)):
+            known.append(UNKNOWN_SLOT)
+        return known
+
     def holders_of(self, residents: Iterable[Resident], *, limit: int = 512) -> tuple[Holder, ...]:
         """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock.
 
@@ -299,13 +313,7 @@ class Reclaimer:
         for count, resident in enumerate(residents):
             if count >= limit or time.thread_time() > end_s:
                 break
-            slots = self.slots_of(resident)
-            if slots is None:
-                continue
-            known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
-            if not known and LOADER_SLOT not in slots and self.is_pinned(resident):
-                known = [0]
-            for slot in known:
+            for slot in self.users_among(resident, self.slots_of(resident) or ()):
                 bytes_of[slot] = bytes_of.get(slot, 0) + resident.nbytes
                 cells_of[slot] = cells_of.get(slot, 0) + 1
         found = []

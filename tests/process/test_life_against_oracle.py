@@ -236,8 +236,9 @@ class Life:
                 assert shown.segment not in believed
                 believed[shown.segment] = {holder.pid for holder in shown.holders}
         for segment, pids in believed.items():
-            known = {holder.pid for holder in mappers.get(segment, ()) if holder.known}
-            assert pids == (known or ({0} if segment in mappers else set())), segment
+            # 0 stands for those whom this life of the daemon has not heard of yet
+            expected = {holder.pid if holder.known else 0 for holder in mappers.get(segment, ())}
+            assert pids == expected, segment
         unseen = mappers.keys() - believed.keys() - self.nameless
         assert not unseen, f"the daemon does not know of {unseen}"
 
