@@ -148,7 +148,8 @@ def starts(environment: dict[str, str]) -> None:
             cpu.append(1e3 * (children_cpu_s() - before))
         median = statistics.median(wall)
         print(
-            f"{name:16} median {median:4.0f} ms, min {min(wall):4.0f} ms, CPU {statistics.median(cpu):4.0f} ms"
+            f"{name:16} median {median:4.0f} ms, min {min(wall):4.0f} ms,"
+            f" CPU {statistics.median(cpu):4.0f} ms"
         )
         if not name.startswith("python"):
             print(f"  bar 150 ms: {'holds' if median < 150 else 'MISSED'}")
