@@ -17,13 +17,13 @@ import numpy as np
 from shmmap.daemon.difference import difference, warm_difference
 from shmmap.daemon.loading import SPACE_CODES
 from shmmap.daemon.reclaim import HAND_OUT_GRACE_S
+from shmmap.daemon.request_limits import admitted_layers, check_count, check_held
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.sessions import Session
 from shmmap.daemon.store import Store
 from shmmap.daemon.waiting_list import WaitingList
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, ZRange, distance_to_boxes
-from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
@@ -34,8 +34,6 @@ __all__ = ["CellRequests", "Wanted"]
 MAX_WAIT_S: Final = 3600.0
 PROMISED: Final = 1e9
 """Priority of a load that only a "pending" speaks of: behind the distances of all that is asked for."""
-MOST_CELLS: Final = 20_000
-"""Cells, in all layers together, of one request: about half a second of the loop when all are cold."""
 
 
 @dataclass(eq=False, slots=True)
@@ -114,7 +112,7 @@ class CellRequests:
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         session.asked_about(area)
-        layers = canonical_layers(message.layers)
+        layers = admitted_layers(self._store, message.layers)
         indices = self._at_height(self._store.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
         self._begin(Wanted(session, message.request, cells, area=area), message.wait, area, now_s)
@@ -122,7 +120,8 @@ class CellRequests:
     def selected(self, session: Session, message: messages.Selected, now_s: float) -> None:
         """Cells by id, in the order asked for."""
         _check_wait(message.wait)
-        layers = canonical_layers(message.layers)
+        layers = admitted_layers(self._store, message.layers)
+        check_count(len(message.ids) * len(layers))
         cells: list[tuple[int, str]] = []
         unknown: list[tuple[str, str]] = []
         for cell_id in message.ids:
@@ -136,10 +135,11 @@ class CellRequests:
 
     def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
         """Cells that touch an area, minus those the client holds."""
+        check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         session.asked_about(area)
-        layers = canonical_layers(message.layers)
+        layers = admitted_layers(self._store, message.layers)
         found = self._store.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._cannot_exceed_quota(session):
             warm = warm_difference(self._store, message, found, layers[0])
@@ -188,11 +188,7 @@ class CellRequests:
     # --- waiting and answering ------------------------------------------------------------------
 
     def _begin(self, wanted: Wanted, wait_s: float | None, area: Area | None, now_s: float) -> None:
-        if len(wanted.cells) > MOST_CELLS:
-            raise BadRequest(
-                f"{len(wanted.cells)} cells in one request; {MOST_CELLS} is the most",
-                hint="ask for a smaller area, or for some ids at a time",
-            )
+        check_count(len(wanted.cells))
         warm = self._store.warm
         find = self._store.find_warm
         cold = [

@@ -8,11 +8,9 @@ frees memory.  Files are read and layers built elsewhere (`workers`).
 from __future__ import annotations
 
 import logging
-import math
 import select
 import time
 from collections.abc import Callable
-from itertools import chain
 from typing import Final
 
 import zmq
@@ -29,6 +27,7 @@ from shmmap.daemon.pin_survey import Pinned, PinSurvey
 from shmmap.daemon.privileges import Privileges
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.replies import Replies
+from shmmap.daemon.request_limits import bounded_intent
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
@@ -258,8 +257,7 @@ class Server:
         session.last_request_s = now_s
         if isinstance(message, messages.Differential | messages.Area | messages.Selected):
             if message.intent is not None:
-                _check_intent(message.intent)
-                session.intent, session.says_where = message.intent, True
+                session.intent, session.says_where = bounded_intent(message.intent), True
             if isinstance(message, messages.Differential):
                 self.cells.differential(session, message, now_s)
             elif isinstance(message, messages.Area):
@@ -382,13 +380,6 @@ class Server:
 
     def _refuse(self, identity: bytes, request: int, error: ShmmapError) -> None:
         self._replies.refuse(identity, request, error)
-
-
-def _check_intent(intent: messages.Intent) -> None:
-    """Refuse what has no order by distance: one NaN would mix up everybody's evictions and loads."""
-    numbers = (intent.x, intent.y, intent.vx, intent.vy, intent.heading or 0.0, *chain(*intent.route))
-    if not all(map(math.isfinite, numbers)):
-        raise BadRequest("intent: every number in it must be finite")
 
 
 def _descriptor(frame: zmq.Frame) -> int:
