@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,18 +25,16 @@ from shmmap.daemon.loading import Loading
 from shmmap.daemon.name_watch import NameWatch
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident, Slot
+from shmmap.daemon.resident_forms import cell_row, encode_handles
 from shmmap.daemon.workers import WorkerPool
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
 from shmmap.origin.stamp import Stamp
-from shmmap.protocol.codec import encode_handle
-from shmmap.protocol.messages import Handle
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
-from shmmap.statistics.layout import CellRow
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Store"]
@@ -319,7 +316,7 @@ class Store:
             self.index_of_version[resident.version] = index
             self._show(resident)
             return
-        self._encode(resident)
+        encode_handles(resident, *self._names_of(resident))
         current = resident.version == self.layers.version(index, resident.key.layer)
         if current:
             self.warm.setdefault(resident.key.layer, {})[index] = resident
@@ -345,37 +342,12 @@ class Store:
                 del self.warm[resident.key.layer], self.versions[resident.key.layer]
         self._show(resident, "zombie")
 
-    def _encode(self, resident: Resident) -> None:
-        handle = Handle(
-            self.wire_id(resident.key.cell_id),
-            resident.version,
-            resident.key.layer,
-            resident.name.removeprefix(self.segment_prefix),
-            0,
-            resident.nbytes,
-            resident.points,
-            *resident.box,
-        )
-        resident.handle = encode_handle(handle)
-        resident.stale_handle = encode_handle(msgspec.structs.replace(handle, stale=True))
-
     def _show(self, resident: Resident, state: str = "resident") -> None:
-        self._statistics.cell_changed(
-            resident.name,
-            CellRow(
-                id=self.wire_id(resident.key.cell_id),
-                layer=resident.key.layer,
-                version=resident.version,
-                segment=resident.name.removeprefix(self.segment_prefix),
-                state=state,
-                bytes=resident.nbytes,
-                points=resident.points,
-                box=resident.box,
-                hits=resident.hits,
-                last_use_monotonic_ns=int(resident.last_use_s * 1e9),
-                load_ns=resident.load_ns,
-            ),
-        )
+        self._statistics.cell_changed(resident.name, cell_row(resident, *self._names_of(resident), state))
+
+    def _names_of(self, resident: Resident) -> tuple[str, str]:
+        """Cell id and segment name without their prefixes."""
+        return self.wire_id(resident.key.cell_id), resident.name.removeprefix(self.segment_prefix)
 
     def show_used(self, limit: int) -> None:
         """Bring hits and last use of at most ``limit`` segments in ``used`` up to date in the statistics."""
@@ -442,11 +414,9 @@ class Store:
                 index = self.index_of(zombie.resident.key.cell_id)
                 if index is not None:
                     self.index_of_version[zombie.resident.version] = index
-        changed = set(change.changed)
+        changed, gone, moved = set(change.changed), set(change.removed), set(change.moved)
         for index in [index for index in self.heights if new.id(index) in changed]:
             self._chill(index)
-        gone = set(change.removed)
-        moved = set(change.moved)
         for zombie in self.books.zombies.values():
             if zombie.resident.key.cell_id in moved:
                 self.reclaimer.never_revive(zombie.resident.key)
@@ -461,7 +431,7 @@ class Store:
                 continue
             self._chill_one(resident, index)
             if not resident.checked and not self.is_current(resident):
-                self.evict(resident, now_s)
+                self.evict(resident, now_s, "map")
                 continue
             self._enter(resident, index)
         for key in [key for key in self.books.slots if key.cell_id in gone]:

@@ -143,12 +143,15 @@ def _served(reader: Reader, serve: str) -> Iterator[Reader]:
 
 def test_commands_of_a_user(reader: Reader) -> None:
     told = [reader.run(command) for command in block("user")]
-    status, query, ls, show, clients, export, inspect, divide, merge = told
+    status, query, ls, show, clients, top, tail, picture, export, inspect, divide, merge = told
     assert "healthy" in status
     assert "town_160_160.pcd" in query
     assert "resident" in ls
     assert "town_160_160.pcd" in show
     assert "CLIENT" in clients
+    assert "cache" in top
+    assert "town_160_160.pcd" in tail
+    assert "town.html" in picture
     assert "around.pcd" in export
     exported = re.search(r"([\d,]+) points of", export)
     assert exported is not None
