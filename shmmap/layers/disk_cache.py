@@ -101,12 +101,15 @@ class LayerCache:
     ----------
     stored_bytes
         Bytes stored by this object since its last `trim`.
+    writable
+        Whether storing is worth another try; for its users to say.
     """
 
     def __init__(self, directory: str, *, limit_bytes: int) -> None:
         self.directory = os.path.join(directory, "layers")
         self.limit_bytes = limit_bytes
         self.stored_bytes = 0
+        self.writable = True
 
     def _state_path(self, name: str) -> str:
         return os.path.join(self.directory, "state", name[:2], f"{name}.layer")

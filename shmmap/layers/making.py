@@ -105,10 +105,13 @@ def make_layer(
 
 
 def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> None:
+    if not cache.writable:
+        return
     try:
         cache.store(key, header, fd)
     except OSError as error:  # the cache is a convenience: a full disk costs nobody a layer
-        _log.warning("%s cannot be kept in %s: %s", key.spec, cache.directory, error)
+        cache.writable = False
+        _log.warning("layers cannot be kept in %s: %s", cache.directory, error)
     if cache.stored_bytes > cache.limit_bytes // 16:
         with contextlib.suppress(OSError):
             cache.trim()

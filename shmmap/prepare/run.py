@@ -15,8 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
@@ -80,28 +79,33 @@ class _Worker:
 class _Run:
     def __init__(
         self,
-        tasks: Sequence[work.CellWork],
+        tasks: Iterator[work.CellWork],
+        total: int,
         cache: LayerCache,
         cache_dir: str,
         limit: int,
         progress: PrepareProgress,
     ) -> None:
-        self._waiting = deque(tasks)
+        self._tasks = tasks
+        self._again: list[work.CellWork] = []
+        self._exhausted = False
         self._cache = cache
         self._arguments = [cache_dir, str(cache.limit_bytes)]
-        self._limit = min(limit, len(tasks))
+        self._limit = min(limit, total)
         self._progress = progress
         self._selector = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
         self._failed_starts = 0
         self._added_bytes = 0
-        self.result = Prepared(len(tasks))
+        self.result = Prepared(total)
 
     def run(self) -> None:
         try:
-            while self._waiting or any(worker.task for worker in self._workers):
-                while self._waiting and len(self._workers) < self._limit:
-                    self._start()
+            while True:
+                while len(self._workers) < self._limit and (task := self._next()) is not None:
+                    self._start(task)
+                if not any(worker.task for worker in self._workers):
+                    break
                 for key, _ in self._selector.select():
                     self._hear(key.data)
         finally:
@@ -109,7 +113,17 @@ class _Run:
                 self._end(worker)
             self._selector.close()
 
-    def _start(self) -> None:
+    def _next(self) -> work.CellWork | None:
+        """The next cell: one given back by a worker that could not start, or a new one."""
+        if self._again:
+            return self._again.pop()
+        if self._exhausted:
+            return None
+        task = next(self._tasks, None)
+        self._exhausted = task is None
+        return task
+
+    def _start(self, task: work.CellWork) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             process = subprocess.Popen(
@@ -130,14 +144,13 @@ class _Run:
         worker = _Worker(process, ours)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
-        self._feed(worker)
+        self._feed(worker, task)
 
-    def _feed(self, worker: _Worker) -> None:
-        worker.task = None
-        if self._waiting:
-            worker.task = self._waiting.popleft()
+    def _feed(self, worker: _Worker, task: work.CellWork | None) -> None:
+        worker.task = task
+        if task is not None:
             with contextlib.suppress(OSError):  # its end is reported by its channel
-                worker.channel.send(work.encode(worker.task))
+                worker.channel.send(work.encode(task))
 
     def _hear(self, worker: _Worker) -> None:
         try:
@@ -152,7 +165,7 @@ class _Run:
             self._failed_starts = 0
         else:
             self._count(message, worker)
-            self._feed(worker)
+            self._feed(worker, self._next())
 
     def _count(self, done: work.CellDone, worker: _Worker) -> None:
         result = self.result
@@ -178,7 +191,7 @@ class _Run:
             if self._failed_starts >= _FAILED_STARTS:
                 raise InternalError(f"no worker can be started: {how}")
             if task is not None:
-                self._waiting.appendleft(task)
+                self._again.append(task)
             return
         if task is not None:
             message = f"{task.path}: the worker died of it ({how})"
@@ -223,32 +236,34 @@ def prepare_map(
     cache = LayerCache(cache_dir, limit_bytes=cache_bytes)
     versions = LayerVersions(lambda: catalogue)
     recognise = not cache.is_empty
-    tasks, failures = [], []
-    for index in range(len(catalogue)):
-        around = [[catalogue.path(n) for n in versions.neighbours(index, name)] for name in names]
-        crowded = [name for name, some in zip(names, around, strict=True) if len(some) > MAX_NEIGHBOURS]
-        cell_id = catalogue.id(index)
-        failures += [
-            Failure(cell_id, name, f"{name} looks into more than {MAX_NEIGHBOURS} cells around one")
-            for name in crowded
-        ]
-        kept = [number for number, name in enumerate(names) if name not in crowded]
-        tasks.append(
-            work.CellWork(
+    crowded: list[Failure] = []
+
+    def tasks() -> Iterator[work.CellWork]:
+        for index in range(len(catalogue)):
+            cell_id = catalogue.id(index)
+            around: dict[str, tuple[str, ...]] = {}
+            for name in names:
+                near = versions.neighbours(index, name)
+                if len(near) > MAX_NEIGHBOURS:
+                    message = f"{name} looks into more than {MAX_NEIGHBOURS} cells around one"
+                    crowded.append(Failure(cell_id, name, message))
+                else:
+                    around[name] = tuple(map(catalogue.path, near))
+            yield work.CellWork(
                 index,
                 cell_id,
                 catalogue.path(index),
                 catalogue.box(index),
                 catalogue.frame_id,
-                tuple(names[number] for number in kept),
-                tuple(tuple(around[number]) for number in kept),
+                tuple(around),
+                tuple(around.values()),
                 recognise,
             )
-        )
-    progress.stage("prepare", len(tasks))
-    run = _Run(tasks, cache, cache_dir, max(1, workers), progress)
+
+    progress.stage("prepare", len(catalogue))
+    run = _Run(tasks(), len(catalogue), cache, cache_dir, max(1, workers), progress)
     run.run()
-    run.result.failures += failures
+    run.result.failures += crowded
     run.result.cache_bytes = cache.trim()
-    progress.done(len(tasks))
+    progress.done(len(catalogue))
     return run.result

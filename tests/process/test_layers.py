@@ -179,6 +179,29 @@ def test_a_kind_of_another_package_with_a_halo(
     assert len(again.cells) == 36
 
 
+def test_normals_have_no_seam(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    client = connect(daemon(divided_map.root))
+    name, radius = "0_0.pcd", 4.0
+    reply = client.cells_reply(
+        client.ask(
+            "selected", [divided_map.id(name)], ["normals(radius=4)", "crop(z_max=4,of=denoise)"], 60.0
+        )
+    )
+    assert reply.failed == []
+    for handle, reach in zip(reply.cells, (radius, 1.0), strict=True):
+        x0, y0, x1, y1 = divided_map.box(name)
+        near = []
+        for other in sorted(set(divided_map.in_circle(x0 + 10, y0 + 10, 20)) - {name}):
+            xyz = cloud(divided_map, other)["xyz"]
+            inside = (xyz[:, 0] >= x0 - reach) & (xyz[:, 0] <= x1 + reach)
+            near.append(xyz[inside & (xyz[:, 1] >= y0 - reach) & (xyz[:, 1] <= y1 + reach)])
+        alone = build_layer(handle.layer, cloud(divided_map, name))
+        whole = build_layer(handle.layer, cloud(divided_map, name), halo=np.concatenate(near))
+        assert_is(client, handle, divided_map, whole)
+        last = list(whole.columns)[-1]
+        assert not np.array_equal(alone[last], whole[last])
+
+
 @pytest.mark.parametrize("how", [0, 1])
 def test_a_builder_that_fails_costs_its_own_layer(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, tmp_path: Path, how: int
