@@ -19,8 +19,10 @@ import pytest
 
 from shmmap.formats.pcd_writer import write_pcd
 from shmmap.origin.map_directory import open_map
+from tests.benchmarks.divide_large import FIELDS, generate
 from tests.support.clouds import expected_rows, map_rows, rows_of, xyzircaedt
 from tests.support.daemon_process import ROOT
+from tests.support.pcd_files import read_pcd
 
 KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "4"))
 
@@ -103,6 +105,19 @@ def test_a_killed_run_leaves_no_half_map(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert map_rows(tmp_path / "map") == truth
     assert sorted(os.listdir(tmp_path)) == ["cloud.pcd", "map"]
+
+
+def test_a_cloud_larger_than_the_memory_it_may_take(tmp_path: Path) -> None:
+    generate(tmp_path / "cloud.pcd", 13_000_000, np.dtype(FIELDS["xyzircaedt"]), random=False)
+    assert (tmp_path / "cloud.pcd").stat().st_size > 384 << 20
+    done = shmmap("divide", tmp_path / "cloud.pcd", tmp_path / "map", "--max-memory", "384M", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["points"] == 13_000_000
+    assert report["peak_memory_bytes"] < 384 << 20
+    cells = list((tmp_path / "map" / "pointcloud_map.pcd").iterdir())
+    assert len(cells) == report["cells"]
+    assert sum(len(read_pcd(cell)["x"]) for cell in cells) == 13_000_000
 
 
 @pytest.mark.root
