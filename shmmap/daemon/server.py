@@ -43,6 +43,9 @@ _log = logging.getLogger(__name__)
 
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
+FAREWELL_S: Final = 1.0
+"""How long a stop waits for the one who asked for it: libzmq drops a reply that was not read when the
+connection ends (ZMQ_IMMEDIATE)."""
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 """A longer request that is refused unread is dropped: finding its number takes too long."""
 _SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
@@ -94,6 +97,8 @@ class Server:
         self._epoll = select.epoll()
         self._events: dict[int, Callable[[], None]] = {}
         self._stopping = False
+        self._asked_to_stop: Session | None = None
+        self._stop_by_s = math.inf
         self._answer_at_end = True
         self.cells = CellRequests(
             store, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
@@ -201,6 +206,8 @@ class Server:
         self._store.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
         self._heartbeat.turn(now_s)
+        if now_s >= self._stop_by_s:
+            self.stop()
 
     # --- requests -----------------------------------------------------------------------------------
 
@@ -275,7 +282,7 @@ class Server:
             if isinstance(message, messages.Shutdown):
                 _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
                 self._send(session, encode(messages.Stopping(message.request)))
-                self.stop()
+                self._asked_to_stop, self._stop_by_s = session, now_s + FAREWELL_S
             elif isinstance(message, messages.Reload):
                 self._reload_for(session, message)
             elif isinstance(message, messages.Stats):
@@ -331,6 +338,8 @@ class Server:
             self.unwatch(session.pidfd)
         self._sessions.close(session)
         self.cells.let_go(held)
+        if session is self._asked_to_stop:
+            self.stop()
 
     # --- reload -------------------------------------------------------------------------------------
 

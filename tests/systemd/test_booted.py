@@ -240,6 +240,42 @@ def test_several_maps_side_by_side(fresh: BootedSystemd) -> None:
     fresh.shell("rm /etc/shmmap/car.toml")
 
 
+def test_a_second_daemon_of_an_instance_stays_down(fresh: BootedSystemd) -> None:
+    fresh.run("systemctl", "start", "shmmapd")
+    fresh.shell("""
+        cp /etc/shmmap/shmmap.toml /etc/shmmap/default.toml
+        mkdir -p /run/systemd/system/shmmapd@default.service.d
+        cp /etc/systemd/system/shmmapd.service.d/20-map.conf /run/systemd/system/shmmapd@default.service.d/
+        systemctl daemon-reload
+    """)
+    try:
+        assert fresh.run("systemctl", "start", "shmmapd@default", check=False).returncode != 0
+        second = fresh.properties("shmmapd@default")
+        assert (second["ActiveState"], second["ExecMainStatus"], second["NRestarts"]) == ("failed", "75", "0")
+        with Client(fresh, "alice") as alice:
+            assert len(alice.ask()) == 12
+    finally:
+        fresh.shell("rm /etc/shmmap/default.toml")
+
+
+def test_administrators_reload_and_stop(fresh: BootedSystemd) -> None:
+    fresh.shell("""
+        mkdir -p /run/systemd/system/shmmapd.service.d
+        printf '[Service]\nEnvironment=SHMMAP_ADMIN_GROUP=shmmap\n' \
+            >/run/systemd/system/shmmapd.service.d/test.conf
+        systemctl daemon-reload
+        systemctl start shmmapd
+    """)
+    done = shmmap(fresh, "reload", user="alice")
+    assert done.returncode == 0, done.stderr
+    done = shmmap(fresh, "stop", user="alice")
+    assert done.returncode == 0, done.stderr
+    waiting = Patience()
+    while waiting((unit := fresh.properties("shmmapd"))["ActiveState"] != "inactive"):
+        pass
+    assert (unit["Result"], unit["NRestarts"]) == ("success", "0")  # it was meant: nobody starts it again
+
+
 @pytest.mark.parametrize(
     ("change", "status", "says"),
     [
