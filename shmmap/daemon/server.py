@@ -8,6 +8,7 @@ frees memory.  Files are read and layers built elsewhere (`workers`).
 from __future__ import annotations
 
 import logging
+import math
 import select
 import time
 from collections.abc import Callable
