@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import matrix_from_pose
 from shmmap_clients.scans.trajectory import tum_line
 
+from shmmap.testing.lidar import Lidar
 from shmmap.testing.town import Town
 
 _HEIGHT_M = 1.8
-_REACH_M = 40.0
-_NOISE_M = 0.02
+_SEEN_DENSITY = 12.0
+_LIDAR = Lidar(rings=32, azimuth_deg=0.6, farthest=45.0)
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,12 @@ class TownDrive:
 
 
 def make_town_drive(
-    folder: Path, *, blocks: tuple[int, int], density: float, frames: int, step: float, points: int = 4000
+    folder: Path, *, blocks: tuple[int, int], density: float, frames: int, step: float
 ) -> TownDrive:
-    """Write a town and ``frames`` scans taken every ``step`` metres; each a sample of what is near."""
+    """Write a town and ``frames`` scans that the simulated LiDAR takes every ``step`` metres.
+
+    The LiDAR looks at a denser sampling of the same town: no scan holds the map's own points.
+    """
     town = Town(seed=3, blocks=blocks, density=density)
     town.write(folder / "map")
     cloud = np.concatenate([tile["xyz"] for tile in town.tiles()])
@@ -40,16 +44,16 @@ def make_town_drive(
     heights = town.ground_height(route[:, 0], route[:, 1]) + _HEIGHT_M
     zeros = np.zeros(len(route))
     poses = np.stack([route[:, 0], route[:, 1], heights, zeros, zeros, route[:, 2]], axis=1)
+    dense = Town(seed=3, blocks=blocks, density=_SEEN_DENSITY)
+    seen = np.concatenate([tile["xyz"] for tile in dense.tiles()])
     scans = folder / "scans"
     scans.mkdir()
     lines = []
     for number, pose in enumerate(poses):
         rng = np.random.default_rng(number)
-        near = cloud[((cloud - pose[:3]) ** 2).sum(axis=1) < _REACH_M**2]
-        near = near[rng.choice(len(near), min(points, len(near)), replace=False)]
+        near = seen[(np.abs(seen[:, :2] - pose[:2]) < _LIDAR.farthest).all(axis=1)]
         T = matrix_from_pose(pose)
-        xyz = (near - pose[:3]) @ T[:3, :3] + rng.normal(0.0, _NOISE_M, near.shape)
-        np.savez(scans / f"scan_{number:04}.npz", xyz=xyz.astype(np.float32))
+        np.savez(scans / f"scan_{number:04}.npz", xyz=_LIDAR.scan(near, T, rng).xyz)
         lines.append(tum_line(0.1 * number, T))
     (folder / "truth.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return TownDrive(folder / "map", scans, folder / "truth.txt", cloud, poses)

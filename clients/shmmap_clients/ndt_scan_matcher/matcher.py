@@ -241,7 +241,7 @@ class NdtMatcher:
         return Result(
             T_map_base=transforms[-1],
             iterations=sum(way.iterations for way in ways),
-            converged=all(way.converged for way in ways),
+            converged=ways[-1].converged,
             transform_probability=last.score / points,
             nvtl=last.nvtl,
             transforms=transforms,

@@ -31,7 +31,8 @@ class Result:
     iterations
         Newton steps, counted as the convention's program counts them.
     converged
-        The last step was below epsilon, not merely the last one allowed.
+        The last step was below epsilon, not merely the last one allowed; of the fine part where there is
+        one.
     transform_probability
         Score per point of the scan.
     nvtl
