@@ -34,6 +34,8 @@ MEMORY_ALLOWANCE_BYTES: Final = 192 << 20
 TRIM_BYTES: Final = 16 << 20
 """When memory has grown by this much, what is free of it goes back to the kernel."""
 TRIM_INTERVAL_S: Final = 2.0
+MANY_CONNECTIONS: Final = 64
+"""Each connection of a process beyond so many counts as memory."""
 LEAST_WEIGHT_BYTES: Final = 1 << 18
 """A process that takes less than this is never the culprit."""
 CENSUSES: Final = 8
@@ -145,8 +147,7 @@ class CrowdControl:
                 weights[process] += nbytes
         weights.update(self._unread_bytes())
         for pid, fds in connections.items():
-            if len(fds) > LEAST_SHARE:
-                weights[pid] += len(fds) << 16
+            weights[pid] += max(0, len(fds) - MANY_CONNECTIONS) << 16  # half a frame may lie in each
         guilty = [pid for pid in connections if weights[pid] >= LEAST_WEIGHT_BYTES]
         if guilty:
             pid = max(guilty, key=lambda one: weights[one])
