@@ -37,7 +37,7 @@ class DividedMap:
     fields
         Names and dtypes of what each point has.
     bounds
-        Least and greatest coordinates in the map; None for an empty one.
+        Least and greatest coordinates of the points that were divided, in the frame of the map.
     sources
         The inputs: path, bytes, mtime_ns, points.
     notes

@@ -111,6 +111,8 @@ class Workspace:
         """Let `content` appear as ``out``, in one step; with ``replace`` in the place of what is there."""
         if durable:
             _flush_file_system(self.path)
+        # from here on what lies in the workspace may be the map that was replaced: nobody may resume from it
+        Path(self.path, _STATE).unlink(missing_ok=True)
         if replace and os.path.isdir(self.out) and os.listdir(self.out):
             _exchange(self.content, self.out, aside=os.path.join(self.path, "replaced"))
         else:

@@ -107,6 +107,21 @@ def test_a_run_that_was_nearly_done(tmp_path: Path, stage: str, options: dict[st
     assert files_of(tmp_path / "map") == files_of(tmp_path / "whole")
 
 
+def test_a_run_killed_while_its_map_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The workspace then has the map that was replaced, of other points with the same names and sizes."""
+    files, columns = inputs(tmp_path, "binary")
+    divide(files, tmp_path / "map", settings())
+    columns["intensity"] = np.uint8(255) - columns["intensity"]
+    write_pcd(tmp_path / "new.pcd", columns)
+    with monkeypatch.context() as patch:
+        patch.setattr(Workspace, "remove", lambda _: None)  # as far as a killed run comes
+        divide([tmp_path / "new.pcd"], tmp_path / "map", settings(force=True))
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+    made = divide([tmp_path / "new.pcd"], tmp_path / "map", settings(force=True, resume=True))
+    assert made.resumed_points == 0
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+
+
 def test_something_else_starts_anew(tmp_path: Path) -> None:
     files, columns = inputs(tmp_path, "binary")
     interrupted(files, tmp_path / "map", 4200)
