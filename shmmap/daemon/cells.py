@@ -313,7 +313,7 @@ class CellRequests:
                 continue
             if (
                 self._store.books.slot(key).failure is None
-                and self._store.want(index, layer, 0.0, now_s).load
+                and self._store.want(index, layer, 0.0, now_s, wanted.session.asker).load
             ):
                 wanted.outstanding.add(key)
                 self._waiting.setdefault(key, []).append(wanted)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 from collections.abc import Iterator
 from typing import Final
 
@@ -22,6 +23,8 @@ __all__ = ["PinWatch"]
 
 KEPT_OPEN: Final = 1024
 """Most retired segments that are kept open; further ones are looked at now and then."""
+KEPT_SHARE: Final = 8
+"""Of the descriptors this process may have, one in so many at most: clients need them more."""
 
 
 class PinWatch:
@@ -45,6 +48,7 @@ class PinWatch:
         self._directory = directory
         self._kept: dict[str, tuple[int, int]] = {}
         self._names: dict[int, str] = {}
+        self._most_kept = min(KEPT_OPEN, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // KEPT_SHARE)
         self._inotify: Inotify | None = None
         if events:
             with contextlib.suppress(OSError):
@@ -90,7 +94,7 @@ class PinWatch:
 
     def keep(self, name: str) -> bool:
         """Keep a retired segment open and hear when others let go of it; False if that cannot be."""
-        if self._inotify is None or len(self._kept) >= KEPT_OPEN:
+        if self._inotify is None or len(self._kept) >= self._most_kept:
             return False
         try:
             fd = self._directory.open(name)

@@ -65,8 +65,6 @@ class Store:
         Tells what happens to cells.
     loads
         What is being loaded.
-    names
-        Hears of names that vanish.
     history : deque
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
     used : set
@@ -286,10 +284,10 @@ class Store:
         return True
 
     def reject(self, resident: Resident, why: str, now_s: float) -> None:
-        """Take an adopted segment that is not what it should be out of service."""
-        self._statistics.add("adoptions_failed")
-        _log.warning("%s of an earlier daemon is not used: %s", resident.name, why)
+        """Take an adopted segment that is not what it should be out of service, if it still is in it."""
         if self.books.resident_named(resident.name) is resident:
+            self._statistics.add("adoptions_failed")
+            _log.warning("%s of an earlier daemon is not used: %s", resident.name, why)
             self.reclaimer.retire(resident, now_s, "damaged")
 
     def estimate_of(self, key: Key) -> int:
@@ -394,7 +392,7 @@ class Store:
         residents = self.books.residents() if names is None else map(self.books.resident_named, names)
         for resident in [r for r in residents if r is not None and not self._directory.exists(r.name)]:
             _log.warning("%s of %s was removed by somebody else", resident.name, resident.key.cell_id)
-            self.reclaimer.retire(resident, now_s)  # it finds no name
+            self.reclaimer.retire(resident, now_s, "damaged")
 
     def replace_catalogue(self, new: Catalogue, now_s: float) -> CatalogueChange:
         """Serve another state of the map; takes effect cell by cell as cells are asked for."""

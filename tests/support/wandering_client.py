@@ -26,7 +26,7 @@ def main() -> None:
         x, y = rng.uniform(-half, half), rng.uniform(-half, half)
         radius = rng.uniform(5.0, half / 3)
         with shmmap.connect(
-            sys.argv[1], name=f"wanderer {sys.argv[2]}", timeout=60.0, connect_timeout=60.0
+            sys.argv[1], name=f"wanderer {sys.argv[2]}", timeout=600.0, connect_timeout=600.0
         ) as client:
             held: dict[str, tuple[shmmap.Cell, int]] = {}
             for _ in range(rng.randrange(20, 400)):
