@@ -16,6 +16,7 @@ from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
     from shmmap.testing.demo import DemoResult, DriveResult
+    from shmmap.testing.demo_town import DemoSettings, Progress
 
 __all__ = ["add_parser", "run"]
 
@@ -32,7 +33,11 @@ _JSON = """\
           "handed_bytes": columns that all consumers got,
           "process_bytes": memory of the processes without shared memory,
           "shm_bytes": shared memory, counted once, "total_bytes": both,
-          "pss_bytes", "private_bytes": as the kernel counts them"""
+          "pss_bytes", "private_bytes": as the kernel counts them}
+  With --full: {"town": {"cells", "points"}, "scans", "seconds", "shm_bytes", "programs":
+  {"ndt", "compare", "elevation": what each printed}, "memory": {...: {"own_bytes",
+  "growth_bytes": more in the last third of the drive than in the middle one,
+  "shared_bytes": of the map, mapped}}, "svg"}; exit code 1 where a scan was lost or not trusted"""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -53,6 +58,12 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="POINTS",
         type=_density,
         help="points per square metre of ground; fewer are quicker (default: 100, or what fits)",
+    )
+    parser.add_argument(
+        "--full",
+        action="store_true",
+        help="drive with the real programs instead: localization, compare filter and elevation map"
+        " beside one another, on simulated scans among moving cars (some minutes)",
     )
     add_json_option(parser)
 
@@ -80,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
     started_s = time.monotonic()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
         settings = DemoSettings() if args.density is None else DemoSettings(density=args.density)
+        if args.full:
+            return _run_full(settings, progress, picture, as_json=args.json)
         result = run_demo(settings, progress, map_dir=args.keep_map)
     picture.write_text(_draw(result), encoding="utf-8")
     duration_s = time.monotonic() - started_s
@@ -91,6 +104,44 @@ def run(args: argparse.Namespace) -> int:
         if args.keep_map:
             print(f"Serve the town yourself: shmmap serve {args.keep_map}")
     return 0
+
+
+def _run_full(settings: DemoSettings, progress: Progress, picture: Path, *, as_json: bool) -> int:
+    """Drive with the three programs; exit code 1 where a scan was lost or could not be trusted."""
+    from shmmap.testing.full_demo import run_full_demo
+    from shmmap.testing.three_programs import table
+
+    result = run_full_demo(settings, progress)
+    picture.write_text(result.picture_svg, encoding="utf-8")
+    runs = result.programs.programs
+    documents = {name: run.document for name, run in runs.items()}
+    scans = result.programs.scans
+    good = documents["ndt"]["trustworthy"] == documents["compare"]["scans"] == scans
+    if as_json:
+        memory = {
+            name: {
+                "own_bytes": max(run.own_bytes, default=0),
+                "growth_bytes": run.growth_bytes,
+                "shared_bytes": run.shared_bytes,
+            }
+            for name, run in runs.items()
+        }
+        print_json(
+            {
+                "town": {"cells": result.town.cells, "points": result.town.points},
+                "scans": scans,
+                "seconds": round(result.programs.seconds, 3),
+                "shm_bytes": max(result.programs.segment_bytes, default=0),
+                "programs": documents,
+                "memory": memory,
+                "svg": str(picture),
+            }
+        )
+    else:
+        print()
+        print("\n".join(table(result.programs)))
+        print(f"Picture of what the compare filter kept (red) and removed: {picture}")
+    return 0 if good and not documents["compare"]["incomplete_scans"] else 1
 
 
 def _picture_path(named: str | None) -> Path:

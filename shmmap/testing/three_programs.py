@@ -290,8 +290,8 @@ class _Answers:
             if ready:
                 quiet_s = time.monotonic()
                 continue
-            for name in self._heard:
-                if not programs[name].running:
+            for name, heard in self._heard.items():
+                if heard < count - 1 and not programs[name].running:
                     raise InternalError(f"{name} ended: {programs[name].last_words()}")
             if time.monotonic() - quiet_s > _PATIENCE_S:
                 raise InternalError(f"no answer for {_PATIENCE_S:g} s; heard {self._heard}")

@@ -4,13 +4,18 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pytest
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
+from shmmap.cli.demo_progress import QuietProgress
+from shmmap.testing.demo_town import DemoSettings
+from shmmap.testing.full_demo import run_full_demo
 from shmmap.testing.three_programs import run_three_programs, table
 from tests.support.daemon_process import DaemonProcess
 from tests.support.town_drive import make_town_drive
@@ -66,3 +71,16 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
         client.evict()
         assert not client.stats().unknown_holders
     assert one.segments() == []
+
+
+def test_the_full_demonstration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("shmmap.testing.full_demo._BLOCKS", (3, 2))
+    before = set(os.listdir("/dev/shm"))
+    result = run_full_demo(DemoSettings(density=8.0), QuietProgress(), length=12.0)
+    documents = {name: run.document for name, run in result.programs.programs.items()}
+    assert result.programs.scans == documents["ndt"]["frames"] == documents["compare"]["scans"] == 7
+    assert documents["compare"]["incomplete_scans"] == 0
+    assert documents["elevation"]["cells"] == result.town.cells == 96
+    assert result.picture_svg.startswith("<svg")
+    mine = f"shmmap.test-{os.getpid()}-"
+    assert not [name for name in set(os.listdir("/dev/shm")) - before if name.startswith(mine)]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fills holes of a grid from the heights around them, in floating point.
 
-A hole that has a known height within the radius gets the value, at its middle, of the plane that fits the
-known heights within the radius and two columns more best, weighted by 1 / distance²; so a slope goes
-on through a hole.  Where those lie on one line, or are fewer than three, it is their weighted mean.
+A hole that has a known height within the radius, and three to go by, gets the value, at its middle, of the
+plane that fits the known heights within the radius and two columns more best, weighted by 1 / distance²;
+so a slope goes on through a hole.  Where those lie on one line it is their weighted mean.
 Upstream inpaints an 8-bit image of the whole map, where 100 m of relief make steps of 0.39 m.
 """
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 __all__ = ["fill_holes", "fill_reach"]
 
 _FIT_MORE: Final = 2.0  # columns: behind the rim of a hole, so that there is a plane and not a line
+_LEAST: Final = 3  # heights: fewer are too lonely to say anything of their surroundings
 _FLAT: Final = 1e-6  # relative determinant below which a plane is not determined
 
 
@@ -75,6 +76,7 @@ def _fill(heights: Any, radius: Any, reach: Any, result: Any) -> None:
             if not some:
                 continue
             s, sx, sy, sxx, sxy, syy, sz, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            known = 0
             about = np.nan  # sums are about the first neighbour, for their digits
             for y in range(max(0, row - reach), min(rows, row + reach + 1)):
                 for x in range(max(0, column - reach), min(columns, column + reach + 1)):
@@ -85,6 +87,7 @@ def _fill(heights: Any, radius: Any, reach: Any, result: Any) -> None:
                         continue
                     if np.isnan(about):
                         about = z
+                    known += 1
                     weight = 1.0 / squared
                     z -= about
                     s += weight
@@ -96,6 +99,8 @@ def _fill(heights: Any, radius: Any, reach: Any, result: Any) -> None:
                     sz += weight * z
                     sxz += weight * z * d_x
                     syz += weight * z * d_y
+            if known < _LEAST:
+                continue
             # normal equations of z = a + b x + c y, by Cramer's rule for a alone
             minor_x, minor_y, minor = sxx * syy - sxy * sxy, sx * syy - sy * sxy, sx * sxy - sy * sxx
             determinant = s * minor_x - sx * minor_y + sy * minor

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""NDT matcher, compare filter and elevation map as separate processes on one daemon, over a real drive.
+
+The drive's scans are taken tile after tile on the real map tiled side by side, for so many minutes:
+windows move, jump from tile to tile, and cells come and go in a budget that holds a small part of the
+map.  Printed are each program's times and own memory, how much of that grew in the last third, shared
+memory, and what was lost or left.  A machine of two cores shows mostly how they share them.
+
+    python -m tests.benchmarks.three_programs DATA [--minutes 10] [--tiles 10] [--budget-mib 600] [--out DIR]
+
+DATA holds ``kitti0005_map`` and ``kitti0005_scans``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
+from shmmap_clients.scans.trajectory import read_trajectory
+
+import shmmap
+from shmmap.testing.three_programs import ThreePrograms, run_three_programs, table
+from tests.benchmarks.tile_map import tile_map
+from tests.support.daemon_process import DaemonProcess
+
+__all__ = ["main"]
+
+PITCH = 220.0
+SCAN_S = 0.5
+
+
+def moved(T: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
+    """A pose, shifted."""
+    result = np.array(T)
+    result[0, 3] += x
+    result[1, 3] += y
+    return result
+
+
+def tile_corners(tiles: int) -> list[tuple[float, float]]:
+    """Where each tile's copy lies, row by row and back."""
+    rows = [[(PITCH * c, PITCH * r) for c in range(tiles)] for r in range(tiles)]
+    return [corner for r, row in enumerate(rows) for corner in (row[::-1] if r % 2 else row)]
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path, metavar="DATA")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--tiles", type=int, default=10)
+    parser.add_argument("--budget-mib", type=int, default=600)
+    parser.add_argument("--out", type=Path, help="where ndt.svg and compare.svg go")
+    args = parser.parse_args()
+    trajectory = read_trajectory(args.data / "kitti0005_scans" / "poses_heldout_tum.txt")
+    sequence = list(ScanSequence(args.data / "kitti0005_scans", trajectory))
+    corners = tile_corners(args.tiles)
+    end_s = 0.0
+
+    def drive() -> Iterator[Scan]:
+        for number, (turn, scan) in enumerate(
+            (turn, scan) for turn in itertools.count() for scan in sequence
+        ):
+            if time.monotonic() > end_s:
+                return
+            x, y = corners[turn % len(corners)]
+            T = scan.T_map_sensor
+            assert T is not None
+            yield dataclasses.replace(
+                scan, name=f"{turn}/{scan.name}", stamp_s=number * SCAN_S, T_map_sensor=moved(T, x, y)
+            )
+
+    def poses(turns: int) -> Iterator[tuple[float, NDArray[np.float64]]]:
+        for number, (turn, scan) in enumerate(itertools.product(range(turns), sequence)):
+            assert scan.T_map_sensor is not None
+            yield number * SCAN_S, moved(scan.T_map_sensor, *corners[turn % len(corners)])
+
+    with tempfile.TemporaryDirectory() as name:
+        directory = Path(name)
+        written = tile_map(
+            args.data / "kitti0005_map" / "map_static_v005.pcd",
+            directory / "map",
+            copies=args.tiles,
+            pitch=PITCH,
+        )
+        points = f"{written.points / 1e6:.0f} million points"
+        print(f"map: {written.cells} cells, {points}, load {os.getloadavg()[0]:.1f}")
+        one = DaemonProcess(directory / "map", "--budget", str(args.budget_mib << 20)).start()
+        try:
+            end_s = time.monotonic() + 60 * args.minutes
+            work = directory / "work"
+            work.mkdir()
+            result = run_three_programs(
+                one.endpoint, one.shm_dir, one.instance, drive(), poses(len(corners) * 20), work,
+                ndt=["--map-radius", "100", "--lidar-radius", "70", "--update-distance", "10"],
+                compare=["--mode", "distance", "--radius", "100"],
+                elevation=["--resolution", "0.5", "--wait", "120"],
+            )  # fmt: skip
+            print("\n".join(table(result)))
+            with shmmap.connect(one.endpoint) as client:
+                client.evict()
+                unknown = client.stats().unknown_holders
+            print(verdict(result, args.budget_mib << 20, len(one.segments()), unknown))
+            if args.out:
+                args.out.mkdir(parents=True, exist_ok=True)
+                for picture in ("ndt.svg", "compare.svg"):
+                    shutil.copy(work / picture, args.out)
+        finally:
+            code = one.stop()
+            left = one.leftovers()
+            one.dispose()
+        print(f"daemon: exit code {code}, left behind: {left or 'nothing'}")
+
+
+def verdict(result: ThreePrograms, budget_bytes: int, segments: int, unknown: int) -> str:
+    """What was lost, in a line."""
+    ndt, compare = result.programs["ndt"].document, result.programs["compare"].document
+    return (
+        f"localized {ndt['frames']} of {result.scans} ({ndt['trustworthy']} to be trusted), compared"
+        f" {compare['scans']} ({compare['incomplete_scans']} with cells missing); budget exceeded:"
+        f" {max(result.segment_bytes) > budget_bytes}; segments that cannot be evicted: {segments},"
+        f" unknown holders: {unknown}"
+    )
+
+
+if __name__ == "__main__":
+    main()
