@@ -123,7 +123,7 @@ def _live(reader: StatisticsReader, interval_s: float) -> int:
             Live(console=console, screen=True, auto_refresh=False, transient=True) as live,
         ):
             while True:
-                found = reader.snapshot()
+                found = reader.snapshot(cells=False)
                 live.update(_render(found, earlier, console), refresh=True)
                 time.sleep(interval_s)
     except KeyboardInterrupt:
