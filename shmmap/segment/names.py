@@ -9,8 +9,8 @@ name that can be derived.
 
 from __future__ import annotations
 
+import os
 import re
-import secrets
 from typing import Final
 
 from shmmap.errors import ConfigError
@@ -51,7 +51,7 @@ def statistics_name(instance: str) -> str:
 
 def new_segment_name(instance: str) -> str:
     """Return a name that was never used before."""
-    return f"/shmmap.{instance}.{secrets.token_hex(8)}"
+    return f"/shmmap.{instance}.{os.urandom(8).hex()}"
 
 
 def zombie_name(name: str) -> str:
