@@ -127,6 +127,21 @@ def test_a_window_of_two_layers(daemon: DaemonFactory, divided_map: DividedMap) 
         del found, cell
 
 
+def test_a_window_follows_layers_however_they_are_written(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.MapWindow(one.endpoint, 30, layers="voxel( 1 )", update_distance=0) as window:
+        for x in (0.0, 15.0):
+            window.move_to(x, 0.0)
+            window.wait_until_current(60)
+            assert {cell.layer for cell in window.cells} == {"voxel(leaf=1.0)"}
+            near = window.points_around(x, 0.0, 5.0)
+            assert near.count() > 0
+            assert window.points_around(x, 0.0, 5.0, layer="voxel(leaf=1.0)").count() == near.count()
+            del near
+
+
 def offered(tmp_path: Path) -> dict[str, str]:
     return {"PYTHONPATH": f"{ROOT}:{install(tmp_path / 'offered')}"}
 

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Versions of computed layers, and what they cost the budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from xxhash import xxh3_64_intdigest
+
+from shmmap.daemon.layer_versions import LayerVersions
+from shmmap.origin.map_directory import open_map
+from shmmap.protocol import messages as m
+from shmmap.protocol.messages import Selected
+from tests.support.divided_map import make_map, random_points
+from tests.unit.daemon.inner_daemon import InnerDaemon
+
+Inner = Callable[..., InnerDaemon]
+NDT = "ndt(leaf=5.0,min_points=3)"
+
+
+def test_a_layer_has_its_cell_s_version_unless_it_looks_farther(tmp_path: Path) -> None:
+    made = make_map(tmp_path / "map", columns=4, rows=4, points=5)
+    catalogue = open_map(str(made.root), cache_dir=str(tmp_path / "cache")).load()
+    versions = LayerVersions(lambda: catalogue)
+    index = catalogue.find(made.id("0_0.pcd"))
+    assert index is not None
+    for layer in ("points", NDT, "crop(z_max=1.0)"):
+        assert versions.version(index, layer) == catalogue.version(index)
+        assert versions.neighbours(index, layer) == []
+    for layer in ("normals(radius=2.0)", "denoise", "ndt(leaf=2.0,of=denoise)"):
+        around = versions.neighbours(index, layer)
+        names = {catalogue.id(i).rsplit("/", 1)[1] for i in around}
+        assert names == {f"{x}_{y}.pcd" for x in (-20, 0, 20) for y in (-20, 0, 20)} - {"0_0.pcd"}
+        packed = np.array([catalogue.version(i) for i in (index, *sorted(around))], "<u8").tobytes()
+        assert versions.version(index, layer) == xxh3_64_intdigest(packed)
+    before = {i: versions.version(i, "denoise") for i in range(len(catalogue))}
+    made.write_cell("20_20.pcd", (20, 20), random_points(np.random.default_rng(3), (20, 20), 6))
+    catalogue = open_map(str(made.root), cache_dir=str(tmp_path / "cache")).load(fresh=True)
+    versions.forget()
+    changed = {
+        catalogue.id(i).rsplit("/", 1)[1] for i in before if versions.version(i, "denoise") != before[i]
+    }
+    assert changed == {"0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"}
+
+
+def ask(one: InnerDaemon, session: Any, number: int, layer: str) -> m.Cells:
+    ids = tuple(one.store.catalogue.id(i) for i in range(len(one.store.catalogue)))
+    one.cells.selected(session, Selected(number, ids, (layer,), 30.0), one.now_s())
+    return one.cells_of(number)
+
+
+def test_ndt_is_served_where_its_points_would_never_fit(tmp_path: Path, inner: Inner) -> None:
+    made = make_map(tmp_path / "map", columns=2, rows=2, points=20_000)
+    one = inner(made.root, budget_bytes=1 << 20)
+    one.books.budget_bytes = one.books.overhead_bytes + 400_000  # each file alone has 320 kB
+    session = one.session()
+    reply = ask(one, session, 1, NDT)
+    assert (len(reply.cells), reply.failed) == (4, ())
+    assert one.books.used_bytes <= one.books.budget_bytes
+    assert {key.layer for key in one.books.slots} == {NDT}
+
+
+def test_forgotten_layers_leave_no_tables(tmp_path: Path, inner: Inner) -> None:
+    made = make_map(tmp_path / "map", columns=2, rows=1, points=50)
+    one = inner(made.root)
+    session = one.session()
+    for number in range(1, 4):
+        ask(one, session, number, f"voxel(leaf={number}.0)")
+    assert len(one.store.warm) == len(one.store.versions) == 3
+    for resident in list(one.books.residents()):
+        one.store.evict(resident, one.now_s())
+    assert one.store.warm == {}
+    assert one.store.versions == {}
+    assert len(ask(one, session, 9, "voxel(leaf=1.0)").cells) == 2
