@@ -20,6 +20,8 @@ Factory = Callable[..., DaemonProcess]
 README = (ROOT / "clients" / "README.md").read_text(encoding="utf-8")
 BLOCKS = dict(re.findall(r"^<!-- ([\w-]+) -->\n```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL))
 EXPECTED = {
+    "ndt": r"\d+ Gaussians, NVTL \d",
+    "pose-init": r"score \d+\.\d+, reliable: (True|False)",
     "compare": r"\d{4,6} points are not in the map",
     "elevation": r"lowest points ahead: \[.*\d",
     "elevation-whole": r"36 cells, \d+ of \d+ columns",
