@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final
 
-from shmmap import BadRequest, Cell, MapWindow, NoAnswer, ShmmapError, canonical_layer
+from shmmap import BadRequest, Cell, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
 from shmmap_clients.ndt_scan_matcher.voxel_cell import VoxelCell, cell_from_layer
 from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
 
@@ -130,7 +130,7 @@ class MapUpdater:
             self.rules.map_radius,
             layers=self.rules.layer,
             shape="square",
-            update_distance=self.rules.update_distance,
+            update_distance=0.0,  # when to ask is decided here
             refresh_interval=_REFRESH_S,
             background=False,
             name=name,
@@ -139,6 +139,7 @@ class MapUpdater:
         self._latest: tuple[VoxelMap, tuple[float, float]] | None = None
         self._changed = threading.Condition()
         self._asked: tuple[float, float, float, float] | None = None
+        self._failed: tuple[float, float, float, float] | None = None
         self._error: ShmmapError | None = None
         self._closing = False
         self._busy = False
@@ -190,8 +191,7 @@ class MapUpdater:
             )
             if self._latest is not None and not reached:
                 self.too_slow += 1
-            due = self._latest is None or self._distance(x, y) > rules.update_distance
-            if due or self._asked is None:
+            if self._distance(x, y) > rules.update_distance:
                 self._asked = (x, y, vx, vy)
                 self._changed.notify_all()
             if not reached:
@@ -234,8 +234,11 @@ class MapUpdater:
                     return
                 asked, self._asked = self._asked, None
                 self._busy = True
-                if asked is None and self._latest is not None:
+                if asked is None and self._failed is not None:
+                    asked = self._failed
+                elif asked is None and self._latest is not None:
                     asked = (*self._latest[1], 0.0, 0.0)  # has the map itself changed?
+                self._failed = None
             if asked is not None:
                 self._update(*asked)
             with self._changed:
@@ -245,16 +248,19 @@ class MapUpdater:
     def _update(self, x: float, y: float, vx: float, vy: float) -> None:
         begin_s = time.perf_counter()
         try:
-            # the window's own distance rule counts from its last answer, as ours does
             self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
             cells = self._window.cells
             if not cells and not self._window.complete:
                 raise NoAnswer("none of the cells could be had", hint="`shmmap status` tells why")
             request_s = time.perf_counter() - begin_s
             known = {cell.id: self._voxels(cell) for cell in cells}
-        except ShmmapError as error:
+        except Exception as error:  # noqa: BLE001  # a thread that ended would keep all scans waiting
             with self._changed:
-                self._error = error
+                if isinstance(error, ShmmapError):
+                    self._error = error
+                else:
+                    self._error = InternalError(f"the map's update failed: {error!r}")
+                self._failed = (x, y, vx, vy)
                 self._changed.notify_all()
             return
         before = self._latest
@@ -280,6 +286,8 @@ class MapUpdater:
             self._known = known
             self._error = None
             self._latest = (voxel_map, (x, y))
+            if self._asked is not None and self._distance(*self._asked[:2]) <= self.rules.update_distance:
+                self._asked = None  # asked again while this was on its way
             self._changed.notify_all()
 
     def _voxels(self, cell: Cell) -> tuple[Cell, VoxelCell]:
