@@ -92,10 +92,10 @@ class CrowdControl:
     def beat(self, now_s: float) -> None:
         """Look at memory and descriptors; called a few times a second."""
         self._gate.look_again(now_s)
-        used = memory_bytes()
+        used = memory_bytes() or self._trimmed_bytes
         if used - self._trimmed_bytes > TRIM_BYTES and now_s >= self._trim_again_s:
             self._libc.malloc_trim(0)
-            used = self._trimmed_bytes = memory_bytes()
+            used = self._trimmed_bytes = memory_bytes() or used
             self._trim_again_s = now_s + TRIM_INTERVAL_S
         self._trimmed_bytes = min(self._trimmed_bytes, used)
         self._heavy = used - self._first_bytes > MEMORY_ALLOWANCE_BYTES
@@ -163,6 +163,9 @@ class CrowdControl:
 
 
 def memory_bytes() -> int:
-    """Resident memory of this process, without what it shares."""
-    fields = Path("/proc/self/statm").read_text().split()
+    """Resident memory of this process, without what it shares; 0 while no descriptor is left to ask with."""
+    try:
+        fields = Path("/proc/self/statm").read_text().split()
+    except OSError:
+        return 0
     return (int(fields[1]) - int(fields[2])) * _PAGE_BYTES

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
+import resource
 import socket
 from collections.abc import Iterator
 from typing import Final
@@ -15,8 +17,19 @@ _DIRECTORY: Final = "/proc/self/fd"
 
 
 def open_descriptors() -> list[int]:
-    """Numbers of the open descriptors."""
-    return [int(name) for name in os.listdir(_DIRECTORY)]
+    """Numbers of the open descriptors, also when none is left to read their directory with."""
+    try:
+        return [int(name) for name in os.listdir(_DIRECTORY)]
+    except OSError:
+        return [fd for fd in range(resource.getrlimit(resource.RLIMIT_NOFILE)[0]) if _is_open(fd)]
+
+
+def _is_open(fd: int) -> bool:
+    try:
+        fcntl.fcntl(fd, fcntl.F_GETFD)
+    except OSError:
+        return False
+    return True
 
 
 @contextlib.contextmanager
