@@ -23,7 +23,9 @@ NOWHERE: Final = -(1 << 31)
 """Index of a point that is not finite."""
 
 _LIMIT: Final = float((1 << 31) - 2)
-_NEAR: Final = 1e-6  # of a cell; nearer to a border the exact corners decide
+_EXACT: Final = float(1 << 52)  # units of the lattice up to here, and one cell more, are exact in float64
+# Of a cell; nearer to a border the exact corners decide.  Rounding errs by 2**31 * 2**-52 = 5e-7 at most.
+_NEAR: Final = 1e-5
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -42,9 +44,9 @@ def _compiled(function: _Function) -> _Function:
 
 
 @_compiled
-def _index(value: float, size: float, origin: float, step: int, first: int, scale: int) -> float:
+def _index(value: float, per_metre: float, origin: float, step: int, first: int, scale: int) -> float:
     """Index of the cell that holds ``value`` on one axis, as a whole float64."""
-    quotient = (value - origin) / size
+    quotient = (value - origin) * per_metre  # a division would take twice as long
     index: float = np.floor(quotient)
     part = quotient - index
     if (part < _NEAR or part > 1.0 - _NEAR) and abs(index) < _LIMIT:
@@ -78,9 +80,11 @@ def assign_cells(
     Returns
     -------
     Number of finite points, then least and greatest ix, least and greatest iy of them.  The number is
-    -1 if some point is more than 2**31 cells away.
+    -1 if some point is more than 2**31 cells or 2**52 units of the lattice away.
     """
     size, origin_x, origin_y, step, first_x, first_y, scale = lattice
+    per_metre = 1.0 / size
+    reach = _EXACT / scale
     kept = 0
     low_x = low_y = np.int64(1 << 31)
     high_x = high_y = np.int64(-(1 << 31))
@@ -92,8 +96,10 @@ def assign_cells(
             ix[row] = NOWHERE
             iy[row] = NOWHERE
             continue
-        i = _index(u, size, origin_x, step, first_x, scale)
-        j = _index(v, size, origin_y, step, first_y, scale)
+        if not (abs(u) < reach and abs(v) < reach):
+            return -1, 0, 0, 0, 0
+        i = _index(u, per_metre, origin_x, step, first_x, scale)
+        j = _index(v, per_metre, origin_y, step, first_y, scale)
         if not (abs(i) < _LIMIT and abs(j) < _LIMIT):
             return -1, 0, 0, 0, 0
         m, n = np.int64(i), np.int64(j)

@@ -19,7 +19,7 @@ from shmmap.errors import BadRequest
 
 __all__ = ["MAX_DECIMALS", "CellLattice"]
 
-MAX_DECIMALS: Final = 9
+MAX_DECIMALS: Final = 6  # so that corners up to 4.5e9 m are exact integers in float64
 _EXACT: Final = 1 << 53  # beyond, an integer is not exact in float64
 
 
@@ -47,7 +47,7 @@ class CellLattice:
         Raises
         ------
         BadRequest
-            The size is not positive, or a number has more than 9 decimals or is out of range.
+            The size is not positive, or a number has more than 6 decimals or is out of range.
         """
         if not (math.isfinite(cell_size) and cell_size > 0):
             raise BadRequest(f"the cell size must be a positive number of metres, not {cell_size!r}")
@@ -55,7 +55,7 @@ class CellLattice:
         places = max(max(0, -int(value.as_tuple().exponent)) for value in decimals)
         if places > MAX_DECIMALS:
             raise BadRequest(
-                f"cell size and origin may have {MAX_DECIMALS} decimals, not {places}",
+                f"cell size, origin and translation may have {MAX_DECIMALS} decimals, not {places}",
                 hint="round them, so that the corners are exact decimal numbers",
             )
         step, x, y = (int(value.scaleb(places)) for value in decimals)

@@ -23,7 +23,7 @@ class DivideSettings:
     Attributes
     ----------
     cell_size
-        Side of a cell, metres, at most 9 decimals.
+        Side of a cell, metres, at most 6 decimals.
     origin
         A corner of the lattice of cells, metres, in the frame of the inputs.
     translate
