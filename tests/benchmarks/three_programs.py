@@ -6,7 +6,7 @@ windows move, jump from tile to tile, and cells come and go in a budget that hol
 map.  Printed are each program's times and own memory, how much of that grew in the last third, shared
 memory, and what was lost or left.  A machine of two cores shows mostly how they share them.
 
-    python -m tests.benchmarks.three_programs DATA [--minutes 10] [--tiles 10] [--budget-mib 600] [--out DIR]
+    python -m tests.benchmarks.three_programs [DATA] [--minutes 4] [--tiles 4] [--budget-mib 300]
 
 DATA holds ``kitti0005_map`` and ``kitti0005_scans``.
 """
@@ -58,12 +58,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("data", type=Path, metavar="DATA")
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--tiles", type=int, default=10)
-    parser.add_argument("--budget-mib", type=int, default=600)
+    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="default: SHMMAP_TEST_DATA")
+    parser.add_argument("--minutes", type=float, default=4.0)
+    parser.add_argument("--tiles", type=int, default=4)
+    parser.add_argument("--budget-mib", type=int, default=300)
     parser.add_argument("--out", type=Path, help="where ndt.svg and compare.svg go")
     args = parser.parse_args()
+    if args.data is None:
+        args.data = Path(os.environ["SHMMAP_TEST_DATA"])
     trajectory = read_trajectory(args.data / "kitti0005_scans" / "poses_heldout_tum.txt")
     sequence = list(ScanSequence(args.data / "kitti0005_scans", trajectory))
     corners = tile_corners(args.tiles)

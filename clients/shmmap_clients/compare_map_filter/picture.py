@@ -21,6 +21,7 @@ _CAPTION_PX: Final = 64.0
 _MARGIN: Final = 2.0  # metres
 _REMOVED: Final = (178, 186, 194)
 _KEPT: Final = (214, 40, 40)
+_MOST: Final = 1 << 20  # pixels that are remembered before they are made twice as large
 _OFFSET: Final = 1 << 30  # makes indices positive; two of them fit one int64
 
 
@@ -35,6 +36,7 @@ class TopView:
 
     def __init__(self, pixel: float = 0.1) -> None:
         self._pixel = pixel
+        self._offset = _OFFSET
         self._kept = np.empty(0, np.int64)
         self._removed = np.empty(0, np.int64)
         self._path: list[tuple[float, float]] = []
@@ -42,17 +44,28 @@ class TopView:
     def add(self, xyz: NDArray[Any], kept: NDArray[np.bool_], position: tuple[float, float]) -> None:
         """Add a scan: (N, 3) and (N,), metres, map frame; and where it was taken."""
         places = np.floor(xyz[:, :2].astype(np.float64) / self._pixel)
-        finite = np.isfinite(places).all(axis=1) & (np.abs(places) < _OFFSET).all(axis=1)
-        index = places[finite].astype(np.int64) + _OFFSET
+        finite = np.isfinite(places).all(axis=1) & (np.abs(places) < self._offset).all(axis=1)
+        index = places[finite].astype(np.int64) + self._offset
         packed = (index[:, 1] << 32) | index[:, 0]
         mine = kept[finite]
         self._kept = np.union1d(self._kept, packed[mine])
         self._removed = np.union1d(self._removed, packed[~mine])
         self._path.append(position)
+        while len(self._kept) + len(self._removed) > _MOST:
+            self._coarsen()
+
+    def _coarsen(self) -> None:
+        """Make pixels twice as large: memory does not grow with the length of the drive."""
+        self._pixel *= 2
+        self._offset //= 2
+        self._kept, self._removed = (
+            np.unique(((packed >> 33) << 32) | ((packed & 0xFFFFFFFF) >> 1))
+            for packed in (self._kept, self._removed)
+        )
 
     def svg(self, title: str, note: str) -> str:
         """Return the picture, north up, with a scale and two lines of text below."""
-        removed, kept = _unpacked(self._removed), _unpacked(self._kept)
+        removed, kept = (_unpacked(packed) - self._offset for packed in (self._removed, self._kept))
         both = np.concatenate([removed, kept])
         if not len(both):
             both = np.zeros((1, 2), np.int64)
@@ -111,4 +124,4 @@ def _legend(x: float, y: float, colour: str, text: str) -> str:
 
 
 def _unpacked(packed: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.stack([packed & 0xFFFFFFFF, packed >> 32], axis=1) - _OFFSET
+    return np.stack([packed & 0xFFFFFFFF, packed >> 32], axis=1)

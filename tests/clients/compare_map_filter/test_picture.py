@@ -90,3 +90,21 @@ def test_kept_points_are_red_on_top_of_grey(shift: tuple[float, float]) -> None:
 
 def test_a_picture_of_nothing() -> None:
     ElementTree.fromstring(TopView().svg("nothing", ""))
+
+
+def test_a_long_drive_takes_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmmap_clients.compare_map_filter.picture._MOST", 500)
+    fine, view = np.random.default_rng(3).uniform(-40, 40, (4000, 3)), TopView(0.1)
+    kept = fine[:, 0] > 0
+    for part in range(0, 4000, 400):
+        view.add(fine[part : part + 400], kept[part : part + 400], (0.0, 0.0))
+    assert len(view._kept) + len(view._removed) <= 500
+    whole = TopView(view._pixel)
+    whole.add(fine, kept, (0.0, 0.0))
+    assert np.array_equal(view._kept + (_shift(whole) - _shift(view)), whole._kept)
+    assert view.svg("a", "b").count("<image") == 1
+
+
+def _shift(view: TopView) -> int:
+    """What the offset of a view's indices makes of its packed pixels."""
+    return (view._offset << 32) + view._offset
