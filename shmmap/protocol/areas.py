@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where, with what intent, and what the client has already: the parts that requests for cells share."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import msgspec
+
+from shmmap import geometry
+
+__all__ = [
+    "AreaMessage",
+    "BoxMessage",
+    "CircleMessage",
+    "HeldCell",
+    "Intent",
+    "SquareMessage",
+    "area_from_message",
+    "area_to_message",
+]
+
+
+class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
+    """True circle; z range absent when either bound is nil."""
+
+    x: float
+    y: float
+    radius: float
+    z_min: float | None = None
+    z_max: float | None = None
+
+
+class SquareMessage(msgspec.Struct, array_like=True, tag="square", frozen=True):
+    """Autoware's square of half-side ``radius``."""
+
+    x: float
+    y: float
+    radius: float
+    z_min: float | None = None
+    z_max: float | None = None
+
+
+class BoxMessage(msgspec.Struct, array_like=True, tag="box", frozen=True):
+    """Axis-aligned rectangle."""
+
+    min_x: float
+    min_y: float
+    max_x: float
+    max_y: float
+    z_min: float | None = None
+    z_max: float | None = None
+
+
+AreaMessage: TypeAlias = CircleMessage | SquareMessage | BoxMessage
+
+
+def area_from_message(message: AreaMessage) -> geometry.Area:
+    """Return the area a message describes; `BadRequest` if it makes no sense."""
+    z = None
+    if message.z_min is not None and message.z_max is not None:
+        z = geometry.ZRange(message.z_min, message.z_max)
+    if isinstance(message, CircleMessage):
+        return geometry.Circle(message.x, message.y, message.radius, z)
+    if isinstance(message, SquareMessage):
+        return geometry.AutowareSquare(message.x, message.y, message.radius, z)
+    return geometry.Box(message.min_x, message.min_y, message.max_x, message.max_y, z)
+
+
+def area_to_message(area: geometry.Area) -> AreaMessage:
+    """Return the message that describes an area."""
+    z = (area.z.min, area.z.max) if area.z is not None else (None, None)
+    if isinstance(area, geometry.Circle):
+        return CircleMessage(area.x, area.y, area.radius, *z)
+    if isinstance(area, geometry.AutowareSquare):
+        return SquareMessage(area.x, area.y, area.radius, *z)
+    return BoxMessage(area.min_x, area.min_y, area.max_x, area.max_y, *z)
+
+
+class Intent(msgspec.Struct, array_like=True, frozen=True):
+    """Where a client is and where it goes: metres and metres per second, map frame.
+
+    ``route`` is the polyline ahead, (x, y) each.
+    """
+
+    x: float
+    y: float
+    vx: float = 0.0
+    vy: float = 0.0
+    heading: float | None = None
+    route: tuple[tuple[float, float], ...] = ()
+
+
+class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """A cell the client says it has: version nil means "the current one", layers nil "all asked for"."""
+
+    id: str
+    version: int | None = None
+    layers: tuple[str, ...] | None = None
