@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import resource
 from typing import Final
 
 __all__ = ["MIN_MEMORY_BYTES", "memory_left", "peak_memory_bytes"]
@@ -23,5 +22,12 @@ def memory_left(limit_bytes: int) -> int:
 
 
 def peak_memory_bytes() -> int:
-    """Most memory that this process ever had resident."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+    """Most memory that this program ever had resident.
+
+    From ``VmHWM``: ``ru_maxrss`` would begin with the memory of whoever started the process.
+    """
+    with open("/proc/self/status", "rb") as file:
+        for line in file:
+            if line.startswith(b"VmHWM:"):
+                return int(line.split()[1]) << 10
+    raise OSError("/proc/self/status has no VmHWM")
