@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 
@@ -19,7 +20,10 @@ from tests.support.skips import (  # noqa: F401  hooks
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile kernels once for all tests and the processes they start, whatever their home is."""
+    """Compile kernels once for all tests and their processes, whatever their home is; heed Ctrl-C."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # a shell's background job ignores SIGINT, and so would the programs it starts for the tests
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if "NUMBA_CACHE_DIR" not in os.environ:
         cache = getattr(config, "cache", None)
         path = (
@@ -28,7 +32,6 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["NUMBA_CACHE_DIR"] = str(path)
         if cache is None:
             config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs root where we are not."""
