@@ -56,7 +56,7 @@ def test_every_block_is_tested() -> None:
 
 def test_benchmarks_start() -> None:
     install, *runs = block("benchmarks")
-    assert install.endswith("'.[bench]'")
+    assert install.endswith("'.[test]'")
     assert {f"`{line.rsplit('.', 1)[1]}`" for line in runs} == set(
         re.findall(r"\| (`\w+`) \|$", README, re.M)
     )
