@@ -33,6 +33,7 @@ def pytest_configure(config: pytest.Config) -> None:
         if cache is None:
             config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
 
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs root where we are not."""
     if os.geteuid() != 0:

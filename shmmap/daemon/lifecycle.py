@@ -72,6 +72,7 @@ from shmmap.daemon.service_manager import ServiceManager, status_line
 from shmmap.daemon.sessions import Sessions
 from shmmap.daemon.start_signals import KEEP_SIGNAL, STOP_SIGNALS, StartSignals, ignore_signals
 from shmmap.daemon.store import Store
+from shmmap.daemon.time_slices import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.workers import WorkerPool
 from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
@@ -256,6 +257,7 @@ class _Life:
         activated: ActivatedSocket | None,
     ) -> None:
         """Bind, say READY, answer requests until told to stop."""
+        take_slices(SERVING_SLICE_NS)  # ZeroMQ's thread inherits it
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
         socket.setsockopt(zmq.LINGER, 200)

@@ -19,6 +19,7 @@ from typing import Final
 
 from shmmap.daemon import jobs
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS
+from shmmap.daemon.time_slices import take_slices
 from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
@@ -210,6 +211,7 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     signal.signal(signal.SIGIO, signal.SIG_IGN)
     os.nice(_NICENESS)
+    take_slices(0)  # the short ones are for those who serve
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
         score.write(_OOM_SCORE)
     channel = socket.socket(fileno=channel_fd)
