@@ -48,10 +48,8 @@ def main() -> None:
                 del reply
                 cell = None  # type: ignore[assignment]
                 time.sleep(rng.expovariate(1 / PAUSE_S))
-            for pair in held.values():
-                _check(*pair)
-            held.clear()
-            del pair
+            while held:
+                _check(*held.popitem()[1])
 
 
 def _check(cell: object, checksum: int) -> None:
