@@ -5,7 +5,8 @@ The kernel says who maps which segment (``/proc/PID/maps``), the oracle says who
 believes has to agree after every step, nothing mapped may ever have lost its name, and the bytes
 have to be those of the version they claim to be.
 
-``SHMMAP_TEST_STEPS`` and ``SHMMAP_TEST_SEED`` choose another length and another life.
+``SHMMAP_TEST_STEPS`` and ``SHMMAP_TEST_SEED`` choose another length and another life; a long one takes
+``-o faulthandler_timeout=0``.
 """
 
 from __future__ import annotations
