@@ -16,6 +16,11 @@ __all__ = ["InstanceLock"]
 class InstanceLock:
     """An exclusive ``flock`` on a file, held for the daemon's life and removed with it.
 
+    Parameters
+    ----------
+    says_who
+        Write the process id into the file, for the message to whoever comes second.
+
     Raises
     ------
     InstanceBusy
@@ -24,7 +29,7 @@ class InstanceLock:
         The file cannot be made.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, *, says_who: bool = True) -> None:
         self.path = path
         while True:
             try:
@@ -46,7 +51,8 @@ class InstanceLock:
             os.close(fd)  # its owner removed it just before we got the lock: try the new file
         self._fd = fd
         os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+        if says_who:
+            os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
         """Remove the file and let the next daemon in.

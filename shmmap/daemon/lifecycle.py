@@ -124,7 +124,8 @@ def run(config: DaemonConfig) -> int:
             lock = InstanceLock(_lock_path(path))
             stack.callback(lock.release)
             # a second one beside the segments: two runtime directories may share a directory of segments
-            shm_lock = InstanceLock(directory.path + lock_name(config.instance))
+            # empty: a single byte would take a page that the budget does not know
+            shm_lock = InstanceLock(directory.path + lock_name(config.instance), says_who=False)
             stack.callback(shm_lock.release)
             stack.callback(ignore_signals)  # without the locks no name is ours to take away
             step("daemon.lock")
