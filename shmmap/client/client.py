@@ -228,28 +228,27 @@ class Client:
         """
         message = messages.area_to_message(area) if area is not None else None
         for _ in range(_LISTING_ROUNDS):
-            rows: list[messages.MetadataRow] = []
-            first: messages.MetadataPage | None = None
+            listing: MapListing | None = None
             start: int | None = 0
             while start is not None:
                 page = self._session.ask(
                     lambda n, at=start: messages.Metadata(n, message, since, at, _PAGE_ROWS),  # type: ignore[misc]
                     messages.MetadataPage,
                 )
-                first = first or page
-                if page.map_version != first.map_version:
+                if listing is None:
+                    listing = MapListing(
+                        self._session.welcome.id_prefix,
+                        map_version=page.map_version,
+                        since_known=page.since_known,
+                        removed=tuple(self._session.whole_id(cell) for cell in page.removed),
+                    )
+                elif page.map_version != listing.map_version:
                     break  # a reload came in between: pages of two states do not fit together
-                rows += page.rows
+                listing.add(page.rows)
                 start = page.next
             else:
-                assert first is not None  # noqa: S101  the loop ran at least once
-                return MapListing(
-                    rows,
-                    self._session.welcome.id_prefix,
-                    map_version=first.map_version,
-                    since_known=first.since_known,
-                    removed=tuple(self._session.whole_id(cell) for cell in first.removed),
-                )
+                assert listing is not None  # noqa: S101  the loop ran at least once
+                return listing
         raise NoAnswer("the map changed again and again while it was being listed")
 
     def stats(self) -> messages.StatsReply:

@@ -3,8 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple, overload
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.protocol.messages import MetadataRow
 
@@ -26,7 +31,7 @@ class CellInfo(NamedTuple):
 
 
 class MapListing(Sequence[CellInfo]):
-    """Cells of the map in id order, all from one map version.
+    """Cells of the map in id order, all from one map version; some ninety bytes for each.
 
     Attributes
     ----------
@@ -39,35 +44,51 @@ class MapListing(Sequence[CellInfo]):
     """
 
     def __init__(
-        self,
-        rows: Sequence[MetadataRow],
-        id_prefix: str,
-        *,
-        map_version: int,
-        since_known: bool,
-        removed: tuple[str, ...],
+        self, id_prefix: str, *, map_version: int, since_known: bool, removed: tuple[str, ...]
     ) -> None:
-        self._rows = rows
         self._prefix = id_prefix
         self.map_version = map_version
         self.since_known = since_known
         self.removed = removed
+        self._ids = bytearray()
+        self._ends = array("Q", [0])
+        self._versions = array("Q")
+        self._boxes = array("d")
+        self._source_bytes = array("Q")
+        self._z_bounds = array("d")
 
-    def _info(self, row: MetadataRow) -> CellInfo:
-        z_bounds = None if row.z_min is None or row.z_max is None else (row.z_min, row.z_max)
+    def add(self, rows: Iterable[MetadataRow]) -> None:
+        """Append one page of the daemon's answer."""
+        for row in rows:
+            self._ids += row.id.encode()
+            self._ends.append(len(self._ids))
+            self._versions.append(row.version)
+            self._boxes.extend((row.min_x, row.min_y, row.max_x, row.max_y))
+            self._source_bytes.append(row.source_bytes)
+            self._z_bounds.extend(math.nan if z is None else z for z in (row.z_min, row.z_max))
+
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """Boxes of all cells, (N, 4): min_x, min_y, max_x, max_y, metres, map frame."""
+        return np.array(self._boxes).reshape(-1, 4)
+
+    def _info(self, index: int) -> CellInfo:
+        cell = self._ids[self._ends[index] : self._ends[index + 1]].decode()
+        min_x, min_y, max_x, max_y = self._boxes[4 * index : 4 * index + 4]
+        z_min, z_max = self._z_bounds[2 * index : 2 * index + 2]
         return CellInfo(
-            row.id if row.id.startswith("/") else self._prefix + row.id,
-            row.version,
-            (row.min_x, row.min_y, row.max_x, row.max_y),
-            row.source_bytes,
-            z_bounds,
+            cell if cell.startswith("/") else self._prefix + cell,
+            self._versions[index],
+            (min_x, min_y, max_x, max_y),
+            self._source_bytes[index],
+            None if math.isnan(z_min + z_max) else (z_min, z_max),
         )
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._versions)
 
     def __iter__(self) -> Iterator[CellInfo]:
-        return map(self._info, self._rows)
+        return map(self._info, range(len(self)))
 
     @overload
     def __getitem__(self, index: int) -> CellInfo: ...
@@ -76,6 +97,5 @@ class MapListing(Sequence[CellInfo]):
     def __getitem__(self, index: slice) -> list[CellInfo]: ...
 
     def __getitem__(self, index: int | slice) -> CellInfo | list[CellInfo]:
-        if isinstance(index, slice):
-            return [self._info(row) for row in self._rows[index]]
-        return self._info(self._rows[index])
+        chosen = range(len(self))[index]
+        return [self._info(n) for n in chosen] if isinstance(chosen, range) else self._info(chosen)

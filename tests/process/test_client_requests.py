@@ -146,6 +146,16 @@ def test_metadata_and_what_changed_since(daemon: Factory, divided_map: DividedMa
         assert [cell.id for cell in listing] == sorted(divided_map.id(name) for name in divided_map.corners)
         assert listing[0].box == divided_map.box(Path(listing[0].id).name)
         assert listing[3:5] == list(listing)[3:5]
+        assert listing[-1] == list(listing)[-1]
+        assert listing.boxes.tolist() == [list(cell.box) for cell in listing]
+        assert all(cell.z_bounds is None for cell in listing)
+        assert [cell.source_bytes for cell in listing] == [Path(c.id).stat().st_size for c in listing]
+        loaded = client.around(*divided_map.corners["0_0.pcd"], 1).cells
+        bounds = {cell.id: cell.z_bounds for cell in client.metadata()}
+        assert loaded
+        for cell in loaded:
+            assert bounds[cell.id] == (cell.xyz[:, 2].min(), cell.xyz[:, 2].max())
+        del loaded, cell
         inside = client.metadata(shmmap.Circle(0, 0, 25))
         assert [Path(cell.id).name for cell in inside] == divided_map.in_circle(0, 0, 25)
         rng = np.random.default_rng(5)

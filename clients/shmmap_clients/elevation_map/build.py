@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from shmmap import Cell, CellError, CellInfo, Client, LoadTimeout, MapMissing, ShmmapError
 from shmmap_clients.elevation_map.cell_columns import columns_of, heights_of
 from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.rule import ElevationRule
-from shmmap_clients.elevation_map.seams import ColumnBox, Seams
+from shmmap_clients.elevation_map.seams import ColumnBox, Seams, column_boxes
 
 __all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map", "map_key"]
 
@@ -112,12 +114,12 @@ def build_elevation_map(
     if not len(listing):
         raise MapMissing("the map has no cells")
     # row after row: only the strip between two rows has to wait
-    # (numbers alone: the listing keeps a cell in a fraction of what its `CellInfo` takes)
-    order = sorted(range(len(listing)), key=lambda n: _place(listing[n]))
+    metres = listing.boxes
+    order = np.lexsort((metres[:, 0], metres[:, 1]))
+    boxes = column_boxes(metres[order], rule.resolution)
     directory = cache / map_key(listing.map_version, rule)
-    boxes = [ColumnBox.of_box(listing[n].box, rule.resolution) for n in order]
-    first = (min(box.i0 for box in boxes), min(box.j0 for box in boxes))
-    shape = (max(box.j1 for box in boxes) - first[1], max(box.i1 for box in boxes) - first[0])
+    first = (int(boxes[:, 0].min()), int(boxes[:, 1].min()))
+    shape = (int(boxes[:, 3].max()) - first[1], int(boxes[:, 2].max()) - first[0])
     grid = ElevationGrid(directory / "heights", rule.resolution, first, shape)
     journal = Journal(directory)
     seams = Seams(boxes)
@@ -137,7 +139,7 @@ def build_elevation_map(
         if cell is not None:
             rows = columns_of(cell, rule)
             state.rows += len(rows)
-            inside = rows.inside(boxes[number])
+            inside = rows.inside(ColumnBox(*boxes[number].tolist()))
             if not inside.all():
                 state.stray += int((~inside).sum())
                 rows = rows.where(inside)
@@ -153,10 +155,6 @@ def build_elevation_map(
     client.release()
     loaded = len(order) - begun
     return BuiltElevation(grid, listing.map_version, len(order), loaded, state.stray, tuple(failed))
-
-
-def _place(cell: CellInfo) -> tuple[float, float, str]:
-    return cell.box[1], cell.box[0], cell.id
 
 
 def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:

@@ -81,21 +81,31 @@ class ElevationGrid:
             for row in range(low, high):
                 os.pwrite(file.fileno(), block[row - low].tobytes(), 4 * (row * self.shape[1] + left))
 
-    def rows(self, begin: int, end: int) -> NDArray[np.float32]:
-        """Rows ``begin`` to ``end``, (n, columns) float32; rows outside the grid are NaN, as are columns
-        without a height."""
-        low, high = max(begin, 0), min(end, self.shape[0])
-        result = np.full((end - begin, self.shape[1]), np.nan, np.float32)
-        if low < high:
+    def rows(self, begin: int, end: int, left: int = 0, right: int | None = None) -> NDArray[np.float32]:
+        """Rows ``begin`` to ``end`` of columns ``left`` to ``right`` (None: to the last), (n, m) float32.
+
+        What is outside the grid is NaN, as are columns without a height.
+        """
+        right = self.shape[1] if right is None else right
+        result = np.full((end - begin, right - left), np.nan, np.float32)
+        west, east = max(left, 0), min(right, self.shape[1])
+        if west < east:
             with open(self.path, "rb") as file:
-                wanted = 4 * (high - low) * self.shape[1]
-                data = os.pread(file.fileno(), wanted, 4 * low * self.shape[1])
-            bits = np.frombuffer(data, np.uint32) ^ _NAN_BITS
-            result[low - begin : high - begin] = bits.view(np.float32).reshape(high - low, -1)
+                for row in range(max(begin, 0), min(end, self.shape[0])):
+                    place = 4 * (row * self.shape[1] + west)
+                    bits = np.frombuffer(os.pread(file.fileno(), 4 * (east - west), place), np.uint32)
+                    result[row - begin, west - left : east - left] = (bits ^ _NAN_BITS).view(np.float32)
         return result
 
     def filled(
-        self, begin: int, end: int, fill_radius: float, margin: int = 0
+        self,
+        begin: int,
+        end: int,
+        fill_radius: float,
+        margin: int = 0,
+        *,
+        left: int = 0,
+        right: int | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Rows with holes filled, and what each value is.
 
@@ -107,22 +117,26 @@ class ElevationGrid:
             See `fill_holes`, metres; 0: nothing is filled.
         margin
             More rows on both sides.
+        left, right
+            Columns; None: to the last.
 
         Returns
         -------
-        (n, columns) float32 metres, and (n, columns) uint8: `NOTHING`, `MEASURED` or `FILLED`.
+        (n, m) float32 metres, and (n, m) uint8: `NOTHING`, `MEASURED` or `FILLED`.
         """
+        right = self.shape[1] if right is None else right
         reach = fill_reach(fill_radius / self.resolution)
-        around = self.rows(begin - margin - reach, end + margin + reach)
-        inner = slice(reach, len(around) - reach)
-        kind = np.where(np.isnan(around[inner]), NOTHING, MEASURED).astype(np.uint8)
+        around = self.rows(begin - margin - reach, end + margin + reach, left - reach, right + reach)
+        inner = (slice(reach, around.shape[0] - reach), slice(reach, around.shape[1] - reach))
+        heights = around[inner]
+        kind = np.where(np.isnan(heights), NOTHING, MEASURED).astype(np.uint8)
         if reach:
             heights = fill_holes(around, fill_radius / self.resolution)[inner]
-            row = np.arange(begin - margin, end + margin)
-            heights[(row < 0) | (row >= self.shape[0])] = np.nan  # nothing is filled beyond the grid
+            # nothing is filled beyond the grid
+            row, column = np.arange(begin - margin, end + margin), np.arange(left, right)
+            heights[(row < 0) | (row >= self.shape[0])] = np.nan
+            heights[:, (column < 0) | (column >= self.shape[1])] = np.nan
             kind[(kind == NOTHING) & ~np.isnan(heights)] = FILLED
-        else:
-            heights = around[inner]
         return heights, kind
 
     def blocks(

@@ -128,6 +128,7 @@ def _geotiff(
             interim, _tiles(grid, fill_radius), shape=grid.shape, dtype=np.float32, tile=(_TILE, _TILE),
             photometric="minisblack", compression="zlib", metadata=None,
             description=json.dumps(document), extratags=tags, bigtiff=math.prod(grid.shape) > 1 << 29,
+            maxworkers=1,  # several would have a quarter of a gigabyte of tiles waiting for them
         )  # fmt: skip
         interim.replace(path)
     finally:
@@ -138,13 +139,9 @@ def _tiles(grid: ElevationGrid, fill_radius: float) -> Iterator[NDArray[np.float
     """Tiles from the north-west, row by row; those at the edges are full as well."""
     rows, columns = grid.shape
     for top in range(0, rows, _TILE):
-        strip, _ = grid.filled(rows - top - _TILE, rows - top, fill_radius)
-        strip = strip[::-1]
         for left in range(0, columns, _TILE):
-            tile = np.full((_TILE, _TILE), np.nan, np.float32)
-            part = strip[:, left : left + _TILE]
-            tile[:, : part.shape[1]] = part
-            yield tile
+            tile, _ = grid.filled(rows - top - _TILE, rows - top, fill_radius, left=left, right=left + _TILE)
+            yield np.ascontiguousarray(tile[::-1])
 
 
 def _png(path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str, Any]) -> None:

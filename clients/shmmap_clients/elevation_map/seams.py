@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ColumnBox", "Columns", "Seams"]
+__all__ = ["ColumnBox", "Columns", "Seams", "column_boxes"]
 
 # beyond its box to which a cell may have points, by rounding: metres, and what float32 coordinates add
 _MARGIN: Final = 1e-3
@@ -26,25 +25,24 @@ class ColumnBox(NamedTuple):
     i1: int
     j1: int
 
-    @classmethod
-    def of_box(cls, box: tuple[float, float, float, float], resolution: float) -> ColumnBox:
-        """The columns that a cell's box (metres) touches."""
-        margin = _MARGIN + _ROUNDING * max(abs(value) for value in box)
-        low = [math.floor((value - margin) / resolution) for value in box[:2]]
-        high = [math.floor((value + margin) / resolution) + 1 for value in box[2:]]
-        return cls(low[0], low[1], high[0], high[1])
-
-    def common(self, other: ColumnBox) -> ColumnBox | None:
-        """What both have, None where that is nothing."""
-        box = ColumnBox(
+    def common(self, other: ColumnBox) -> ColumnBox:
+        """What both have; they must have something."""
+        return ColumnBox(
             max(self.i0, other.i0), max(self.j0, other.j0), min(self.i1, other.i1), min(self.j1, other.j1)
         )
-        return box if box.i0 < box.i1 and box.j0 < box.j1 else None
 
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns)."""
         return self.j1 - self.j0, self.i1 - self.i0
+
+
+def column_boxes(boxes: NDArray[np.float64], resolution: float) -> NDArray[np.int64]:
+    """The columns that cells touch, (N, 4) int64, each row a `ColumnBox`; ``boxes`` (N, 4), metres."""
+    margin = _MARGIN + _ROUNDING * np.abs(boxes).max(axis=1, keepdims=True)
+    low = np.floor((boxes[:, :2] - margin) / resolution)
+    high = np.floor((boxes[:, 2:] + margin) / resolution) + 1
+    return np.hstack([low, high]).astype(np.int64)
 
 
 @dataclass(slots=True)
@@ -76,35 +74,34 @@ class Columns:
         )
 
 
-@dataclass(slots=True)
 class Seams:
     """Holds back what later cells may add to.
 
-    Attributes
+    Parameters
     ----------
     boxes
-        Columns that each cell touches, in the order in which cells come.
+        (N, 4) int64: the `ColumnBox` of each cell, in the order in which cells come.
+
+    Attributes
+    ----------
     waiting
         Rows held back, by the cell that brought them last.
     """
 
-    boxes: Sequence[ColumnBox]
-    waiting: dict[int, Columns] = field(default_factory=dict)
-    _bins: dict[tuple[int, int], list[int]] = field(default_factory=dict)
-    _edge: int = 1
+    def __init__(self, boxes: NDArray[np.int64]) -> None:
+        self.waiting: dict[int, Columns] = {}
+        self._boxes = boxes
+        self._by_row = np.argsort(boxes[:, 1], kind="stable")
+        self._rows = boxes[self._by_row, 1]
+        self._tallest = int((boxes[:, 3] - boxes[:, 1]).max(initial=0))
 
-    def __post_init__(self) -> None:
-        if self.boxes:
-            self._edge = int(np.median([max(box.shape) for box in self.boxes]))
-        for number, box in enumerate(self.boxes):
-            for place in self._places(box):
-                self._bins.setdefault(place, []).append(number)
-
-    def _places(self, box: ColumnBox) -> Iterable[tuple[int, int]]:
-        edge = self._edge
-        for j in range(box.j0 // edge, (box.j1 - 1) // edge + 1):
-            for i in range(box.i0 // edge, (box.i1 - 1) // edge + 1):
-                yield i, j
+    def _near(self, number: int, box: ColumnBox) -> list[tuple[int, ColumnBox]]:
+        """The other cells that share columns with a cell, and which columns."""
+        begin, end = np.searchsorted(self._rows, (box.j0 - self._tallest, box.j1))
+        some = self._by_row[begin:end]
+        i0, j0, i1, j1 = self._boxes[some].T
+        some = some[(i0 < box.i1) & (i1 > box.i0) & (j0 < box.j1) & (j1 > box.j0) & (some != number)]
+        return [(n, ColumnBox(*self._boxes[n].tolist()).common(box)) for n in some.tolist()]
 
     def add(self, number: int, rows: Columns | None) -> Columns | None:
         """Take the rows of cell ``number``, the next in order; return what nobody adds to any more.
@@ -116,13 +113,12 @@ class Seams:
         rows
             All in the cell's box; None: it has none.
         """
-        box = self.boxes[number]
-        near = {other for place in self._places(box) for other in self._bins[place]} - {number}
-        shared = [(other, self.boxes[other].common(box)) for other in near]
+        box = ColumnBox(*self._boxes[number].tolist())
+        shared = self._near(number, box)
         parts = [] if rows is None or not len(rows) else [rows]
-        for other, common in shared:
+        for other, _ in shared:
             held = self.waiting.get(other)
-            if common is None or held is None:
+            if held is None:
                 continue
             mine = held.inside(box)
             if mine.any():
@@ -137,7 +133,7 @@ class Seams:
         every = Columns.joined(parts)
         open_columns = np.zeros(box.shape, np.bool_)
         for other, common in shared:
-            if common is not None and other > number:
+            if other > number:
                 open_columns[
                     common.j0 - box.j0 : common.j1 - box.j0, common.i0 - box.i0 : common.i1 - box.i0
                 ] = True

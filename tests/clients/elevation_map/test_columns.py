@@ -14,7 +14,7 @@ from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
 from shmmap_clients.elevation_map.grid import FILLED, MEASURED, NOTHING, ElevationGrid
 from shmmap_clients.elevation_map.holes import fill_holes
 from shmmap_clients.elevation_map.rule import ElevationRule
-from shmmap_clients.elevation_map.seams import ColumnBox, Columns, Seams
+from shmmap_clients.elevation_map.seams import Columns, Seams, column_boxes
 from shmmap_clients.elevation_map.surface import surface_heights
 
 from shmmap import BadRequest
@@ -77,6 +77,22 @@ def test_rules_are_checked() -> None:
             ElevationRule(rule, resolution, min_points=points)
 
 
+def test_cells_of_any_size_find_who_shares_their_columns() -> None:
+    rng = np.random.default_rng(6)
+    low = rng.integers(-60, 60, (80, 2))
+    boxes = np.hstack([low, low + rng.integers(1, 30, (80, 2))])
+    seams = Seams(boxes)
+    for number, box in enumerate(boxes):
+        j, i = np.mgrid[box[1] : box[3], box[0] : box[2]]
+        seams.add(number, Columns(i.ravel(), j.ravel(), np.full(i.size, number)))
+        left = {(i, j) for rows in seams.waiting.values() for i, j in zip(rows.i, rows.j, strict=True)}
+        come, coming = (
+            {(i, j) for b in part for i in range(b[0], b[2]) for j in range(b[1], b[3])}
+            for part in (boxes[: number + 1], boxes[number + 1 :])
+        )
+        assert left == come & coming
+
+
 @pytest.mark.parametrize("order", ["rows", "random", "reverse"])
 @pytest.mark.parametrize("resolution", [0.3, 0.5, 0.7])
 def test_every_column_is_released_once_and_whole(order: str, resolution: float) -> None:
@@ -88,7 +104,8 @@ def test_every_column_is_released_once_and_whole(order: str, resolution: float) 
         corners.reverse()
     elif order == "random":
         corners = [corners[n] for n in rng.permutation(len(corners))]
-    seams = Seams([ColumnBox.of_box((x, y, x + 20, y + 20), resolution) for x, y in corners])
+    boxes = column_boxes(np.array([(x, y, x + 20, y + 20) for x, y in corners]), resolution)
+    seams = Seams(boxes)
     seen: dict[tuple[int, int], list[int]] = {}
     peak = 0
     for number, (x, y) in enumerate(corners):
@@ -114,7 +131,7 @@ def test_every_column_is_released_once_and_whole(order: str, resolution: float) 
 
 
 def test_a_cell_without_rows_still_ends_what_waits_for_it() -> None:
-    seams = Seams([ColumnBox(0, 0, 5, 5), ColumnBox(4, 0, 9, 5)])
+    seams = Seams(np.array([(0, 0, 5, 5), (4, 0, 9, 5)]))
     rows = Columns(np.array([4, 1]), np.array([2, 2]), np.array([7.0, 8.0]))
     first = seams.add(0, rows)
     assert first is not None
@@ -175,13 +192,18 @@ def test_blocks_fill_as_the_whole_does(tmp_path: Path) -> None:
         assert np.array_equal(kind == MEASURED, ~np.isnan(heights[begin:end]))
         assert np.array_equal(kind == NOTHING, np.isnan(whole[begin:end]))
         assert ((kind == FILLED) == (~np.isnan(values) & np.isnan(heights[begin:end]))).all()
+    for left, right in ((0, 7), (7, 30), (-4, 3), (25, 41)):
+        values, kind = grid.filled(-5, 31, 1.0, left=left, right=right)
+        expected = np.pad(whole, ((5, 0), (4, 11)), constant_values=np.nan)[:36, left + 4 : right + 4]
+        assert np.array_equal(values, expected, equal_nan=True)
+        assert np.array_equal(kind == NOTHING, np.isnan(expected))
     plain, kind = grid.filled(5, 9, 0.0)
     assert np.array_equal(plain, heights[5:9], equal_nan=True)
     assert FILLED not in kind
 
 
 def test_a_checkpoint_brings_back_what_waits(tmp_path: Path) -> None:
-    boxes = [ColumnBox(0, 0, 5, 5), ColumnBox(4, 0, 9, 5), ColumnBox(8, 0, 12, 5)]
+    boxes = np.array([(0, 0, 5, 5), (4, 0, 9, 5), (8, 0, 12, 5)])
 
     def rows(*i: int) -> Columns:
         values: NDArray[Any] = np.array([[n, 0.5, 1.5] for n in i], np.float32)

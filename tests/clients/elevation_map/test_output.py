@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,26 @@ def test_light_comes_from_the_north_west() -> None:
 
     flat = grey(0 * x)
     assert grey(0.3 * (x - y)) > flat > grey(0.3 * (y - x))  # facing the light: descending to the north-west
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".tif", ".png", "shade"])
+def test_a_larger_grid_takes_no_more_memory(tmp_path: Path, suffix: str) -> None:
+    def peak_bytes(side: int) -> int:
+        grid = ElevationGrid.create(tmp_path / f"grid{side}", 0.5, (0, 0), (side, side))
+        i = np.arange(0, side, 2)
+        grid.put(i, i, i / 7.0)
+        tracemalloc.start()
+        try:
+            if suffix == "shade":
+                write_hillshade(tmp_path / "h.png", grid, 1.0)
+            else:
+                write_elevation(tmp_path / f"e{suffix}", grid, 1.0, DOCUMENT)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak_bytes(100)  # imports
+    assert peak_bytes(2000) < 1.5 * peak_bytes(600) < 10e6
 
 
 def test_an_empty_grid_and_unknown_suffixes(tmp_path: Path) -> None:

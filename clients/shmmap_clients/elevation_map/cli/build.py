@@ -76,32 +76,32 @@ def run(args: argparse.Namespace) -> int:
             raise shmmap.BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
     if not args.fill_radius >= 0:
         raise shmmap.BadRequest(f"--fill-radius must not be negative, it is {args.fill_radius}")
-    progress = None if args.quiet else _ProgressLine()
-    with shmmap.connect(args.endpoint, name="shmmap-elevation", shm_dir=args.shm_dir) as client:
-        for attempt in range(_ATTEMPTS):
-            try:
-                built = build_elevation_map(
-                    client, rule, _cache(args.cache), wait_s=args.wait, progress=progress
-                )
-                break
-            except MapChanged:
-                if attempt == _ATTEMPTS - 1:
-                    raise
-    if progress is not None:
-        progress.end()
-    grid = built.grid
-    document = {
-        "map_version": f"{built.map_version:016x}",
-        "rule": rule.document,
-        "fill_radius": args.fill_radius,
-    }
-    for path in files:
-        write_elevation(path, grid, args.fill_radius, document, epsg=args.epsg)
-    if args.hillshade:
-        write_hillshade(Path(args.hillshade), grid, args.fill_radius)
-    counts = np.zeros(3, np.int64)
-    for _, _, kind in grid.blocks(args.fill_radius):
-        counts += np.bincount(kind.ravel(), minlength=3)
+    with _ProgressLine(quiet=args.quiet) as progress:
+        with shmmap.connect(args.endpoint, name="shmmap-elevation", shm_dir=args.shm_dir) as client:
+            for attempt in range(_ATTEMPTS):
+                try:
+                    built = build_elevation_map(
+                        client, rule, _cache(args.cache), wait_s=args.wait, progress=progress
+                    )
+                    break
+                except MapChanged:
+                    if attempt == _ATTEMPTS - 1:
+                        raise
+        grid = built.grid
+        document = {
+            "map_version": f"{built.map_version:016x}",
+            "rule": rule.document,
+            "fill_radius": args.fill_radius,
+        }
+        for path in files:
+            progress.say(f"writing {path}")
+            write_elevation(path, grid, args.fill_radius, document, epsg=args.epsg)
+        if args.hillshade:
+            progress.say(f"writing {args.hillshade}")
+            write_hillshade(Path(args.hillshade), grid, args.fill_radius)
+        counts = np.zeros(3, np.int64)
+        for _, _, kind in grid.blocks(args.fill_radius):
+            counts += np.bincount(kind.ravel(), minlength=3)
     summary = {
         "map_version": document["map_version"],
         "cells": built.cells,
@@ -140,22 +140,31 @@ def _cache(named: str | None) -> Path:
 class _ProgressLine:
     """One line that is written over on a terminal, and a line now and then elsewhere."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
         self._terminal = sys.stderr.isatty()
         self._next_s = 0.0
-        self._shown = False
+        self._shown = ""
+
+    def __enter__(self) -> _ProgressLine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._terminal and self._shown:
+            print(file=sys.stderr)
 
     def __call__(self, progress: BuildProgress) -> None:
         now_s = time.monotonic()
-        if now_s < self._next_s and progress.done < progress.cells:
-            return
-        self._next_s = now_s + (_EVERY_S if self._terminal else 10 * _EVERY_S)
-        text = f"{progress.done} of {progress.cells} cells, {progress.rows} rows"
-        print(f"\r{text}" if self._terminal else text, end="" if self._terminal else "\n", file=sys.stderr)
-        sys.stderr.flush()
-        self._shown = True
+        if now_s >= self._next_s or progress.done == progress.cells:
+            self._next_s = now_s + (_EVERY_S if self._terminal else 10 * _EVERY_S)
+            self.say(f"{progress.done} of {progress.cells} cells, {progress.rows} rows")
 
-    def end(self) -> None:
-        """Leave the line."""
-        if self._terminal and self._shown:
-            print(file=sys.stderr)
+    def say(self, text: str) -> None:
+        """Show what is being done."""
+        if self._quiet:
+            return
+        if self._terminal:
+            print("\r" + text.ljust(len(self._shown)), end="", file=sys.stderr, flush=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+        self._shown = text
