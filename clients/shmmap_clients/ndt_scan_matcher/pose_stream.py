@@ -9,19 +9,19 @@ read.
 from __future__ import annotations
 
 import threading
-from types import TracebackType
 
 import msgspec
 import numpy as np
-import zmq
 
 from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.follower import Frame
 from shmmap_clients.scans.trajectory import Trajectory
+from shmmap_clients.streams import Publisher, Subscriber
 
 __all__ = ["OdometryListener", "PoseMessage", "PosePublisher", "decode_pose"]
 
 _VERSION = 1
+_QUEUE = 1000  # messages that wait for a slow reader; what comes meanwhile is lost
 _LINGER_MS = 2000
 _POLL_MS = 100
 _KEPT = 10_000  # odometry entries
@@ -62,7 +62,7 @@ def decode_pose(message: bytes) -> PoseMessage:
     return pose
 
 
-class PosePublisher:
+class PosePublisher(Publisher):
     """Binds an endpoint and publishes a message per scan.
 
     Raises
@@ -72,34 +72,7 @@ class PosePublisher:
     """
 
     def __init__(self, endpoint: str) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.XPUB)
-        self._socket.linger = _LINGER_MS
-        try:
-            self._socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self.close()
-            raise BadRequest(f"cannot bind {endpoint}: {error}") from None
-
-    def __enter__(self) -> PosePublisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def wait_for_listener(self, timeout_s: float) -> bool:
-        """Wait until somebody has subscribed; False if nobody has in time."""
-        if not self._socket.poll(int(timeout_s * 1000)):
-            return False
-        self._socket.recv()
-        return True
-
-    def close(self) -> None:
-        """Deliver what is queued and close."""
-        self._socket.close()
-        self._context.term()
+        super().__init__(endpoint, queue=_QUEUE, linger_ms=_LINGER_MS)
 
     def send(self, frame: Frame) -> None:
         """Publish a frame's pose."""
@@ -114,7 +87,7 @@ class PosePublisher:
             transform_probability=result.transform_probability,
             nvtl=result.nvtl,
         )
-        self._socket.send(_encoder.encode(message))
+        self.publish([_encoder.encode(message)])
 
 
 class OdometryListener:
@@ -127,16 +100,7 @@ class OdometryListener:
     """
 
     def __init__(self, endpoint: str) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
-        self._socket.linger = 0
-        try:
-            self._socket.connect(endpoint)
-        except zmq.ZMQError as error:
-            self._socket.close()
-            self._context.term()
-            raise BadRequest(f"cannot connect to {endpoint}: {error}") from None
-        self._socket.subscribe(b"")
+        self._subscriber = Subscriber(endpoint, queue=_QUEUE)
         self._entries: list[PoseMessage] = []
         self._closing = threading.Event()
         self._heard = threading.Condition()
@@ -147,8 +111,7 @@ class OdometryListener:
         """Stop listening."""
         self._closing.set()
         self._thread.join()
-        self._socket.close()
-        self._context.term()
+        self._subscriber.close()
 
     def wait_for(self, entries: int, timeout_s: float) -> bool:
         """Wait until so many entries were heard; False if they were not in time."""
@@ -165,9 +128,9 @@ class OdometryListener:
 
     def _listen(self) -> None:
         while not self._closing.is_set():
-            if self._socket.poll(_POLL_MS):
+            if self._subscriber.poll(_POLL_MS):
                 try:
-                    entry = decode_pose(self._socket.recv())
+                    entry = decode_pose(self._subscriber.receive()[0])
                 except BadRequest:
                     continue  # somebody else's message
                 with self._heard:

@@ -9,21 +9,20 @@ order of the frames.  ``"last": true`` (without columns) says that no more scans
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Any, Final
 
 import msgspec
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
 from shmmap_clients.scans.scan_sequence import Scan
+from shmmap_clients.streams import Publisher, Subscriber
 
 __all__ = ["ScanPublisher", "ScanSubscriber", "decode_scan", "encode_scan"]
 
 _VERSION: Final = 1
-_QUEUE: Final = 64  # scans that wait for a slow reader before the oldest are lost
+_QUEUE: Final = 64  # scans that wait for a slow reader; what comes meanwhile is lost
 _LINGER_MS: Final = 10_000
 
 
@@ -88,7 +87,7 @@ def decode_scan(frames: list[bytes]) -> Scan | None:
     return Scan(head.name, head.stamp_s, columns, pose)
 
 
-class ScanPublisher:
+class ScanPublisher(Publisher):
     """Sends scans to whoever listens.
 
     Parameters
@@ -103,44 +102,14 @@ class ScanPublisher:
     """
 
     def __init__(self, endpoint: str) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.XPUB)
-        self._socket.sndhwm = _QUEUE
-        self._socket.linger = _LINGER_MS
-        try:
-            self._socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self._socket.close(0)
-            self._context.term()
-            raise BadRequest(f"cannot bind {endpoint}: {error}") from None
-        self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
-
-    def __enter__(self) -> ScanPublisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def wait_for_listener(self, timeout_s: float) -> bool:
-        """Wait until somebody has subscribed; False if nobody has in time."""
-        if not self._socket.poll(int(timeout_s * 1000)):
-            return False
-        self._socket.recv()
-        return True
+        super().__init__(endpoint, queue=_QUEUE, linger_ms=_LINGER_MS)
 
     def send(self, scan: Scan | None) -> None:
         """Send a scan; None: the last one was sent."""
-        self._socket.send_multipart(encode_scan(scan))
-
-    def close(self) -> None:
-        """Deliver what is queued (ten seconds at most) and close."""
-        self._socket.close()
-        self._context.term()
+        self.publish(encode_scan(scan))
 
 
-class ScanSubscriber:
+class ScanSubscriber(Subscriber):
     """Scans from a publisher: iterate until it sends the last one.
 
     Parameters
@@ -155,35 +124,13 @@ class ScanSubscriber:
     """
 
     def __init__(self, endpoint: str) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
-        self._socket.rcvhwm = _QUEUE
-        self._socket.linger = 0
-        try:
-            self._socket.connect(endpoint)
-        except zmq.ZMQError as error:
-            self.close()
-            raise BadRequest(f"cannot connect to {endpoint}: {error}") from None
-        self._socket.subscribe(b"")
-
-    def __enter__(self) -> ScanSubscriber:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        super().__init__(endpoint, queue=_QUEUE)
 
     def __iter__(self) -> ScanSubscriber:
         return self
 
     def __next__(self) -> Scan:
-        scan = decode_scan(self._socket.recv_multipart())
+        scan = decode_scan(self.receive())
         if scan is None:
             raise StopIteration
         return scan
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._socket.close(0)
-        self._context.term()
