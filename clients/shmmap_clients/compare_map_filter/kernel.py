@@ -6,45 +6,34 @@ Importing this module compiles the kernel, or loads it from numba's cache (tenth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
 from shmmap_clients.compare_map_filter.numpy_path import SLACK
 from shmmap_clients.compare_map_filter.rule import VOXEL, VOXEL_DISTANCE
+from shmmap_clients.compare_map_filter.search_table import (
+    ADDRESS_START,
+    ADDRESS_TILE,
+    ADDRESS_XYZ,
+    FIRST_X,
+    FIRST_Y,
+    IS_DOUBLE,
+    TILES_X,
+    TILES_Y,
+)
+from shmmap_clients.compiling import compiled, float32_at, float64_at, int32_at, read_only
 
 __all__ = ["explain"]
-
-
-def _loader(result: types.Type, llvm_type: ir.Type) -> Any:
-    @intrinsic
-    def load(_context: Any, _address: types.Type, _index: types.Type) -> tuple[Any, Callable[..., Any]]:
-        """Return element ``_index`` of the array that starts at ``_address``."""
-
-        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-            pointer = builder.inttoptr(arguments[0], llvm_type.as_pointer())
-            return builder.load(builder.gep(pointer, [arguments[1]]))
-
-        return result(types.int64, types.int64), generate
-
-    return load
-
-
-_float32_at = _loader(types.float32, ir.FloatType())
-_float64_at = _loader(types.float64, ir.DoubleType())
-_int32_at = _loader(types.int32, ir.IntType(32))
 
 
 @numba.njit(inline="always")
 def _coordinate(address: Any, double: Any, index: Any) -> Any:
     if double:
-        return _float64_at(address, index)
-    return np.float64(_float32_at(address, index))
+        return float64_at(address, index)
+    return np.float64(float32_at(address, index))
 
 
 @numba.njit(inline="always")
@@ -59,31 +48,26 @@ def _first_above(address: Any, double: Any, begin: Any, end: Any, z: Any) -> Any
     return begin
 
 
-def _readonly(dtype: types.Type, dimensions: int) -> types.Array:
-    # a read-only array is another type: without it the first scan out of shared memory would compile anew
-    return types.Array(dtype, dimensions, "C", readonly=True)
-
-
 _ARGUMENTS: Final = (
-    _readonly(types.float64, 2),  # T_map_sensor
+    read_only(types.float64, 2),  # T_map_sensor
     types.int64,  # mode
     types.float64,  # distance
     types.float64,  # distance along z
     types.float64,  # leaf
-    _readonly(types.int64, 2),  # rows of the table
+    read_only(types.int64, 2),  # rows of the table
     types.int64,  # columns in a bin
     types.int64,  # first bin, x
     types.int64,  # first bin, y
     types.int64,  # bins along x
     types.int64,  # bins along y
-    _readonly(types.int32, 1),  # bin_start
-    _readonly(types.int32, 1),  # bin_cells
+    read_only(types.int32, 1),  # bin_start
+    read_only(types.int32, 1),  # bin_cells
     types.boolean[::1],  # result
 )
-_SIGNATURES: Final = [types.void(_readonly(t, 2), *_ARGUMENTS) for t in (types.float32, types.float64)]
+_SIGNATURES: Final = [types.void(read_only(t, 2), *_ARGUMENTS) for t in (types.float32, types.float64)]
 
 
-@numba.njit(_SIGNATURES, nogil=True, cache=True, error_model="numpy")
+@compiled(*_SIGNATURES, error_model="numpy")
 def explain(
     points: Any, T: Any, mode: Any, d: Any, d_z: Any, leaf: Any, rows: Any, bin_columns: Any,
     bin_first_x: Any, bin_first_y: Any, bins_x: Any, bins_y: Any, bin_start: Any, bin_cells: Any,
@@ -121,13 +105,13 @@ def explain(
         found = False
         for entry in range(bin_start[at], bin_start[at + 1]):
             cell = bin_cells[entry]
-            first_x, first_y = rows[cell, 5], rows[cell, 6]
-            tiles_x, tiles_y = rows[cell, 3], rows[cell, 4]
+            first_x, first_y = rows[cell, FIRST_X], rows[cell, FIRST_Y]
+            tiles_x, tiles_y = rows[cell, TILES_X], rows[cell, TILES_Y]
             from_x, to_x = max(low_x, first_x), min(high_x, first_x + tiles_x * 8 - 1)
             from_y, to_y = max(low_y, first_y), min(high_y, first_y + tiles_y * 8 - 1)
             if from_x > to_x or from_y > to_y:
                 continue
-            address, double = rows[cell, 0], rows[cell, 7] != 0
+            address, double = rows[cell, ADDRESS_XYZ], rows[cell, IS_DOUBLE] != 0
             # its own column first: most points of a scan are explained there
             width = to_x - from_x + 1
             columns = width * (to_y - from_y + 1)
@@ -145,12 +129,12 @@ def explain(
                 c_x = from_x + place % width
                 c_y = from_y + place // width
                 right, up = c_x - first_x, c_y - first_y
-                tile = np.int64(_int32_at(rows[cell, 1], (up >> 3) * tiles_x + (right >> 3)))
+                tile = np.int64(int32_at(rows[cell, ADDRESS_TILE], (up >> 3) * tiles_x + (right >> 3)))
                 if tile < 0:
                     continue
                 column = tile * 64 + (up & 7) * 8 + (right & 7)
-                begin = np.int64(_int32_at(rows[cell, 2], column))
-                end = np.int64(_int32_at(rows[cell, 2], column + 1))
+                begin = np.int64(int32_at(rows[cell, ADDRESS_START], column))
+                end = np.int64(int32_at(rows[cell, ADDRESS_START], column + 1))
                 if begin == end:
                     continue
                 row = _first_above(address, double, begin, end, low_z)

@@ -13,9 +13,21 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap_clients.compare_map_filter.search_cell import SearchCell
 
-__all__ = ["SearchTable"]
+__all__ = [
+    "ADDRESS_START",
+    "ADDRESS_TILE",
+    "ADDRESS_XYZ",
+    "FIRST_X",
+    "FIRST_Y",
+    "IS_DOUBLE",
+    "TILES_X",
+    "TILES_Y",
+    "SearchTable",
+]
 
 _MAX_BINS: Final = 1 << 16
+
+# What lies where in a row of the table.
 ADDRESS_XYZ, ADDRESS_TILE, ADDRESS_START, TILES_X, TILES_Y, FIRST_X, FIRST_Y, IS_DOUBLE = range(8)
 
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
+
+from shmmap_clients.compiling import compiled, read_only
 
 __all__ = ["fill_holes", "fill_reach"]
 
@@ -48,12 +49,8 @@ def fill_holes(heights: NDArray[np.float32], radius: float) -> NDArray[np.float3
     return result
 
 
-@numba.njit(
-    types.void(
-        types.Array(types.float32, 2, "C", readonly=True), types.float64, types.int64, types.float32[:, ::1]
-    ),
-    nogil=True,
-    cache=True,
+@compiled(
+    types.void(read_only(types.float32, 2), types.float64, types.int64, types.float32[:, ::1]),
     error_model="numpy",
 )
 def _fill(heights: Any, radius: Any, reach: Any, result: Any) -> None:

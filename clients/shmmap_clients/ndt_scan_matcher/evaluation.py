@@ -23,6 +23,7 @@ __all__ = [
     "BJ",
     "CHUNK_POINTS",
     "JBJ",
+    "NEGLIGIBLE_EXPONENT",
     "SUMS",
     "A",
     "B",
@@ -48,6 +49,7 @@ JBJ: Final = slice(33, 39)
 SUMS: Final = 40  # a row, padded to whole cache lines
 
 CHUNK_POINTS: Final = 128  # summed in one go; fixed, so that the number of threads changes nothing
+NEGLIGIBLE_EXPONENT: Final = 36.7  # exp(-36.7) is less than half a unit in the last place of 1
 
 _OUTLIER_RATIO: Final = 0.55
 

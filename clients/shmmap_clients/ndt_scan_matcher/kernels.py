@@ -7,56 +7,29 @@ Importing this module compiles the kernel, or loads it from numba's cache (tenth
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, Final
 
-import numba
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
-__all__ = ["NEGLIGIBLE_EXPONENT", "accumulate", "loaded_from_cache"]
+from shmmap_clients.compiling import compiled, float64_at, int32_at, read_only
+from shmmap_clients.ndt_scan_matcher.evaluation import NEGLIGIBLE_EXPONENT
 
-NEGLIGIBLE_EXPONENT: Final = 36.7  # exp(-36.7) is less than half a unit in the last place of 1
-
-
-def _load(result: types.Type, llvm_type: ir.Type) -> Any:
-    @intrinsic
-    def load(_context: Any, _address: types.Type, _index: types.Type) -> tuple[Any, Callable[..., Any]]:
-        """Return element ``_index`` of the array that starts at ``_address``."""
-
-        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-            pointer = builder.inttoptr(arguments[0], llvm_type.as_pointer())
-            return builder.load(builder.gep(pointer, [arguments[1]]))
-
-        return result(types.int64, types.int64), generate
-
-    return load
-
-
-_float64_at = _load(types.float64, ir.DoubleType())
-_int32_at = _load(types.int32, ir.IntType(32))
-
-
-def _readonly(dtype: types.Type, dimensions: int) -> types.Array:
-    # a read-only array is another type: without it each attach would compile anew
-    return types.Array(dtype, dimensions, "C", readonly=True)
-
+__all__ = ["accumulate", "loaded_from_cache"]
 
 _SIGNATURE: Final = types.void(
-    _readonly(types.float64, 2),  # source
+    read_only(types.float64, 2),  # source
     types.int64,  # first chunk
     types.int64,  # last chunk
     types.int64,  # points in a chunk
-    _readonly(types.float64, 2),  # T
-    _readonly(types.float64, 3),  # derivatives of the rotation
-    _readonly(types.int64, 2),  # table
-    _readonly(types.float64, 2),  # origins
-    _readonly(types.int64, 1),  # box
-    _readonly(types.int32, 1),  # column_start
-    _readonly(types.int32, 1),  # column_cell
-    _readonly(types.int64, 2),  # columns
+    read_only(types.float64, 2),  # T
+    read_only(types.float64, 3),  # derivatives of the rotation
+    read_only(types.int64, 2),  # table
+    read_only(types.float64, 2),  # origins
+    read_only(types.int64, 1),  # box
+    read_only(types.int32, 1),  # column_start
+    read_only(types.int32, 1),  # column_cell
+    read_only(types.int64, 2),  # columns
     types.float64,  # 1 / leaf
     types.float64,  # radius squared; infinite for none
     types.float64,  # d1
@@ -67,10 +40,12 @@ _SIGNATURE: Final = types.void(
 )
 
 
-def _accumulate(  # type: ignore[no-untyped-def]  # one kernel, typed by its signature above
-    source, first, last, chunk_points, T, M, table, origins, box, column_start, column_cell, columns,
-    inverse_leaf, radius2, d1, d2, near, near_inverse, rows,
-):  # fmt: skip
+@compiled(_SIGNATURE, boundscheck=False, fastmath={"contract"})
+def accumulate(
+    source: Any, first: Any, last: Any, chunk_points: Any, T: Any, M: Any, table: Any, origins: Any,
+    box: Any, column_start: Any, column_cell: Any, columns: Any, inverse_leaf: Any, radius2: Any, d1: Any,
+    d2: Any, near: Any, near_inverse: Any, rows: Any,
+) -> None:  # fmt: skip
     """Write the sums of chunks [first, last) of the source into their rows."""
     most = near.shape[0]
     for chunk in range(first, last):
@@ -121,15 +96,15 @@ def _accumulate(  # type: ignore[no-untyped-def]  # one kernel, typed by its sig
                         cj + box[1] - table[cell, 4]
                     ) * table[cell, 8]
                     for dk in range(low, high + 1):
-                        voxel = np.int64(_int32_at(table[cell, 0], offset + dk * table[cell, 9]))
+                        voxel = np.int64(int32_at(table[cell, 0], offset + dk * table[cell, 9]))
                         if voxel < 0 or voxel >= table[cell, 10]:
                             continue
                         inverse = table[cell, 2] + voxel * 48
-                        if not _float64_at(inverse, 0) > 0.0:  # refused in this convention
+                        if not float64_at(inverse, 0) > 0.0:  # refused in this convention
                             continue
-                        dx = px - origins[cell, 0] - _float64_at(table[cell, 1], voxel * 3)
-                        dy = py - origins[cell, 1] - _float64_at(table[cell, 1], voxel * 3 + 1)
-                        dz = pz - origins[cell, 2] - _float64_at(table[cell, 1], voxel * 3 + 2)
+                        dx = px - origins[cell, 0] - float64_at(table[cell, 1], voxel * 3)
+                        dy = py - origins[cell, 1] - float64_at(table[cell, 1], voxel * 3 + 1)
+                        dz = pz - origins[cell, 2] - float64_at(table[cell, 1], voxel * 3 + 2)
                         distance2 = dx * dx + dy * dy + dz * dz
                         if distance2 > radius2:
                             continue
@@ -164,17 +139,17 @@ def _accumulate(  # type: ignore[no-untyped-def]  # one kernel, typed by its sig
                 dy = near[slot, 1]
                 dz = near[slot, 2]
                 inverse = near_inverse[slot]
-                c00 = _float64_at(inverse, 0)
-                c01 = _float64_at(inverse, 1)
-                c02 = _float64_at(inverse, 2)
-                c11 = _float64_at(inverse, 3)
-                c12 = _float64_at(inverse, 4)
-                c22 = _float64_at(inverse, 5)
+                c00 = float64_at(inverse, 0)
+                c01 = float64_at(inverse, 1)
+                c02 = float64_at(inverse, 2)
+                c11 = float64_at(inverse, 3)
+                c12 = float64_at(inverse, 4)
+                c22 = float64_at(inverse, 5)
                 q0 = c00 * dx + c01 * dy + c02 * dz
                 q1 = c01 * dx + c11 * dy + c12 * dz
                 q2 = c02 * dx + c12 * dy + c22 * dz
                 exponent = 0.5 * d2 * (dx * q0 + dy * q1 + dz * q2)
-                if not (exponent >= 0.0 and exponent < 36.7):
+                if not (exponent >= 0.0 and exponent < NEGLIGIBLE_EXPONENT):
                     continue
                 e = math.exp(-exponent)
                 share = -d1 * e
@@ -285,18 +260,6 @@ def _accumulate(  # type: ignore[no-untyped-def]  # one kernel, typed by its sig
         row[36] = r11
         row[37] = r12
         row[38] = r22
-
-
-def _compiled(function: Callable[..., None]) -> Callable[..., None]:
-    settings: dict[str, Any] = {"nogil": True, "boundscheck": False, "fastmath": {"contract"}}
-    try:
-        kernel: Callable[..., None] = numba.njit(_SIGNATURE, cache=True, **settings)(function)
-    except RuntimeError:  # nowhere to keep a cache: compile each time rather than fail
-        kernel = numba.njit(_SIGNATURE, **settings)(function)
-    return kernel
-
-
-accumulate: Final = _compiled(_accumulate)
 
 
 def loaded_from_cache() -> bool:

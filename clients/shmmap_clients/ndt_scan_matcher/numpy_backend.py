@@ -18,6 +18,7 @@ from shmmap_clients.ndt_scan_matcher.evaluation import (
     AX,
     BJ,
     JBJ,
+    NEGLIGIBLE_EXPONENT,
     SUMS,
     A,
     B,
@@ -31,7 +32,6 @@ from shmmap_clients.ndt_scan_matcher.voxel_map import Covariance, VoxelMap
 
 __all__ = ["NumpyBackend"]
 
-_NEGLIGIBLE_EXPONENT: Final = 36.7  # as in the compiled kernel
 _BLOCK_POINTS: Final = 4096  # keeps intermediate arrays within the caches
 
 
@@ -170,7 +170,7 @@ class NumpyBackend:
         q = np.matmul(C, d[:, :, None])[:, :, 0]
         exponent = 0.5 * gauss.d2 * (d * q).sum(axis=1)
         e = np.exp(-exponent)
-        e[~((exponent >= 0.0) & (exponent < _NEGLIGIBLE_EXPONENT))] = 0.0
+        e[~((exponent >= 0.0) & (exponent < NEGLIGIBLE_EXPONENT))] = 0.0
         share = -gauss.d1 * e
         w = gauss.d1 * gauss.d2 * e
         starts = np.flatnonzero(np.r_[True, point[1:] != point[:-1]])

@@ -25,5 +25,6 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     from shmmap_clients.compare_map_filter import kernel
 
-    print(f"{len(kernel.explain.signatures)} variants ready after {time.perf_counter() - begin:.1f} s")
+    variants = len(kernel.explain.signatures)  # type: ignore[attr-defined]
+    print(f"{variants} variants ready after {time.perf_counter() - begin:.1f} s")
     return 0
