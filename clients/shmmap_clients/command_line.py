@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the programs' command lines share: verbs, how errors are answered, numbers in lists."""
+"""What the programs' command lines share: verbs, options, how errors are answered."""
 
 from __future__ import annotations
 
@@ -9,11 +9,24 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
 from shmmap import InternalError, ShmmapError
 
-__all__ = ["Verb", "numbers", "print_json", "run_command", "run_program"]
+if TYPE_CHECKING:
+    from shmmap import Client
+
+__all__ = [
+    "Verb",
+    "add_daemon_options",
+    "add_json_option",
+    "add_scan_option",
+    "connect",
+    "numbers",
+    "print_json",
+    "run_command",
+    "run_program",
+]
 
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_BROKEN_PIPE: Final = 141
@@ -53,9 +66,38 @@ def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
     return parse
 
 
+def add_daemon_options(parser: argparse.ArgumentParser) -> None:
+    """Add what finds the daemon; see `connect`."""
+    group = parser.add_argument_group("which daemon")
+    group.add_argument(
+        "--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL (default: as for shmmap)"
+    )
+    group.add_argument(
+        "--shm-dir", metavar="DIR", help="directory of the segments (default: where the daemon says)"
+    )
+
+
+def connect(args: argparse.Namespace, name: str) -> Client:
+    """Open a session with the daemon that the options name."""
+    import shmmap
+
+    return shmmap.connect(args.endpoint, name=name, shm_dir=args.shm_dir)
+
+
+def add_scan_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--scan``, a file as `shmmap_clients.scans.scan_file` reads it."""
+    parser.add_argument("--scan", required=True, metavar="FILE", help="PCD, NPZ (xyz or xyz_4mm), KITTI .bin")
+
+
+def add_json_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add ``--json``."""
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+
+
 def print_json(value: object) -> None:
     """Print one JSON document; a number JSON cannot hold (NaN, infinity) is a defect."""
-    json.dump(value, sys.stdout, indent=2 if sys.stdout.isatty() else None, allow_nan=False)
+    indent = 2 if sys.stdout.isatty() else None
+    json.dump(value, sys.stdout, indent=indent, allow_nan=False, ensure_ascii=False)
     sys.stdout.write("\n")
 
 

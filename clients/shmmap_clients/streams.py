@@ -11,10 +11,15 @@ import zmq
 
 from shmmap import BadRequest
 
-__all__ = ["Publisher", "Subscriber"]
+__all__ = ["Publisher", "Subscriber", "is_endpoint"]
 
 _Publisher = TypeVar("_Publisher", bound="Publisher")
 _Subscriber = TypeVar("_Subscriber", bound="Subscriber")
+
+
+def is_endpoint(text: str) -> bool:
+    """Whether this is an address, not a file or directory."""
+    return "://" in text
 
 
 class Publisher:

@@ -58,7 +58,8 @@ def test_a_drive_whose_window_moves(drive: TownDrive, daemon: DaemonFactory) -> 
 
 def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
     one = daemon(drive.map_dir)
-    words = ["follow", "--endpoint", one.endpoint, "--scans", str(drive.scans), "--truth", str(drive.truth)]
+    words = ["follow", "--endpoint", one.endpoint, "--shm-dir", one.shm_dir]
+    words += ["--scans", str(drive.scans), "--truth", str(drive.truth)]
     # the drive is 72 m long: no map is outrun, however fast
     words += ["--update-distance", "20", "--map-radius", "200", "--lidar-radius", "100", "--thin", "0.5"]
     words += ["--steady", "--odometry", str(drive.truth), "--tum", str(tmp_path / "out.tum")]

@@ -61,7 +61,8 @@ def test_a_place_without_map_is_no_answer(town: TownDrive, daemon: DaemonFactory
 def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
     one = daemon(town.map_dir)
     x, y, z, _, _, yaw = town.poses[2]
-    program = [sys.executable, "-m", "shmmap_clients.pose_initializer", "--endpoint", one.endpoint]
+    program = [sys.executable, "-m", "shmmap_clients.pose_initializer"]
+    program += ["--endpoint", one.endpoint, "--shm-dir", one.shm_dir]
     words = [
         "--scan",
         str(town.scans / "scan_0002.npz"),

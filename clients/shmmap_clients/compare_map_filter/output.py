@@ -14,6 +14,7 @@ from shmmap_clients.compare_map_filter.drive import ComparedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import quaternion_of
+from shmmap_clients.streams import is_endpoint
 
 __all__ = ["Output", "PcdDirectory", "Stream", "open_output"]
 
@@ -95,7 +96,7 @@ class Stream:
 
 
 def open_output(target: str, *, mask: bool, wait_s: float) -> Output:
-    """Return the output for a directory or an endpoint (what has ``://`` in it)."""
-    if "://" in target:
+    """Return the output for a directory or an endpoint."""
+    if is_endpoint(target):
         return Stream(target, mask=mask, wait_s=wait_s)
     return PcdDirectory(Path(target), mask=mask)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final
 
-from shmmap import BadRequest, Cell, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
+from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
 from shmmap_clients.ndt_scan_matcher.voxel_cell import VoxelCell, cell_from_layer
 from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
 
@@ -99,13 +99,13 @@ class MapUpdater:
 
     Parameters
     ----------
-    endpoint
-        As in `shmmap.connect`.
+    client
+        A session with the daemon, or a socket as in `shmmap.connect`: then it has a session of its own.
     rules
     prepare
         Called in the updater's thread with each new map; computes what alignments need of it.
     name
-        Of the session, for ``shmmap clients``.
+        Of its own session, for ``shmmap clients``.
 
     Raises
     ------
@@ -115,7 +115,7 @@ class MapUpdater:
 
     def __init__(
         self,
-        endpoint: str | os.PathLike[str] | None = None,
+        client: Client | str | os.PathLike[str] | None = None,
         rules: MapRules | None = None,
         *,
         prepare: Callable[[VoxelMap], VoxelMap] = lambda voxel_map: voxel_map,
@@ -126,7 +126,7 @@ class MapUpdater:
         self.too_slow = 0
         self._prepare = prepare
         self._window = MapWindow(
-            endpoint,
+            client,
             self.rules.map_radius,
             layers=self.rules.layer,
             shape="square",
@@ -155,7 +155,7 @@ class MapUpdater:
         self.close()
 
     def close(self) -> None:
-        """End the thread and the session; a map taken before stays readable."""
+        """End the thread, and the session if it is its own; a map taken before stays readable."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapWindow, NoAnswer, canonical_layer
+from shmmap import BadRequest, Client, MapWindow, NoAnswer, canonical_layer
 from shmmap_clients.ndt_scan_matcher import (
     Caps,
     NdtMatcher,
@@ -83,8 +83,8 @@ class PoseInitializer:
 
     Parameters
     ----------
-    endpoint
-        As in `shmmap.connect`.
+    client
+        A session with the daemon, or a socket as in `shmmap.connect`: then it has a session of its own.
     rules
     caps
         Of the final alignments.
@@ -99,7 +99,7 @@ class PoseInitializer:
 
     def __init__(
         self,
-        endpoint: str | os.PathLike[str] | None = None,
+        client: Client | str | os.PathLike[str] | None = None,
         rules: InitializerRules | None = None,
         *,
         caps: Caps | None = None,
@@ -115,7 +115,7 @@ class PoseInitializer:
         )
         self._fine = NdtMatcher(Settings(mode="coarse_fine"), caps=caps, backend=backend, threads=threads)
         self._window = MapWindow(
-            endpoint,
+            client,
             self.rules.map_radius,
             layers=(self._voxels, self._ground),
             shape="square",
@@ -135,7 +135,7 @@ class PoseInitializer:
         self.close()
 
     def close(self) -> None:
-        """End the session with the daemon."""
+        """Let the map go, and end the session if it is its own."""
         self._window.close()
         self._coarse.close()
         self._fine.close()

@@ -36,11 +36,6 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_s)
 
-    @property
-    def positions(self) -> NDArray[np.float64]:
-        """(N, 3), metres, map frame."""
-        return self.T_map_sensor[:, :3, 3]
-
 
 def matrix_of(translation: Iterable[float], quaternion: Iterable[float]) -> NDArray[np.float64]:
     """Return the (4, 4) pose of a translation (metres) and a quaternion (x, y, z, w), normalised.

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from shmmap_clients.command_line import numbers, print_json
+from shmmap_clients.command_line import add_json_option, add_scan_option, numbers, print_json
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
 
 __all__ = ["add_parser", "run"]
@@ -22,7 +22,7 @@ def add_parser(subparsers: Any) -> None:
         " index, their rows in the scan; with --mask all points and a column kept.",
     )
     parser.add_argument("--map", required=True, metavar="FILE", help="PCD, NPZ or any cloud file")
-    parser.add_argument("--scan", required=True, metavar="FILE", help="PCD, NPZ (xyz or xyz_4mm), KITTI .bin")
+    add_scan_option(parser)
     parser.add_argument(
         "--pose",
         type=numbers(7),
@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--out", metavar="DIR", help="write SCAN.pcd there")
     parser.add_argument("--mask", action="store_true", help="write all points, with a column kept")
     parser.add_argument("--picture", metavar="FILE", help="write an SVG of kept and removed points")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 

@@ -5,15 +5,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from shmmap_clients.command_line import print_json
+from shmmap_clients.command_line import add_daemon_options, add_json_option, connect, print_json
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from shmmap_clients.scans.scan_sequence import Scan
 
 __all__ = ["add_parser", "run"]
 
@@ -51,10 +46,8 @@ def add_parser(subparsers: Any) -> None:
     )
     output.add_argument("--picture", metavar="FILE", help="an SVG of kept and removed points")
     output.add_argument("--quiet", action="store_true", help="no line for each scan on stderr")
-    output.add_argument("--json", action="store_true", help="print one JSON document at the end")
-    daemon = parser.add_argument_group("which daemon")
-    daemon.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
-    daemon.add_argument("--shm-dir", metavar="DIR", help="directory of the segments")
+    add_json_option(output)
+    add_daemon_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -63,26 +56,25 @@ def run(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
     from pathlib import Path
 
-    import shmmap
+    from shmmap import MapWindow
     from shmmap_clients.compare_map_filter.drive import compare_drive
     from shmmap_clients.compare_map_filter.filter import CompareMapFilter
     from shmmap_clients.compare_map_filter.numpy_path import to_map
     from shmmap_clients.compare_map_filter.output import open_output
     from shmmap_clients.compare_map_filter.picture import TopView
     from shmmap_clients.compare_map_filter.statistics import DriveStatistics
+    from shmmap_clients.scans.scan_source import open_scans
+    from shmmap_clients.streams import is_endpoint
 
     rule = rule_from(args)
     compare = CompareMapFilter(rule, backend=args.backend)  # compiles before anybody waits
     statistics, view = DriveStatistics(), TopView()
-    offline = "://" not in args.scans
-    wait_s = args.wait if args.wait is not None else (30.0 if offline else None)
+    wait_s = args.wait if args.wait is not None else (None if is_endpoint(args.scans) else 30.0)
     with ExitStack() as stack:
-        scans = _scans(args, stack)
-        client = stack.enter_context(
-            shmmap.connect(args.endpoint, name="shmmap-compare", shm_dir=args.shm_dir)
-        )
+        scans = open_scans(args.scans, args.poses, stack)
+        client = stack.enter_context(connect(args, "shmmap-compare"))
         window = stack.enter_context(
-            shmmap.MapWindow(client, args.radius, layers=rule.layer, update_distance=args.update_distance)
+            MapWindow(client, args.radius, layers=rule.layer, update_distance=args.update_distance)
         )
         output = None
         if args.out:
@@ -116,17 +108,3 @@ def run(args: argparse.Namespace) -> int:
             f" {statistics.incomplete} scans with cells missing"
         )
     return 1 if statistics.incomplete or not statistics.scans else 0
-
-
-def _scans(args: argparse.Namespace, stack: Any) -> Iterable[Scan]:
-    from shmmap import BadRequest
-    from shmmap_clients.scans.scan_sequence import ScanSequence
-    from shmmap_clients.scans.scan_stream import ScanSubscriber
-    from shmmap_clients.scans.trajectory import read_trajectory
-
-    if "://" in args.scans:
-        if args.poses:
-            raise BadRequest("--poses goes with a directory of scans: those of a publisher bring their poses")
-        subscriber: ScanSubscriber = stack.enter_context(ScanSubscriber(args.scans))
-        return subscriber
-    return ScanSequence(args.scans, read_trajectory(args.poses) if args.poses else None)

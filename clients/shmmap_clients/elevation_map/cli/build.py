@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import print_json
+from shmmap_clients.command_line import add_daemon_options, add_json_option, connect, print_json
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress
@@ -52,10 +52,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--cache", metavar="DIR", help="default: $XDG_CACHE_HOME/shmmap/elevation")
     parser.add_argument("--wait", type=float, default=60.0, metavar="SECONDS", help="for one cell (60)")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
-    daemon = parser.add_argument_group("which daemon")
-    daemon.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
-    daemon.add_argument("--shm-dir", metavar="DIR", help="directory of the segments")
+    add_json_option(parser)
+    add_daemon_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -63,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     """Build and write."""
     import numpy as np
 
-    import shmmap
+    from shmmap import BadRequest
     from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
     from shmmap_clients.elevation_map.grid import FILLED, MEASURED
     from shmmap_clients.elevation_map.output import SUFFIXES, write_elevation, write_hillshade
@@ -73,11 +71,11 @@ def run(args: argparse.Namespace) -> int:
     files = [Path(name) for name in args.out]
     for path in files:
         if path.suffix.lower() not in SUFFIXES:
-            raise shmmap.BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
+            raise BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
     if not args.fill_radius >= 0:
-        raise shmmap.BadRequest(f"--fill-radius must not be negative, it is {args.fill_radius}")
+        raise BadRequest(f"--fill-radius must not be negative, it is {args.fill_radius}")
     with _ProgressLine(quiet=args.quiet) as progress:
-        with shmmap.connect(args.endpoint, name="shmmap-elevation", shm_dir=args.shm_dir) as client:
+        with connect(args, "shmmap-elevation") as client:
             for attempt in range(_ATTEMPTS):
                 try:
                     built = build_elevation_map(

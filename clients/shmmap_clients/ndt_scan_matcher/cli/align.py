@@ -6,9 +6,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from shmmap_clients.command_line import numbers, print_json
+from shmmap_clients.command_line import add_json_option, add_scan_option, numbers, print_json
 
-__all__ = ["add_parser", "run"]
+__all__ = ["add_alignment_options", "add_backend_options", "add_parser", "matcher_from", "run"]
 
 
 def add_parser(subparsers: Any) -> None:
@@ -25,7 +25,7 @@ def add_parser(subparsers: Any) -> None:
         " points, voxels, convention, neighbors, backend.",
     )
     parser.add_argument("--map", required=True, metavar="FILE", help="PCD, NPZ or any cloud file")
-    parser.add_argument("--scan", required=True, metavar="FILE", help="PCD, NPZ (xyz or xyz_4mm), KITTI .bin")
+    add_scan_option(parser)
     parser.add_argument(
         "--guess",
         type=numbers(6),
@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
     add_alignment_options(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -62,12 +62,17 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         default=None,
         help="steps that never swing to and fro, unlike the originals' (default: with --fine)",
     )
-    group.add_argument("--backend", default="numba", metavar="NAME", help="numba (default) or numpy")
-    group.add_argument("--threads", type=int, default=1, metavar="N", help="results do not depend on it")
+    add_backend_options(group)
     caps = parser.add_argument_group("caps (what exceeds one is left out and reported)")
     caps.add_argument("--max-points", type=int, metavar="N", help="points of a scan")
     caps.add_argument("--max-neighbors", type=int, metavar="N", help="voxels per point, the nearest")
     caps.add_argument("--max-voxels", type=int, metavar="N", help="voxels of the map, whole cells")
+
+
+def add_backend_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add the options that say what computes."""
+    parser.add_argument("--backend", default="numba", metavar="NAME", help="numba (default) or numpy")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="results do not depend on it")
 
 
 def matcher_from(args: argparse.Namespace) -> Any:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import numbers, print_json
+from shmmap_clients.command_line import add_daemon_options, add_json_option, connect, numbers, print_json
 from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, matcher_from
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ def add_parser(subparsers: Any) -> None:
         " trusted, or the map did not keep up.",
     )
     parser.add_argument("--scans", required=True, metavar="DIR|ENDPOINT")
-    parser.add_argument("--endpoint", metavar="PATH", help="the daemon's (default: found as by shmmap)")
     parser.add_argument(
         "--truth", metavar="FILE", help="TUM poses of the scans, to start from and compare with"
     )
@@ -59,7 +58,8 @@ def add_parser(subparsers: Any) -> None:
     out.add_argument("--tum", metavar="FILE", help="write poses in the TUM format")
     out.add_argument("--publish", metavar="ENDPOINT", help="bind a ZeroMQ publisher of poses")
     out.add_argument("--plot", metavar="FILE", help="write an SVG of way, errors and latency")
-    out.add_argument("--json", action="store_true", help="print the summary as one JSON document")
+    add_json_option(out)
+    add_daemon_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -75,11 +75,14 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
     from shmmap_clients.ndt_scan_matcher.pose_stream import OdometryListener, PosePublisher
     from shmmap_clients.ndt_scan_matcher.prediction import ConstantVelocity, Odometry, Prediction
+    from shmmap_clients.scans.scan_source import open_scans
     from shmmap_clients.scans.trajectory import read_trajectory, tum_line
+    from shmmap_clients.streams import is_endpoint
 
     frames: list[Frame] = []
     with contextlib.ExitStack() as stack:
-        scans = _scans(args, stack)
+        source = open_scans(args.scans, args.truth, stack)
+        scans = iter(_paced(source, args.rate) if args.rate and not is_endpoint(args.scans) else source)
         first = next(scans, None)
         if first is None:
             raise BadRequest("there are no scans")
@@ -92,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         prediction: Prediction
         if args.odometry is None:
             prediction = ConstantVelocity(T_first)
-        elif "://" in args.odometry:
+        elif is_endpoint(args.odometry):
             listener = OdometryListener(args.odometry)
             stack.callback(listener.close)
             prediction = Odometry(T_first, lambda: listener.trajectory)
@@ -103,7 +106,8 @@ def run(args: argparse.Namespace) -> int:
         rules = MapRules(
             args.update_distance, args.map_radius, args.lidar_radius, args.leaf, matcher.caps.voxels
         )
-        maps = stack.enter_context(MapUpdater(args.endpoint, rules, prepare=matcher.prepare))
+        client = stack.enter_context(connect(args, "shmmap-ndt"))
+        maps = stack.enter_context(MapUpdater(client, rules, prepare=matcher.prepare))
         follower = Follower(matcher, maps, prediction, thin=args.thin or None)
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
         tum = stack.enter_context(open(args.tum, "w", encoding="utf-8")) if args.tum else None
@@ -131,17 +135,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print(summary)
     return 0 if summary.trustworthy == summary.frames and not summary.too_slow else 1
-
-
-def _scans(args: argparse.Namespace, stack: contextlib.ExitStack) -> Any:
-    from shmmap_clients.scans.scan_sequence import ScanSequence
-    from shmmap_clients.scans.scan_stream import ScanSubscriber
-    from shmmap_clients.scans.trajectory import read_trajectory
-
-    if "://" in args.scans:
-        return iter(stack.enter_context(ScanSubscriber(args.scans)))
-    sequence = ScanSequence(args.scans, read_trajectory(args.truth) if args.truth else None)
-    return _paced(sequence, args.rate) if args.rate else iter(sequence)
 
 
 def _paced(scans: Any, rate: float) -> Any:

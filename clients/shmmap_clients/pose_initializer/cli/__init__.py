@@ -6,7 +6,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from shmmap_clients.command_line import numbers, print_json, run_command
+from shmmap_clients.command_line import (
+    add_daemon_options,
+    add_json_option,
+    add_scan_option,
+    connect,
+    numbers,
+    print_json,
+    run_command,
+)
+from shmmap_clients.ndt_scan_matcher.cli.align import add_backend_options
 
 __all__ = ["main"]
 
@@ -27,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scan", required=True, metavar="FILE", help="PCD, NPZ (xyz or xyz_4mm), KITTI .bin")
+    add_scan_option(parser)
     parser.add_argument("--pose", required=True, type=numbers(3), metavar="X,Y,YAW", help="metres, radians")
     parser.add_argument(
         "--z", type=float, default=0.0, metavar="M", help="where the map has no ground (default 0)"
@@ -39,7 +48,6 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--height", type=float, default=0.0, metavar="M", help="of the scanner above the ground (default 0)"
     )
-    parser.add_argument("--endpoint", metavar="PATH", help="the daemon's (default: found as by shmmap)")
     parser.add_argument("--map-radius", type=float, default=150.0, metavar="M", help="default 150")
     parser.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
     parser.add_argument("--candidates", type=int, default=200, metavar="N", help="poses scored (default 200)")
@@ -47,9 +55,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m)"
     )
-    parser.add_argument("--backend", default="numba", metavar="NAME", help="numba (default) or numpy")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="results do not depend on it")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    add_backend_options(parser)
+    add_json_option(parser)
+    add_daemon_options(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -67,7 +75,10 @@ def _run(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     scan = thinned(read_scan(args.scan), args.thin or None)
-    with PoseInitializer(args.endpoint, rules, backend=args.backend, threads=args.threads) as initializer:
+    with (
+        connect(args, "shmmap-pose-init") as client,
+        PoseInitializer(client, rules, backend=args.backend, threads=args.threads) as initializer,
+    ):
         found = initializer.initialize(scan, rough)
     result = found.result
     if args.json:
