@@ -7,15 +7,12 @@ in the cache directory where that can be written; else it is compiled at each st
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
-import numba
-import numba.core.config
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.layers.compiling import kernel_cache_directory
+from shmmap.layers.compiling import compiled
 
 __all__ = ["NOWHERE", "assign_cells", "count_cells", "scatter_rows"]
 
@@ -27,23 +24,8 @@ _EXACT: Final = float(1 << 52)  # units of the lattice up to here, and one cell 
 # Of a cell; nearer to a border the exact corners decide.  Rounding errs by 2**31 * 2**-52 = 5e-7 at most.
 _NEAR: Final = 1e-5
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
 
-
-def _compiled(function: _Function) -> _Function:
-    compiler: Any = numba.njit  # its types say that a function becomes something else
-    config: Any = numba.core.config
-    directory, before = kernel_cache_directory(), config.CACHE_DIR
-    try:
-        # numba chooses a function's cache when it is decorated, by this process-wide setting
-        config.CACHE_DIR = str(directory) if directory is not None else before
-        made: _Function = compiler(nogil=True, cache=directory is not None)(function)
-    finally:
-        config.CACHE_DIR = before
-    return made
-
-
-@_compiled
+@compiled()
 def _index(value: float, per_metre: float, origin: float, step: int, first: int, scale: int) -> float:
     """Index of the cell that holds ``value`` on one axis, as a whole float64."""
     quotient = (value - origin) * per_metre  # a division would take twice as long
@@ -58,7 +40,7 @@ def _index(value: float, per_metre: float, origin: float, step: int, first: int,
     return index
 
 
-@_compiled
+@compiled()
 def assign_cells(
     x: NDArray[Any],
     y: NDArray[Any],
@@ -124,7 +106,7 @@ def assign_cells(
     return kept, low_x, high_x, low_y, high_y
 
 
-@_compiled
+@compiled()
 def count_cells(
     ix: NDArray[np.int32],
     iy: NDArray[np.int32],
@@ -139,7 +121,7 @@ def count_cells(
             counts[(np.int64(iy[row]) - low_y) * width + (np.int64(ix[row]) - low_x)] += 1
 
 
-@_compiled
+@compiled()
 def scatter_rows(
     rows: NDArray[Any],
     ix: NDArray[np.int32],

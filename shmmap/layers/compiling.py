@@ -20,12 +20,12 @@ from typing import Any, Final, TypeVar, cast
 import numba
 import numba.core.config
 
-__all__ = ["compiled", "inlined", "kernel_cache_directory", "read_only"]
+__all__ = ["compiled", "inlined", "read_only"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def kernel_cache_directory() -> Path | None:
+def _cache_directory() -> Path | None:
     """Directory of compiled kernels, made if missing; None where none can be written."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     service = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
@@ -44,7 +44,7 @@ def kernel_cache_directory() -> Path | None:
 
 
 _config: Any = numba.core.config
-_DIRECTORY: Final = kernel_cache_directory()
+_DIRECTORY: Final = _cache_directory()
 
 
 def read_only(dtype: Any, dimensions: int) -> Any:
@@ -53,7 +53,10 @@ def read_only(dtype: Any, dimensions: int) -> Any:
 
 
 def compiled(*signatures: Any) -> Callable[[F], F]:
-    """Compile a kernel for these signatures now; it runs without the interpreter lock."""
+    """Compile a kernel for these signatures now; it runs without the interpreter lock.
+
+    Without a signature it is compiled when it is first called with arguments of new types.
+    """
 
     def compile_now(function: F) -> F:
         before = _config.CACHE_DIR
@@ -61,7 +64,7 @@ def compiled(*signatures: Any) -> Callable[[F], F]:
             # numba chooses a function's cache when it is decorated, by this process-wide setting
             _config.CACHE_DIR = str(_DIRECTORY) if _DIRECTORY is not None else before
             dispatcher = numba.njit(
-                list(signatures), nogil=True, cache=_DIRECTORY is not None, error_model="numpy"
+                list(signatures) or None, nogil=True, cache=_DIRECTORY is not None, error_model="numpy"
             )(function)
         finally:
             _config.CACHE_DIR = before
