@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import secrets
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +24,7 @@ _FORMATS = ("pcd", "npz")
 
 _JSON = """\
   {"files": [{"path", "points", "cells": [id]}]}
-Exit code: 0, or 1 when a cell could not be had; then nothing is written."""
+Exit code: 0, 1 when a cell could not be had (then nothing is written), 73 a file cannot be written."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -78,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         plan = _plan(args, found.cells, kind)
         for path, _ in plan:
             if path.exists() and not args.force:
-                raise BadRequest(f"{path} exists", hint="give another name, or --force to overwrite it")
+                raise _exists(path)
         written = []
         for path, cells in plan:
             columns = merged_columns(cells)
@@ -149,26 +147,21 @@ def _write_npz(file: IO[bytes], columns: dict[str, NDArray[Any]]) -> None:
 
 
 def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argparse.Namespace) -> None:
-    """Write one file under a temporary name; it appears whole or not at all."""
+    """Write one file; it appears whole or not at all."""
+    from shmmap.formats.durable_file import appearing_file, writing_errors
     from shmmap.formats.pcd_writer import write_pcd
 
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
+    with writing_errors(str(path)):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
-            if kind == "npz":
-                _write_npz(file, columns)
-            else:
-                write_pcd(file, columns, encoding=args.encoding)
-            file.flush()
-            os.fsync(file.fileno())
-        if args.force:
-            temporary.replace(path)
-        else:
-            os.link(temporary, path)  # unlike a rename this never replaces a file
-    except FileExistsError as error:
-        raise BadRequest(f"{path} exists", hint="give another name, or --force to overwrite it") from error
-    except OSError as error:
-        raise BadRequest(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        try:
+            with appearing_file(path, replace=args.force) as file:
+                if kind == "npz":
+                    _write_npz(file, columns)
+                else:
+                    write_pcd(file, columns, encoding=args.encoding)
+        except FileExistsError as error:
+            raise _exists(path) from error
+
+
+def _exists(path: Path) -> BadRequest:
+    return BadRequest(f"{path} exists", hint="give another name, or --force to overwrite it")

@@ -32,8 +32,9 @@ from shmmap.dividing.row_layout import AXES, RowLayout, common_rows
 from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.sources import Source, open_source
 from shmmap.dividing.stream import Stream
-from shmmap.dividing.workspace import Workspace, writing_errors
+from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
+from shmmap.formats.durable_file import writing_errors
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
 
 __all__ = ["divide"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any, Final
 
@@ -18,8 +17,8 @@ from shmmap.dividing.progress import NoProgress, Progress
 from shmmap.dividing.report import read_report
 from shmmap.dividing.row_layout import AXES, NO_MOVE, RowLayout, common_rows
 from shmmap.dividing.sources import Source, open_source
-from shmmap.dividing.workspace import flush_directory, writing_errors
 from shmmap.errors import BadRequest, CannotWrite
+from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd_writer import pcd_header, pcd_rows
 
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
@@ -129,7 +128,7 @@ def merge(
         stack.enter_context(writing_errors(out))
         _check_space(out, len(header) + points * row.itemsize)
         progress.stage("merging", points)
-        with _appearing(out) as target:
+        with appearing_file(out) as target:
             target.write(header)
             for source, move in zip(sources, moves, strict=True):
                 _append(target, source, RowLayout(row, move), encoding, progress)
@@ -154,24 +153,6 @@ def _append(file: IO[bytes], source: Source, layout: RowLayout, encoding: str, p
         left -= count
         progress.advance(count)
     source.close()  # a map has more cells than a process may have open files
-
-
-@contextlib.contextmanager
-def _appearing(path: str) -> Iterator[IO[bytes]]:
-    """A file that is there under its name only when it is complete and on the disk."""
-    directory, name = os.path.split(path)
-    interim = os.path.join(directory, f".{name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with open(interim, "xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(interim, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(interim)
-        raise
-    flush_directory(directory)
 
 
 def _check_space(out: str, needed: int) -> None:

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import errno
 import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
-from shmmap.errors import CannotWrite, InstanceBusy
+from shmmap.errors import InstanceBusy
+from shmmap.formats.durable_file import flush_directory, writing_errors
 
-__all__ = ["Workspace", "flush_directory", "writing_errors"]
+__all__ = ["Workspace"]
 
 _STATE: Final = "state.json"
 _LOCK: Final = "lock"
@@ -124,33 +123,6 @@ class Workspace:
         """Remove the directory and everything in it."""
         with contextlib.suppress(OSError):
             shutil.rmtree(self.path)
-
-
-@contextlib.contextmanager
-def writing_errors(what: str) -> Iterator[None]:
-    """Turn what the operating system refuses into `CannotWrite`, with a hint."""
-    try:
-        yield
-    except OSError as error:
-        hints = {
-            errno.ENOSPC: "free some space, or choose another disk",
-            errno.EDQUOT: "the quota of this user is used up",
-            errno.EACCES: "choose a directory that this user may write to",
-            errno.EPERM: "choose a directory that this user may write to",
-            errno.EROFS: "choose a directory that this user may write to",
-        }
-        raise CannotWrite(
-            f"{error.filename or what}: {error.strerror or error}", hint=hints.get(error.errno or 0, "")
-        ) from error
-
-
-def flush_directory(path: str) -> None:
-    """Force the names in a directory to the disk."""
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def _flush_file_system(path: str) -> None:

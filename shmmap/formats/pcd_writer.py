@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 from shmmap.formats import lzf
+from shmmap.formats.durable_file import appearing_file
 from shmmap.formats.pcd_fields import PADDING
 from shmmap.formats.pcd_header import ENCODINGS, IDENTITY_VIEWPOINT
 
@@ -63,7 +62,8 @@ def write_pcd(
     header = pcd_header(described, points, encoding, viewpoint)
     body = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[encoding]
     if isinstance(target, str | os.PathLike):
-        _replace(Path(target), header, body(fields, points))
+        with appearing_file(target) as file:
+            _write(file, header, body(fields, points))
     else:
         _write(target, header, body(fields, points))
 
@@ -190,22 +190,3 @@ def _write(file: IO[bytes], header: bytes, body: Iterator[bytes]) -> None:
     file.write(header)
     for part in body:
         file.write(part)
-
-
-def _replace(path: Path, header: bytes, body: Iterator[bytes]) -> None:
-    """Write to a temporary file in the same directory and rename it over ``path``."""
-    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
-    try:
-        with open(temporary, "xb") as file:
-            _write(file, header, body)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)

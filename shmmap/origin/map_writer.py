@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
+from shmmap.formats.durable_file import flush_directory
 from shmmap.formats.pcd_writer import write_pcd
 from shmmap.origin.metadata_text import metadata_text
 
@@ -191,13 +192,13 @@ class MapWriter:
         self._write_metadata()
         if self._durable:
             for directory in (self._cells_dir, self._partial):
-                _flush_directory(directory)
+                flush_directory(directory)
         self._refuse_existing()
         # replaces an empty directory, and fails on any other
         os.rename(self._partial, self._out_dir)
         self._open = False
         if self._durable:
-            _flush_directory(os.path.dirname(self._out_dir))
+            flush_directory(os.path.dirname(self._out_dir))
         return WrittenMap(self._out_dir, len(self._written), self._points, self._dropped)
 
     def discard(self) -> None:
@@ -310,11 +311,3 @@ def _group(ix: NDArray[np.int64], iy: NDArray[np.int64]) -> tuple[NDArray[np.int
     ordered = keys[order]
     starts = np.flatnonzero(np.concatenate(([True], ordered[1:] != ordered[:-1])))
     return order, [*starts.tolist(), len(order)]
-
-
-def _flush_directory(path: str) -> None:
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

@@ -254,6 +254,7 @@ def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     shmmap("export", "--id", "nowhere.pcd", "0_0.pcd", "-o", "other.pcd", code=1)
     shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", code=2)
     shmmap("export", "--id", "0_0.pcd", "-o", "other.xyz", code=2)
+    shmmap("export", "--id", "0_0.pcd", "-o", "out.pcd/beneath.pcd", code=73)
     (divided_map.pcd_dir / "20_0.pcd").write_bytes(b"broken")
     shmmap("export", "--id", "0_0.pcd", "20_0.pcd", "--output-dir", ".", code=1)
     assert sorted(path.name for path in shmmap.cwd.iterdir()) == ["map", "out.pcd"]
