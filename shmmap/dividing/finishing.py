@@ -43,7 +43,7 @@ def thin_out(
     Raises
     ------
     BadRequest
-        A bucket does not fit in memory.
+        A bucket does not fit in memory, or its points cannot be numbered by voxel.
     """
     _check_fits(buckets, 2 * buckets.row.itemsize + BYTES_PER_POINT, memory_bytes)
     progress.stage("thinning out", sum(buckets.counts.values()))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Final, Literal
 
 import numpy as np
@@ -130,8 +131,9 @@ def choose_frame(
     move = [0.0, 0.0, 0.0]
     for axis in range(3):
         if max(abs(low[axis]), abs(high[axis])) >= FLOAT32_REACH_M:
-            unit = step if axis < 2 else 1.0
-            move[axis] = 0.0 - round((low[axis] + high[axis]) / 2 / unit) * unit
+            unit = step if axis < 2 else Fraction(1)
+            # exactly, rounded once: a multiple of a size with decimals keeps as few of them
+            move[axis] = 0.0 - float(round((low[axis] + high[axis]) / 2 / float(unit)) * unit)
     x, y, z = move
     moved = _reach(low, high, (x, y, z))
     if moved >= FLOAT32_REACH_M:

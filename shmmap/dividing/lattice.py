@@ -106,11 +106,11 @@ class CellLattice:
             scale,
         )
 
-    def common_step(self) -> float:
+    def common_step(self) -> Fraction:
         """Smallest whole number of metres that is a whole number of cells, if below 10 km; else a cell."""
         cell = Fraction(self.step, self.scale)
         whole = cell.numerator  # cell * denominator
-        return float(whole) if whole < 10_000 else self.size
+        return Fraction(whole) if whole < 10_000 else cell
 
     def _text(self, units: int) -> str:
         whole, rest = divmod(abs(units), self.scale)

@@ -66,8 +66,8 @@ class DividedMap:
 def write_report(directory: str | os.PathLike[str], report: DividedMap) -> None:
     """Write ``report`` into a map's directory."""
     content = {"format": _FORMAT, "version": _VERSION, **asdict(report)}
-    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    Path(directory, REPORT_NAME).write_text(text, encoding="utf-8")
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"  # ASCII: a path may be no Unicode
+    Path(directory, REPORT_NAME).write_text(text, encoding="ascii")
 
 
 def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:

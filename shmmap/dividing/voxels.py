@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 from shmmap.dividing.kernels import assign_cells
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.row_layout import AXES
+from shmmap.errors import BadRequest
 
 __all__ = ["BYTES_PER_POINT", "reduce_voxels"]
 
 BYTES_PER_POINT: Final = 96
 """What reducing takes for each point, beside two copies of the points."""
 
+_MOST_KEYS: Final = (1 << 63) - 1
 _PACKED_COLOURS: Final = frozenset({"rgb", "rgba"})  # PCL keeps four bytes in a float32
 _AMOUNTS: Final = frozenset({"intensity", "red", "green", "blue", "nir"})  # integers that have a mean
 
@@ -34,6 +37,12 @@ def reduce_voxels(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.voi
         (N,) finite points.
     voxels
         Lattice in x and y; z has the same step about 0.
+
+    Raises
+    ------
+    BadRequest
+        A point is too far from the origin of the lattice, or the points too far from each other, for voxels
+        to be numbered.
     """
     if not len(rows):
         return rows
@@ -61,9 +70,15 @@ def _keys(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.int64]:
     ix, iy, iz = (np.empty(len(rows), np.int32) for _ in AXES)
     extremes = np.zeros((2, 3))
     x, y, z = (rows[axis] for axis in AXES)
-    _, low_x, _, low_y, high_y = assign_cells(x, y, z, _numbers(voxels), ix, iy, extremes)
+    level, low_x, high_x, low_y, high_y = assign_cells(x, y, z, _numbers(voxels), ix, iy, extremes)
     spare = np.empty(len(rows), np.int32)
-    _, low_z, high_z, _, _ = assign_cells(z, z, z, _numbers(flat), iz, spare, extremes)
+    upright, low_z, high_z, _, _ = assign_cells(z, z, z, _numbers(flat), iz, spare, extremes)
+    spans = (high_x - low_x + 1, high_y - low_y + 1, high_z - low_z + 1)
+    if level < 0 or upright < 0 or math.prod(spans) > _MOST_KEYS:
+        raise BadRequest(
+            f"the points span too many voxels of {voxels.size:g} m to number them",
+            hint="larger --leaf, or look for a damaged coordinate with `shmmap inspect`",
+        )
     keys: NDArray[np.int64] = ix.astype(np.int64) - low_x
     for index, low, high in ((iy, low_y, high_y), (iz, low_z, high_z)):
         keys *= high - low + 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -196,6 +197,18 @@ def test_large_float64_coordinates_are_moved(tmp_path: Path, encoding: str) -> N
     for row in rows:
         assert np.abs(np.array(row[:3]) + origin - by_time[row[-1]]).max() <= 0.0005
     assert map_rows(tmp_path / "map") == expected_rows(sorted(rows, key=lambda row: row[-1]))
+
+
+@pytest.mark.parametrize("size", [12.3457, 7.00001, 0.1])
+def test_an_automatic_frame_suits_any_cell_size(tmp_path: Path, size: float) -> None:
+    rng = np.random.default_rng(5)
+    for number, shift in enumerate(rng.uniform(2e4, 5e6, (4, 3))):
+        xyz = rng.uniform(0, 3 * size, (50, 3)) + shift
+        file, out = cloud_file(tmp_path / f"{number}.pcd", {"xyz": xyz}), tmp_path / f"map{number}"
+        made = run([file], out, cell_size=size, check=True)
+        assert dict(made.fields)["x"] == "<f4"
+        for part in made.origin[:2]:  # whole cells away: the squares of ground stay the same
+            assert Fraction(repr(part)) % Fraction(repr(size)) == 0
 
 
 def test_a_frame_that_is_kept_is_kept_exactly(tmp_path: Path) -> None:
@@ -429,6 +442,11 @@ def test_the_report_is_json_and_read_back(tmp_path: Path) -> None:
         "points": 10, "cells": made.cells, "path": str(tmp_path / "map"),
     }  # fmt: skip
     assert read_report(tmp_path) is None
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.pcd"))  # a name that is no UTF-8
+    run([cloud_file(odd, xyzircaedt(10))], tmp_path / "other")
+    other = read_report(tmp_path / "other")
+    assert other is not None
+    assert other["sources"][0]["path"] == str(odd)
     for text in ("[]", "{", json.dumps({**report, "version": 99})):
         (tmp_path / "map" / "shmmap_divide.json").write_text(text)
         with pytest.raises(MapDataError):

@@ -104,7 +104,7 @@ def test_a_moved_lattice_has_the_same_squares(size: float, move: float, index: i
 
 def test_the_common_step_is_whole_metres_and_whole_cells() -> None:
     assert [CellLattice.of(size).common_step() for size in (20.0, 12.5, 0.3, 33.33, 12.345678)] == [
-        20.0, 25.0, 3.0, 3333.0, 12.345678,
+        20, 25, 3, 3333, Fraction("12.345678"),
     ]  # fmt: skip
 
 
