@@ -116,16 +116,17 @@ def read_halo(
 ) -> tuple[NDArray[Any], tuple[tuple[SourceStamp, bytes], ...]]:
     """Read the neighbours' points within ``halo_m`` of a cell's box, (M, 3) of ``dtype``.
 
-    Also returns each neighbour's stamp and digest.  One that cannot be read has no points and a
-    digest of zeros: it must not cost its neighbours their layers.
+    Also returns each neighbour's stamp and digest.  One that cannot be read has no points, the stamp of
+    before the attempt and a digest of zeros: it must not cost its neighbours their layers.
     """
     found: list[NDArray[Any]] = [np.empty((0, 3), dtype)]
     seen: list[tuple[SourceStamp, bytes]] = []
     for path in paths:
+        before = _stamp(path)  # afterwards it may be that of a file that nobody has read
         try:
             source = read_source(path, box, ("xyz",))
         except MapDataError:
-            seen.append((_stamp(path), bytes(16)))
+            seen.append((before, bytes(16)))
             continue
         xyz = source.points.xyz
         x, y = xyz[:, 0], xyz[:, 1]

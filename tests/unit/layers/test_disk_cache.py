@@ -5,15 +5,20 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from shmmap.formats.causes import refusal
+from shmmap.layers import sources
+from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import CacheKey, LayerCache
 from shmmap.layers.making import Made, cache_key, make_layer
+from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.layout import SourceStamp
 from tests.support.divided_map import random_points
@@ -172,6 +177,33 @@ def test_an_id_that_needs_a_longer_header_is_built(one: Bench) -> None:
     made, _ = one.make(LAYERS[1], job)
     assert not made.cached
     assert made.header.header_bytes == 8192
+
+
+def test_a_neighbour_that_changes_while_it_is_read_is_built_with_later(
+    one: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layer = "normals(radius=5.0)"
+    near = one.directory / "near.pcd"
+    write_pcd(near, random_points(np.random.default_rng(1), (20, 0), 200))
+    before = SourceStamp.of(os.stat(near))
+    job = replace(one.job, neighbours=(str(near),))
+    read_source = sources.read_source
+
+    def rewritten_meanwhile(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
+        if path != str(near):
+            return read_source(path, box, needs)
+        write_pcd(near, random_points(np.random.default_rng(2), (20, 0), 201))
+        raise refusal("changed", "the file changed while it was being read", path=path)
+
+    monkeypatch.setattr(sources, "read_source", rewritten_meanwhile)
+    made, without = one.make(layer, job)
+    assert made.neighbours == (before,)  # what it knows nothing of is not the neighbour's new state
+    monkeypatch.setattr(sources, "read_source", read_source)
+    made, data = one.make(layer, job)
+    assert not made.cached
+    assert made.neighbours == (SourceStamp.of(os.stat(near)),)
+    assert data != without
+    assert one.make(layer, job)[0].cached
 
 
 def test_the_least_recently_used_go_first(one: Bench) -> None:
