@@ -312,7 +312,8 @@ class CellRequests:
             if key in wanted.refused or self._store.find_warm(index, layer, now_s) is not None:
                 continue
             if (
-                self._store.books.slot(key).failure is None
+                key not in wanted.outstanding  # it may be asked for twice
+                and self._store.books.slot(key).failure is None
                 and self._store.want(index, layer, 0.0, now_s, wanted.session.asker).load
             ):
                 wanted.outstanding.add(key)

@@ -478,3 +478,22 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
     assert one.cells.next_deadline_s() == math.inf
     assert 9 not in [reply.request for _, reply in one.replies]
     assert all(isinstance(key, Key) for key in one.settled)
+
+
+def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
+    inner: Inner, small_map: DividedMap
+) -> None:
+    """It is loaded once more, and the request is answered once."""
+    one = inner(small_map.root)
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.cells_of(1)
+    first = one.store.warm["points"][one.store.index_of("0_0.pcd") or 0]
+    wanted = ("0_0.pcd", "0_0.pcd", "20_0.pcd")
+    with loaders_standing_still(one):
+        one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
+        one.store.evict(first, one.now_s() - 1.0)
+        one.run_until(lambda: first.name not in one.books.zombies)
+    assert names(one.cells_of(2)) == list(wanted)
+    assert sum(reply.request == 2 for _, reply in one.replies) == 1
+    assert len(one.cells) == 0
