@@ -96,12 +96,9 @@ class Loading:
         """Whether asking again can help: the back-off is over, or the file has changed."""
         if now_s >= failure.retry_at_s:
             return True
-        if failure.code in SPACE_CODES:
+        if failure.code in SPACE_CODES or failure.stamp is None:
             return False
-        try:
-            return SourceStamp.of(os.stat(key.cell_id)) != failure.stamp
-        except OSError:
-            return False
+        return _stamp_of(key.cell_id) not in (failure.stamp, None)
 
     def pump(self, now_s: float) -> None:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""
@@ -255,7 +252,8 @@ class Loading:
                 continue
             if position == 0 and at_fault:
                 _log.error("loader died while it read %s: %s", job.path, how)
-                self.fail(load, "load_failed", f"{job.path}: the loader died of it ({how})", None, now_s)
+                message = f"{job.path}: the loader died of it ({how})"
+                self.fail(load, "load_failed", message, _stamp_of(job.path), now_s)
             else:
                 self.books.requeue(load)
 
@@ -307,3 +305,11 @@ class Loading:
         """The cell left the map: nobody asks for this any more, so nothing is remembered of it."""
         self.books.failed(load, None)
         self._on_settled(load.key)
+
+
+def _stamp_of(path: str) -> SourceStamp | None:
+    """What a file is now; None where it cannot be looked at."""
+    try:
+        return SourceStamp.of(os.stat(path))
+    except OSError:
+        return None

@@ -87,7 +87,11 @@ class Load:
 
 @dataclass(slots=True)
 class Failure:
-    """Why the last load of a key failed, and when asking again is worth another try."""
+    """Why the last load of a key failed, and when asking again is worth another try.
+
+    ``stamp`` is the state of the file that it failed for: another state is tried at once.  None, if it is
+    not known or nobody should look (its file system may be what hangs).
+    """
 
     code: str
     message: str

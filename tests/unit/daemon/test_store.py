@@ -54,6 +54,26 @@ def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: Divi
     assert len(one.cells_of(999).cells) == 1
 
 
+def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each try costs a loader: that somebody asks again is no reason for another one."""
+    monkeypatch.setenv("SHMMAP_TEST_WORKER", "crash:0_0.pcd")
+    one = inner(small_map.root)
+    session = one.session()
+    one.stop_clock()
+    for request, (passed_s, crashes) in enumerate([(0.0, 1), (0.99, 1), (0.02, 2), (1.98, 2), (0.03, 3)]):
+        one.offset_s += passed_s
+        one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+        assert [failure.code for failure in one.cells_of(request).failed] == ["load_failed"]
+        assert one.statistics.values["worker_crashes"] == crashes
+    path = small_map.pcd_dir / "0_0.pcd"
+    path.write_bytes(path.read_bytes())
+    one.cells.selected(session, Selected(99, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.cells_of(99)
+    assert one.statistics.values["worker_crashes"] == 4, "another state of the file is tried at once"
+
+
 class Puppet:
     """A loader whose part the test plays: a process that only sleeps, and the other end of its channel."""
 
@@ -128,6 +148,26 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     assert second.path in failure.message, "the second is what it died of"
     assert one.store.wire_id(first.cell_id) in [cell.id for cell in reply.cells]
     assert len(reply.cells) == 3
+
+
+def test_a_load_that_took_too_long_is_not_tried_again_at_once(
+    puppet: Puppet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is its file looked at: the file system may be what hangs, and would take the loop with it."""
+    one = puppet.one
+    one.stop_clock()
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
+    puppet.queue(1)
+    monkeypatch.setattr("shmmap.daemon.loading._stamp_of", lambda path: pytest.fail(f"looks at {path}"))
+    one.offset_s += 31.0
+    for request in (1, 2):
+        one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=300.0), one.now_s())
+        assert [failure.code for failure in one.cells_of(request).failed] == ["load_timeout"]
+    one.offset_s += 1.01
+    one.cells.selected(session, Selected(3, ("0_0.pcd",), wait=300.0), one.now_s())
+    assert len(one.cells_of(3).cells) == 1
+    puppet.channel.close()
 
 
 def test_done_without_a_segment(puppet: Puppet) -> None:
