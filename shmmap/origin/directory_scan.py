@@ -76,7 +76,8 @@ def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
     """List the PCD files in and among ``roots`` (absolute paths of directories and files).
 
     A file that is reached twice counts once.  Symbolic links are followed and keep their own names;
-    a directory reached twice is listed once.  Hidden directories are passed over when recursing.
+    a directory reached twice is listed once.  Hidden directories are passed over when recursing, and
+    names that are no UTF-8 everywhere.
 
     Raises
     ------
@@ -110,7 +111,7 @@ def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
             seen.add((status.st_dev, status.st_ino))
             inner = _list_directory(directory, skip, found, problems)
         except OSError as error:
-            problems.setdefault(f"cannot be listed ({error.strerror})", []).append(os.fsdecode(directory))
+            problems.setdefault(f"cannot be listed ({error.strerror})", []).append(_readable(directory))
             continue
         directories[os.fsdecode(directory)] = status
         if recursive:
@@ -131,18 +132,36 @@ def _list_directory(
     with os.scandir(directory) as entries:
         for entry in entries:
             name = entry.name
-            if entry.is_dir():
-                if not name.startswith(b"."):
-                    inner.append(entry.path)
-            elif is_pcd(name):
-                try:
-                    status = entry.stat()
-                except OSError as error:
-                    what = f"cannot be read ({error.strerror})"
-                    problems.setdefault(what, []).append(os.fsdecode(entry.path))
+            try:
+                is_directory = entry.is_dir()
+                if name.startswith(b".") if is_directory else not is_pcd(name):
                     continue
-                if stat.S_ISREG(status.st_mode):
+                status = entry.stat()
+            except OSError as error:  # a link to itself, say, or to where this user may not look
+                problem = f"cannot be read ({error.strerror})"
+            else:
+                if not _is_utf8(name):
+                    problem = "the name is no UTF-8"
+                elif is_directory:
+                    inner.append(entry.path)
+                    continue
+                elif stat.S_ISREG(status.st_mode):
                     found.add(below + name, status)
+                    continue
                 else:
-                    problems.setdefault("no regular file", []).append(os.fsdecode(entry.path))
+                    problem = "no regular file"
+            problems.setdefault(problem, []).append(_readable(entry.path))
     return inner
+
+
+def _is_utf8(name: bytes) -> bool:
+    """Whether clients can name it."""
+    try:
+        name.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _readable(path: bytes) -> str:
+    return path.decode("utf-8", "backslashreplace")

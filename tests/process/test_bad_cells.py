@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import struct
 from collections.abc import Callable
@@ -167,3 +168,18 @@ def test_mutated_files(daemon: DaemonFactory, connect: Connect, tmp_path: Path, 
     made.write_cell("0_0.pcd", corner, random_points(rng, corner, 10))
     client.ask("reload")
     assert client.selected(["0_0.pcd"]).cells[0].points == 10
+
+
+def test_names_that_no_client_could_say(daemon: DaemonFactory, connect: Connect, tmp_path: Path) -> None:
+    """Neither the stray file that a reload reports nor the cell in an odd directory ends the daemon."""
+    made = make_map(tmp_path / "map", columns=2, rows=2)
+    cells = os.fsencode(made.pcd_dir)
+    os.mkdir(cells + b"/\xff")
+    os.rename(cells + b"/0_0.pcd", cells + b"/\xff/0_0.pcd")
+    client = connect(daemon(made.root))
+    assert len(client.area(circle(0, 0, 50)).cells) == 3
+    with open(cells + b"/Stra\xdfe.pcd", "wb"):
+        pass
+    reloaded = client.ask("reload")
+    assert reloaded[3:6] == [0, 0, 0]
+    assert "Stra\\xdfe.pcd" in "\n".join(reloaded[6])

@@ -237,6 +237,36 @@ def test_things_called_pcd_that_are_no_files(tmp_path: Path) -> None:
     assert f"cannot be read (No such file or directory): {cells / 'dangling.pcd'}" in text
 
 
+def test_links_that_lead_nowhere_cost_nobody_else(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path)
+    cells = root / "pointcloud_map.pcd"
+    (cells / "itself").symlink_to(cells / "itself")
+    (cells / "0.pcd").symlink_to(cells / "0.pcd")
+    catalogue = open_map(root).load()
+    assert len(catalogue) == 3
+    (problem,) = catalogue.problems
+    assert problem == (
+        f"cannot be read (Too many levels of symbolic links): {cells / '0.pcd'}, {cells / 'itself'}"
+    )
+
+
+def test_names_that_no_client_could_say(tmp_path: Path) -> None:
+    """They are told of in readable form, and neither served nor looked into."""
+    root = autoware_map(tmp_path)
+    cells = os.fsencode(root / "pointcloud_map.pcd")
+    Path(os.fsdecode(cells + b"/Stra\xdfe.pcd")).write_bytes(b"")
+    os.mkdir(cells + b"/\xff")
+    os.rename(cells + b"/t_0_0.pcd", cells + b"/\xff/t_0_0.pcd")
+    Path(os.fsdecode(cells), "Stra\u00dfe.txt").write_bytes(b"")
+    catalogue = open_map(root).load()
+    assert len(catalogue) == 2
+    odd, lacking = catalogue.problems
+    assert odd == (
+        f"the name is no UTF-8: {root}/pointcloud_map.pcd/Stra\\xdfe.pcd, {root}/pointcloud_map.pcd/\\xff"
+    )
+    assert lacking.endswith("entries without a file, not served: t_0_0.pcd")
+
+
 def test_path_that_no_client_could_name(tmp_path: Path) -> None:
     odd = os.fsencode(tmp_path) + b"/\xff"
     os.mkdir(odd)
