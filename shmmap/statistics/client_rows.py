@@ -11,7 +11,7 @@ from shmmap.errors import SegmentCorrupt
 
 __all__ = ["CLIENT_ROW_BYTES", "MAX_CLIENTS", "ClientRow", "Window", "pack_client", "unpack_client"]
 
-CLIENT_ROW: Final = struct.Struct("<QIiQQQq3d4dBBHI48s16s76x")
+CLIENT_ROW: Final = struct.Struct("<QIIQQQq3d4dBBHI48s16s76x")
 CLIENT_ROW_BYTES: Final = CLIENT_ROW.size + 4
 MAX_CLIENTS: Final = 256  # more clients than that are counted, not listed
 
@@ -20,6 +20,7 @@ Shape: TypeAlias = Literal["none", "circle", "square", "box"]
 HAS_POSE: Final = 1
 HAS_HEADING: Final = 2
 SHAPES: Final[tuple[Shape, ...]] = ("none", "circle", "square", "box")
+NO_USER: Final = 0xFFFFFFFF  # no process has this uid
 CLIENT_BYTES: Final = 48
 COMMAND_BYTES: Final = 16
 
@@ -87,7 +88,8 @@ def pack_client(row: ClientRow | None) -> bytes:
         return _sealed(bytes(CLIENT_ROW.size))
     window = row.window
     body = CLIENT_ROW.pack(
-        row.session, row.pid, row.uid, row.cells, row.bytes, row.requests, row.last_request_monotonic_ns,
+        row.session, row.pid, row.uid & NO_USER,
+        row.cells, row.bytes, row.requests, row.last_request_monotonic_ns,
         *(row.pose or (0.0, 0.0)), row.heading or 0.0,
         *(window[1:] if window is not None else (0.0, 0.0, 0.0, 0.0)),
         SHAPES.index(window.shape) if window is not None else 0,
@@ -119,7 +121,7 @@ def unpack_client(data: bytes | memoryview) -> ClientRow | None:
     if not session:
         return None
     return ClientRow(
-        session, pid, uid, cells, nbytes, requests, last,
+        session, pid, -1 if uid == NO_USER else uid, cells, nbytes, requests, last,
         client.rstrip(b"\0").decode("utf-8", "replace"),
         command.rstrip(b"\0").decode("utf-8", "replace"),
         (x, y) if flags & HAS_POSE else None,

@@ -97,6 +97,8 @@ def test_client() -> None:
     assert unpack_client(pack_client(None)) is None
     bare = ClientRow(1, 0, -1, 0, 0, 0, 0, "ä" * 30, "c" * 20)
     assert unpack_client(pack_client(bare)) == bare._replace(client="ä" * 24, command="c" * 16)
+    far = bare._replace(client="", command="", uid=2**32 - 2)  # a user id may have all 32 bits
+    assert unpack_client(pack_client(far)) == far
     for at in range(256):
         torn = bytearray.fromhex(GOLDEN_CLIENT)
         torn[at] ^= 1
