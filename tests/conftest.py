@@ -17,6 +17,7 @@ from tests.support.skips import (  # noqa: F401  hooks
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
+from tests.support.survivors import no_survivors  # noqa: F401
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -44,13 +44,13 @@ def wait_ended(pid: int, timeout: float = STOP_S) -> bool:
         os.close(fd)
 
 
-def processes_marked(mark: str) -> list[int]:
+def processes_marked(mark: str, variable: str = _MARK) -> list[int]:
     """Ids of the living processes whose environment carries ``mark``."""
     found = []
     for entry in os.listdir("/proc"):
         if entry.isdigit():
             try:
-                if f"{_MARK}={mark}".encode() in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
+                if f"{variable}={mark}".encode() in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
                     found.append(int(entry))
             except OSError:
                 continue
