@@ -11,7 +11,7 @@ from shmmap.cli.output import Column, format_bytes, format_duration, print_json,
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
-    from shmmap.statistics.layout import CellRow
+    from shmmap.statistics.cell_rows import CellRow
 
 __all__ = ["add_parser", "run"]
 

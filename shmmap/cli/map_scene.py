@@ -13,8 +13,8 @@ from shmmap.cli.output import format_bytes, format_duration
 from shmmap.cli.picture import CellSquare, Vehicle, WindowBox, top_view_svg
 
 if TYPE_CHECKING:
+    from shmmap.statistics.cell_rows import CellRow
     from shmmap.statistics.client_rows import ClientRow
-    from shmmap.statistics.layout import CellRow
 
 __all__ = ["GLYPHS", "Scene", "html_page", "svg", "terminal_rows"]
 

@@ -17,7 +17,7 @@ from shmmap.errors import BadRequest, DaemonUnreachable
 if TYPE_CHECKING:
     from shmmap.cli.map_scene import BoxTuple, Scene
     from shmmap.geometry import Area
-    from shmmap.statistics.layout import CellRow
+    from shmmap.statistics.cell_rows import CellRow
     from shmmap.statistics.reader import Snapshot
 
 __all__ = ["add_parser", "run"]

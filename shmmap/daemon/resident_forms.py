@@ -8,7 +8,7 @@ import msgspec
 from shmmap.daemon.residency import Resident
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
-from shmmap.statistics.layout import CellRow
+from shmmap.statistics.cell_rows import CellRow
 
 __all__ = ["cell_row", "encode_handles"]
 

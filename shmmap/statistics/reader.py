@@ -14,6 +14,7 @@ from typing import Literal
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.names import statistics_name
+from shmmap.statistics.cell_rows import CellRow, unpack_cell
 from shmmap.statistics.client_rows import ClientRow, unpack_client
 from shmmap.statistics.counters import Counter
 from shmmap.statistics.histogram import Histogram
@@ -21,12 +22,10 @@ from shmmap.statistics.identity import DaemonIdentity, DaemonState, WriterProces
 from shmmap.statistics.layout import (
     IDENTITY,
     TABLE,
-    CellRow,
     Header,
     State,
     unpack_header,
     unpack_identity,
-    unpack_row,
     unpack_state,
 )
 
@@ -122,7 +121,7 @@ class Snapshot:
         found = []
         for data in _pieces(self._rows, self._header.row_bytes if self._header is not None else 0):
             try:
-                row = unpack_row(data)
+                row = unpack_cell(data)
             except SegmentCorrupt:
                 continue
             if row is not None:

@@ -16,18 +16,16 @@ from itertools import chain, islice
 
 from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import statistics_name
+from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
 from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
-    ROW_BYTES,
     TABLE,
-    CellRow,
     State,
     pack_header,
     pack_identity,
-    pack_row,
     pack_state,
     plan,
 )
@@ -43,7 +41,7 @@ def _always(nbytes: int) -> bool:
     return True
 
 
-_FREE_ROW = pack_row(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
+_FREE_ROW = pack_cell(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
 
 
 class StatisticsWriter:
@@ -107,7 +105,7 @@ class StatisticsWriter:
             # with the first rows, so that a small daemon never grows after it took its budget
             start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
             os.posix_fallocate(self._fd, 0, start)
-            os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * ROW_BYTES)
+            os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * CELL_ROW_BYTES)
             self._allocated = _GROWTH_ROWS
             os.pwrite(self._fd, pack_header(self._layout), 0)
             self.update_identity(identity)
@@ -228,7 +226,7 @@ class StatisticsWriter:
     def _place(self, key: Hashable, row: CellRow) -> bool:
         slot = self._slot(key)
         if slot is not None:
-            self._write_row(slot, pack_row(row))
+            self._write_row(slot, pack_cell(row))
         return slot is not None
 
     def _mark_table(self) -> None:
@@ -237,7 +235,7 @@ class StatisticsWriter:
         os.pwrite(self._fd, TABLE.pack(self._table_sequence), self._layout.table_offset)
 
     def _write_row(self, slot: int, packed: bytes) -> None:
-        os.pwrite(self._fd, packed, self._layout.rows_offset + slot * ROW_BYTES)
+        os.pwrite(self._fd, packed, self._layout.rows_offset + slot * CELL_ROW_BYTES)
 
     def _slot(self, key: Hashable) -> int | None:
         """Return the row of ``key``, a new one if needed; None when there is no room."""
@@ -257,8 +255,8 @@ class StatisticsWriter:
         rows = min(self._allocated + _GROWTH_ROWS, self._layout.max_rows)
         if rows == self._allocated:
             return False
-        start = self._layout.rows_offset + self._allocated * ROW_BYTES
-        if not self._allocate(start, (rows - self._allocated) * ROW_BYTES):
+        start = self._layout.rows_offset + self._allocated * CELL_ROW_BYTES
+        if not self._allocate(start, (rows - self._allocated) * CELL_ROW_BYTES):
             return False
         self._allocated = rows
         return True

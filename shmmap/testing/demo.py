@@ -20,7 +20,7 @@ from shmmap.client import Client, connect
 from shmmap.protocol.codec import encode
 from shmmap.protocol.messages import Stats
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.statistics.layout import CellRow
+from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from shmmap.testing.consumer import Pose
 from shmmap.testing.daemon_process import DaemonProcess

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.statistics.layout import CellRow
+from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, wait_ended

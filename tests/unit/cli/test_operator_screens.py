@@ -11,11 +11,12 @@ import pytest
 from shmmap.cli.cache_verdict import cache_verdict
 from shmmap.cli.map_scene import GLYPHS, Scene, html_page, svg, terminal_rows
 from shmmap.cli.top_screen import budget_parts, screen
+from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.client_rows import ClientRow, Window
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import BUCKETS
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.layout import CellRow, State, plan
+from shmmap.statistics.layout import State, plan
 from shmmap.statistics.reader import Snapshot
 
 MIB = 1 << 20

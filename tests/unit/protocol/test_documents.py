@@ -15,6 +15,7 @@ from shmmap.protocol import events
 from shmmap.protocol import messages as m
 from shmmap.segment import layout
 from shmmap.statistics import layout as statistics_layout
+from shmmap.statistics.cell_rows import CELL_ROW_BYTES
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
 
 PROTOCOL = files("shmmap.protocol").joinpath("PROTOCOL.md").read_text(encoding="utf-8")
@@ -153,7 +154,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
                 statistics_layout.START.size,
                 statistics_layout.EXTENSION.size,
                 statistics_layout.STATE.size,
-                statistics_layout.ROW_BYTES,
+                CELL_ROW_BYTES,
                 CLIENT_ROW_BYTES,
             ],
         ),

@@ -9,9 +9,10 @@ import pytest
 
 from shmmap.errors import SegmentCorrupt
 from shmmap.statistics import layout
+from shmmap.statistics.cell_rows import CellRow, pack_cell, unpack_cell
 from shmmap.statistics.client_rows import ClientRow, Window, pack_client, unpack_client
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, Counter
-from shmmap.statistics.layout import CellRow, State
+from shmmap.statistics.layout import State
 
 TWO = (
     Counter("requests", "counter", "", "Requests received"),
@@ -112,8 +113,8 @@ def test_identity() -> None:
 
 
 def test_row() -> None:
-    assert layout.pack_row(ROW) == bytes.fromhex(GOLDEN_ROW)
-    assert layout.unpack_row(memoryview(bytes.fromhex(GOLDEN_ROW))) == ROW
+    assert pack_cell(ROW) == bytes.fromhex(GOLDEN_ROW)
+    assert unpack_cell(memoryview(bytes.fromhex(GOLDEN_ROW))) == ROW
 
 
 def test_a_torn_row_is_noticed() -> None:
@@ -121,7 +122,7 @@ def test_a_torn_row_is_noticed() -> None:
         torn = bytearray.fromhex(GOLDEN_ROW)
         torn[at] ^= 1
         with pytest.raises(SegmentCorrupt):
-            layout.unpack_row(memoryview(bytes(torn)))
+            unpack_cell(memoryview(bytes(torn)))
 
 
 def test_a_torn_state_is_noticed() -> None:
@@ -145,10 +146,8 @@ def test_states_never_written_are_left_out() -> None:
 
 
 def test_long_ids_keep_their_end_and_say_so() -> None:
-    row = layout.unpack_row(
-        memoryview(
-            layout.pack_row(CellRow("ä" * 200 + "end", "l" * 90, 1, "0" * 16, "zombie", 1, 1, ROW.box))
-        )
+    row = unpack_cell(
+        memoryview(pack_cell(CellRow("ä" * 200 + "end", "l" * 90, 1, "0" * 16, "zombie", 1, 1, ROW.box)))
     )
     assert row is not None
     assert row.id_cut
@@ -158,8 +157,8 @@ def test_long_ids_keep_their_end_and_say_so() -> None:
 
 
 def test_ids_that_are_no_utf8_survive() -> None:
-    row = layout.unpack_row(
-        memoryview(layout.pack_row(CellRow("\udcff.pcd", "points", 1, "", "resident", 1, 1, ROW.box)))
+    row = unpack_cell(
+        memoryview(pack_cell(CellRow("\udcff.pcd", "points", 1, "", "resident", 1, 1, ROW.box)))
     )
     assert row is not None
     assert row.id == "\udcff.pcd"

@@ -18,11 +18,11 @@ import pytest
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics import identity as identity_module
+from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.client_rows import ClientRow
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import bucket_of
 from shmmap.statistics.identity import DaemonIdentity, WriterProcess, judge, pid_namespace, start_time_ticks
-from shmmap.statistics.layout import CellRow
 from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 
