@@ -3,18 +3,21 @@
 
 Counting costs a dictionary access; `StatisticsWriter.beat` writes what changed.  It writes with
 ``pwrite`` into memory allocated before: a full file system is an error here, never SIGBUS, and a
-reader that cannot be trusted cannot stop or hurt the writer.
+reader that cannot be trusted cannot stop or hurt the writer.  Once the segment is there, what cannot
+be written (a limit on the size of files, say) is logged once, stays due, and stops nobody: the
+statistics serve the operator, the daemon serves without them.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import struct
 import time
 from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 
-from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
+from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
@@ -31,6 +34,8 @@ from shmmap.statistics.layout import (
 )
 
 __all__ = ["StatisticsWriter"]
+
+_log = logging.getLogger(__name__)
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
 _CLIENTS_A_PAGE = 16
@@ -89,7 +94,8 @@ class StatisticsWriter:
         self._packer = struct.Struct(f"<{len(COUNTERS)}q")
         self._sequence = 0
         self._identity_sequence = 0
-        self._table_sequence = 0
+        self._identity_due: tuple[bytes, int] | None = None
+        self._table_sequence = 0  # odd while rows change
         self._slots: dict[Hashable, int] = {}
         self._free: list[int] = []
         self._used = 0
@@ -98,8 +104,9 @@ class StatisticsWriter:
         self._clients_allocated = _CLIENTS_A_PAGE
         self._clients_used = 0
         self._changed: dict[Hashable, CellRow] = {}
-        self._missing: dict[Hashable, CellRow] = {}  # there was no room for these
+        self._missing: dict[Hashable, CellRow] = {}  # there was no room for these, or no writing them
         self._removed: list[int] = []
+        self._told = False
         self._fd = directory.create()
         try:
             # with the first rows, so that a small daemon never grows after it took its budget
@@ -141,13 +148,15 @@ class StatisticsWriter:
 
     def show_clients(self, rows: Sequence[ClientRow]) -> None:
         """Show these clients, from the next beat on; at most 256, and as many as there is room for."""
-        self._clients_used = count = min(len(rows), self._room_for_clients(min(len(rows), MAX_CLIENTS)))
+        count = min(len(rows), self._room_for_clients(min(len(rows), MAX_CLIENTS)))
         self._clients += [None] * (count - len(self._clients))
-        for index in range(count):
-            if self._clients[index] != rows[index]:
-                self._clients[index] = rows[index]
-                place = self._layout.clients_offset + index * CLIENT_ROW_BYTES
-                os.pwrite(self._fd, pack_client(rows[index]), place)
+        self._clients_used = 0
+        for index, row in enumerate(rows[:count]):
+            place = self._layout.clients_offset + index * CLIENT_ROW_BYTES
+            if self._clients[index] != row and not self._write(pack_client(row), place):
+                break
+            self._clients[index] = row
+            self._clients_used += 1
 
     def _room_for_clients(self, wanted: int) -> int:
         """Allocate rows as clients come, a page at a time; returns how many there are."""
@@ -184,18 +193,24 @@ class StatisticsWriter:
         ValueError
             If its strings need more than 16 kB.
         """
-        self._identity_sequence += 1
-        block = self._layout.identity_offset + self._identity_sequence % 2 * self._layout.identity_bytes
-        packed = pack_identity(self._identity_sequence, identity.to_bytes(), self._layout.identity_bytes)
-        os.pwrite(self._fd, packed, block)
+        sequence, size = self._identity_sequence + 1, self._layout.identity_bytes
+        packed = pack_identity(sequence, identity.to_bytes(), size)
+        self._identity_due = packed, self._layout.identity_offset + sequence % 2 * size
+        self._write_identity()
+
+    def _write_identity(self) -> None:
+        if self._identity_due is not None and self._write(*self._identity_due):
+            self._identity_due = None
+            self._identity_sequence += 1
 
     def beat(self, *, max_rows: int = 256) -> None:
         """Write the time, all counters and at most ``max_rows`` changed rows (the rest at later beats)."""
-        if self._changed or self._removed or self._missing:
+        self._write_identity()
+        if self._changed or self._removed or self._missing or self._table_sequence % 2:
             self._write_rows(max_rows)
-        self._sequence += 1
+        sequence = self._sequence + 1
         state = State(
-            self._sequence,
+            sequence,
             time.monotonic_ns(),
             time.time_ns(),
             self._used,
@@ -204,15 +219,17 @@ class StatisticsWriter:
             self._clients_used,
             tuple(chain.from_iterable(self._durations.values())),
         )
-        block = self._layout.state_offset + self._sequence % 2 * self._layout.state_bytes
-        os.pwrite(self._fd, pack_state(state, self._packer), block)
+        block = self._layout.state_offset + sequence % 2 * self._layout.state_bytes
+        if self._write(pack_state(state, self._packer), block):
+            self._sequence = sequence
 
     def _write_rows(self, max_rows: int) -> None:
-        self._mark_table()
+        if not self._mark_table(self._table_sequence + 1 | 1):  # odd already where no even one could follow
+            return
         for _ in range(min(max_rows, len(self._removed))):
-            slot = self._removed.pop()
-            self._write_row(slot, _FREE_ROW)
-            self._free.append(slot)
+            if not self._write_row(self._removed[-1], _FREE_ROW):
+                break
+            self._free.append(self._removed.pop())
         for key in list(islice(self._changed, max_rows)):
             row = self._changed.pop(key)
             if not self._place(key, row):
@@ -221,21 +238,38 @@ class StatisticsWriter:
             if not self._place(key, self._missing[key]):
                 break
             del self._missing[key]
-        self._mark_table()
+        self._mark_table(self._table_sequence + 1)
 
     def _place(self, key: Hashable, row: CellRow) -> bool:
         slot = self._slot(key)
-        if slot is not None:
-            self._write_row(slot, pack_cell(row))
-        return slot is not None
+        return slot is not None and self._write_row(slot, pack_cell(row))
 
-    def _mark_table(self) -> None:
-        """Make the table's sequence number odd while rows change, and even again."""
-        self._table_sequence += 1
-        os.pwrite(self._fd, TABLE.pack(self._table_sequence), self._layout.table_offset)
+    def _mark_table(self, sequence: int) -> bool:
+        if not self._write(TABLE.pack(sequence), self._layout.table_offset):
+            return False
+        self._table_sequence = sequence
+        return True
 
-    def _write_row(self, slot: int, packed: bytes) -> None:
-        os.pwrite(self._fd, packed, self._layout.rows_offset + slot * CELL_ROW_BYTES)
+    def _write_row(self, slot: int, packed: bytes) -> bool:
+        return self._write(packed, self._layout.rows_offset + slot * CELL_ROW_BYTES)
+
+    def _write(self, data: bytes, place: int) -> bool:
+        """Write all of it; False if that cannot be done, which whoever asked tries again at a later beat."""
+        left = memoryview(data)
+        try:
+            while left:
+                written = os.pwrite(self._fd, left, place)
+                left, place = left[written:], place + written
+        except OSError as error:
+            if not self._told:
+                self._told = True
+                _log.warning(
+                    "the statistics cannot be written (%s): `shmmap top` and `health` show an older state;"
+                    " cells are served as before",
+                    error.strerror,
+                )
+            return False
+        return True
 
     def _slot(self, key: Hashable) -> int | None:
         """Return the row of ``key``, a new one if needed; None when there is no room."""
@@ -267,10 +301,8 @@ class StatisticsWriter:
             return False
         try:
             os.posix_fallocate(self._fd, start, nbytes)
-        except OSError as error:
-            if is_full(error):
-                return False
-            raise
+        except OSError:
+            return False
         return True
 
     @property

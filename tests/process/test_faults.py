@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import struct
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, wait_ended
 from tests.support.divided_map import DividedMap
@@ -203,6 +205,28 @@ def test_a_header_that_promises_the_moon_costs_no_memory(
         assert [f.code for f in reply.failed] == ["load_failed"]
     assert one.children() == [loader]
     assert peak_memory(loader) - idle < 100 << 20
+
+
+def test_statistics_that_cannot_be_written_end_nobody(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """The limit lies before the counters and behind all that the log gets."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    warm = [handle.segment for handle in client.area(circle(0, 0, 5)).cells]
+    soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
+    told = "the statistics cannot be written (File too large)"
+    waiting = Patience()
+    while waiting(told not in one.log):
+        os.sched_yield()
+    asked = client.ask("stats")[4]["requests"]
+    assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
+    resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (soft, hard))
+    waiting = Patience()
+    while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
+        os.sched_yield()
+    assert one.log.count(told) == 1
 
 
 def peak_memory(pid: int) -> int:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -18,11 +20,12 @@ import pytest
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics import identity as identity_module
-from shmmap.statistics.cell_rows import CellRow
-from shmmap.statistics.client_rows import ClientRow
+from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow
+from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, ClientRow
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import bucket_of
 from shmmap.statistics.identity import DaemonIdentity, WriterProcess, judge, pid_namespace, start_time_ticks
+from shmmap.statistics.layout import plan
 from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -219,6 +222,64 @@ def test_no_room_for_rows(
     seen = read_statistics("unit", shm.path)
     assert (seen.rows_missing, [c.version for c in seen.cells]) == (0, [*range(1, 256), 257, 258, 259, 260])
     assert seen.cells[255].bytes == 8192
+
+
+@contextlib.contextmanager
+def files_no_larger_than(nbytes: int) -> Iterator[None]:
+    """Let writes behind so many bytes of any file fail (EFBIG; Python ignores SIGXFSZ)."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (nbytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_what_cannot_be_written_is_written_as_soon_as_it_can(
+    shm: ShmDirectory, writer: StatisticsWriter, identity: DaemonIdentity, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Wherever the limit lies, also in the midst of a block; what was whole stays readable throughout."""
+    layout = plan(COUNTERS, HISTOGRAMS)
+    limits = [
+        0,
+        layout.identity_offset + 100,
+        layout.state_offset + 100,
+        layout.state_offset + layout.state_bytes + 100,
+        layout.table_offset,
+        layout.clients_offset + CLIENT_ROW_BYTES + 100,
+        layout.rows_offset,
+        layout.rows_offset + 3 * CELL_ROW_BYTES + 100,
+    ]
+    writer.show_clients([client(0)])
+    for number in range(3):
+        writer.cell_changed(number, row(number))
+    writer.beat()
+    for turn, limit in enumerate(limits, 1):
+        new = 10 * turn
+        with files_no_larger_than(limit):
+            for version in (turn - 1, turn):
+                writer.update_identity(replace(identity, map_version=100 + version))
+            writer.show_clients([client(turn), client(turn + 1)])
+            writer.cell_removed(0 if turn == 1 else new - 10)
+            writer.cell_changed(1, row(1, nbytes=4096 * turn))
+            for key in (new, new + 1):
+                writer.cell_changed(key, row(key))
+            writer.cell_removed(new + 1)
+            writer.add("requests")
+            for _ in range(3):
+                writer.beat()
+            assert read_statistics("unit", shm.path).state == "healthy"
+        writer.show_clients([client(turn), client(turn + 1)])
+        writer.beat()
+        seen = read_statistics("unit", shm.path)
+        assert seen.identity == replace(identity, map_version=100 + turn)
+        assert seen.clients == [client(turn), client(turn + 1)]
+        assert [cell.version for cell in seen.cells] == [1, 2, new]
+        assert seen.cells[0].bytes == 4096 * turn
+        assert (seen.rows_missing, seen.counters["requests"]) == (0, turn)
+        assert not writer.outdated
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "File too large" in caplog.text
 
 
 def test_a_leftover_is_replaced_and_never_taken_away(shm: ShmDirectory, identity: DaemonIdentity) -> None:
