@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb, numbers
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, numbers, size_bytes
 from shmmap.cli.output import format_bytes, format_duration, print_json, print_pairs
-from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
     from shmmap.dividing.frame import Translation
@@ -85,7 +84,11 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     work = parser.add_argument_group("work")
     work.add_argument(
-        "--max-memory", metavar="BYTES", default="1G", help="most memory of the process (default: 1G)"
+        "--max-memory",
+        metavar="BYTES",
+        type=size_bytes,
+        default="1G",
+        help="most memory of the process (default: 1G)",
     )
     work.add_argument("--force", action="store_true", help="replace a divided map that is there")
     work.add_argument(
@@ -102,15 +105,10 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.work_progress import StageProgress
-    from shmmap.daemon.config import parse_bytes
     from shmmap.dividing.divide import divide
     from shmmap.dividing.memory import peak_memory_bytes
     from shmmap.dividing.settings import DivideSettings
 
-    try:
-        memory_bytes = parse_bytes(args.max_memory)
-    except ConfigError as error:
-        raise BadRequest(f"--max-memory: {error.message}", hint=error.hint) from None
     origin_x, origin_y = args.origin
     settings = DivideSettings(
         cell_size=args.cell_size,
@@ -120,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         prefix=args.prefix,
         encoding=args.encoding,
         order=args.order,
-        memory_bytes=memory_bytes,
+        memory_bytes=args.max_memory,
         common_fields=args.common_fields,
         force=args.force,
         resume=args.resume,

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
     from shmmap.geometry import Area
@@ -23,6 +23,7 @@ __all__ = [
     "area_from",
     "numbers",
     "seconds",
+    "size_bytes",
 ]
 
 # argparse offers no public name for this type
@@ -51,6 +52,16 @@ def seconds(text: str) -> float:
     if not (0.0 <= value < math.inf):
         raise argparse.ArgumentTypeError(f"expected seconds, not {text!r}")
     return value
+
+
+def size_bytes(text: str) -> int:
+    """Read a size such as ``512M``, bytes."""
+    from shmmap.daemon.config import parse_bytes
+
+    try:
+        return parse_bytes(text)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(f"{error.message}; {error.hint}") from None
 
 
 def add_verb(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, size_bytes
 from shmmap.cli.output import format_bytes, format_duration, print_json, print_pairs
 
 __all__ = ["add_parser", "run"]
@@ -19,7 +19,8 @@ JSON (fields may be added, none is removed):
   {"map", "cells", "layers": [spec], "kept", "recognised", "built": layers of cells, "bytes",
    "cache_dir", "cache_bytes": disk space of the whole cache, "seconds",
    "failed": [{"id", "layer", "message"}]}
-Exit code: 0, 1 if a layer of some cell could not be prepared, 2 wrong usage, 66 no map."""
+Exit code: 0, 1 if a layer of some cell could not be prepared, 2 wrong usage, 65 bad map, 66 no map,
+73 nothing can be kept in the cache directory."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -44,7 +45,11 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--workers", metavar="N", type=int, default=0, help="processes (default: all cores)")
     parser.add_argument("--cache-dir", metavar="DIR", default="", help="where layers are kept")
     parser.add_argument(
-        "--cache-size", metavar="SIZE", default="8G", help="most disk space of kept layers (default: 8G)"
+        "--cache-size",
+        metavar="SIZE",
+        type=size_bytes,
+        default="8G",
+        help="most disk space of kept layers (default: 8G)",
     )
     add_json_option(parser)
 
@@ -55,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.work_progress import StageProgress
-    from shmmap.daemon.config import DaemonConfig, parse_bytes
+    from shmmap.daemon.config import DaemonConfig
     from shmmap.daemon.divided_cloud import find_origin
     from shmmap.errors import BadRequest
     from shmmap.layers.spec import canonical_layers
@@ -64,18 +69,18 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.layers:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
-    layers = canonical_layers(args.layers)
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
     origin = find_origin(
         DaemonConfig(args.map_path, args.metadata or "", strict=args.strict, cache_dir=cache_dir)
     )
+    layers = canonical_layers(args.layers)
     catalogue = origin.load(fresh=True)
     done = prepare_map(
         catalogue,
         layers,
         cache_dir=cache_dir,
-        cache_bytes=parse_bytes(args.cache_size),
+        cache_bytes=args.cache_size,
         workers=args.workers or len(os.sched_getaffinity(0)),
         progress=StageProgress(quiet=args.json, unit="cells", scale=1.0),
     )
@@ -103,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
     if len(done.failures) > _SHOWN_FAILURES:
         print(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
-    if done.bytes > parse_bytes(args.cache_size):
+    if done.bytes > args.cache_size:
         print("note: the layers are larger than --cache-size: some had to leave the cache again")
     print_pairs(
         [

@@ -102,11 +102,13 @@ def run(config: DaemonConfig) -> int:
     MapMissing, MapDataError
         There is no map, or none that can be served.
     ConfigError
-        A setting that cannot work on this machine.
+        No map is named, or a setting cannot work on this machine.
     InstanceBusy
         Another daemon has this instance.
     """
     set_up_logging()
+    if not config.map_path:
+        raise ConfigError("no map is named", key="map_path", hint="give `shmmap serve MAP`, or set map_path")
     prepare_process()
     raise_descriptor_limit()
     activated = take_activated_socket()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 from shmmap.dividing.report import REPORT_NAME
 from shmmap.errors import BadRequest, MapMissing
@@ -33,14 +34,14 @@ def find_inputs(paths: Sequence[str]) -> list[InputFile]:
     Raises
     ------
     MapMissing
-        There is nothing there, or no cloud in a directory.
+        There is nothing there, no cloud in a directory, or a directory that cannot be read.
     """
     found: dict[str, InputFile] = {}
     for path in map(os.path.abspath, paths):
         if os.path.isdir(path):
             names = [
                 os.path.join(folder, name)
-                for folder, _, files in os.walk(path)
+                for folder, _, files in os.walk(path, onerror=_refuse)
                 for name in files
                 if name.lower().endswith(CLOUD_SUFFIXES) and not name.startswith(".")
             ]
@@ -54,9 +55,13 @@ def find_inputs(paths: Sequence[str]) -> list[InputFile]:
             try:
                 status = os.stat(name)
             except OSError as error:
-                raise MapMissing(f"cannot read {name}: {error.strerror}") from error
+                _refuse(error)
             found.setdefault(name, InputFile(name, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
     return list(found.values())
+
+
+def _refuse(error: OSError) -> NoReturn:
+    raise MapMissing(f"cannot read {error.filename}: {error.strerror}") from error
 
 
 def check_output_place(inputs: Sequence[str], files: Sequence[InputFile], out: str) -> None:

@@ -101,11 +101,11 @@ def merge(
         moves: list[_Move] = []
         origins: dict[str, list[float]] = {}
         for path in [os.fspath(path) for path in inputs]:
+            files = find_inputs([path])
             report = read_report(path) if os.path.isdir(path) and not keep_frame else None
             x, y, z = report["origin"] if report is not None else NO_MOVE
             if (x, y, z) != NO_MOVE:
                 origins[os.path.abspath(path)] = [x, y, z]
-            files = find_inputs([path])
             check_output_place([path], files, out)
             for file in files:
                 source = open_source(

@@ -72,12 +72,15 @@ def write_report(directory: str | os.PathLike[str], report: DividedMap) -> None:
 
 def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
     """Return what `divide` left about a map, or None for a map made by others."""
+    path = os.path.join(map_dir, REPORT_NAME)
     try:
-        report = json.loads(Path(map_dir, REPORT_NAME).read_bytes())
+        report = json.loads(Path(path).read_bytes())
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
-        raise MapDataError(f"cannot be read: {error}", path=str(Path(map_dir, REPORT_NAME))) from error
+    except OSError as error:
+        raise MapDataError(f"cannot be read: {error.strerror}", path=path) from error
+    except ValueError as error:
+        raise MapDataError(f"cannot be read: {error}", path=path) from error
     if not isinstance(report, dict) or report.get("format") != _FORMAT or report.get("version") != _VERSION:
-        raise MapDataError("not made by this version", path=str(Path(map_dir, REPORT_NAME)))
+        raise MapDataError("not made by this version", path=path)
     return report

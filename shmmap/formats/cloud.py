@@ -17,6 +17,7 @@ from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.open3d_reader import OPEN3D_SUFFIXES, read_with_open3d
 from shmmap.formats.pcd_header import IDENTITY_VIEWPOINT
 from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.source_file import open_regular
 
 __all__ = ["CLOUD_SUFFIXES", "CloudDescription", "PointCloud", "describe", "read_cloud", "read_pcd"]
 
@@ -240,6 +241,7 @@ def _suffix(path: str | os.PathLike[str]) -> str:
     name = os.fspath(path)
     suffix = os.path.splitext(name)[1].lower()
     if suffix not in CLOUD_SUFFIXES:
+        os.close(open_regular(name))  # what is not there, or no file, is refused for that
         raise refusal(
             "unsupported_format",
             f"files called {suffix or 'without a suffix'} are not read",

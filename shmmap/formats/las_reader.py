@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats.causes import refusal
+from shmmap.formats.source_file import open_regular
 
 __all__ = ["LAS_SUFFIXES", "LasReader"]
 
@@ -134,11 +135,9 @@ class LasReader:
 def _check_start(path: str) -> bool:
     """Refuse what is no LAS or is cut short, before laspy allocates for it; returns whether it is LAZ."""
     try:
-        with open(path, "rb") as file:
+        with open(open_regular(path), "rb") as file:
             head = file.read(_LONG_COUNT_AT + 8)
             size = os.fstat(file.fileno()).st_size
-    except FileNotFoundError:
-        raise refusal("missing", "no such file", path=path) from None
     except OSError as error:
         raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
     if not head:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import ShmmapError
 from shmmap.formats.causes import refusal
+from shmmap.formats.source_file import open_regular
 
 __all__ = ["OPEN3D_SUFFIXES", "read_with_open3d"]
 
@@ -49,12 +50,10 @@ def read_with_open3d(path: str, suffix: str) -> tuple[dict[str, NDArray[Any]], t
         If Open3D cannot be loaded.
     """
     try:
-        with open(path, "rb") as file:
+        with open(open_regular(path), "rb") as file:
             expected = _ply_points(file.read(_HEADER_LIMIT_BYTES), path) if suffix == ".ply" else None
         if suffix != ".ply":
             expected = _text_points(path, counted=suffix == ".pts")
-    except FileNotFoundError:
-        raise refusal("missing", "no such file", path=path) from None
     except OSError as error:
         raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
     if expected == 0:

@@ -8,10 +8,8 @@ the points and the XXH3-128 digest of the whole file are taken along.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
-import stat
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Final
@@ -20,13 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.formats.causes import refusal
 from shmmap.formats.finite import Bounds
 from shmmap.formats.pcd_ascii import ascii_blocks
 from shmmap.formats.pcd_binary import binary_blocks, compressed_blocks
 from shmmap.formats.pcd_header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
 from shmmap.formats.pcd_table import field_table
-from shmmap.formats.source_file import SourceFile
+from shmmap.formats.source_file import SourceFile, open_regular
 
 __all__ = ["Block", "PcdReader"]
 
@@ -80,7 +77,7 @@ class PcdReader:
     ) -> None:
         self.path = path or (f"<descriptor {file}>" if isinstance(file, int) else os.fspath(file))
         self._owned = not isinstance(file, int)
-        self._fd = file if isinstance(file, int) else _open(self.path)
+        self._fd = file if isinstance(file, int) else open_regular(self.path)
         try:
             self._source = SourceFile(self._fd, self.path)
             self._head = self._read_head()
@@ -178,18 +175,3 @@ class PcdReader:
         if len(head) < size and not _DATA_LINE.search(head):
             head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
         return head
-
-
-def _open(path: str) -> int:
-    """Open a file for reading; a pipe must not block, so O_NONBLOCK until we know what it is."""
-    try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except FileNotFoundError:
-        raise refusal("missing", "no such file", path=path) from None
-    except (OSError, ValueError) as error:
-        raise refusal("unreadable", f"cannot be opened: {error}", path=path) from error
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
-        with contextlib.suppress(OSError):
-            os.close(fd)
-        raise refusal("not_regular", "not a regular file", path=path)
-    return fd

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file read once from front to back, digested on the way."""
+"""A file, opened for what it is, and read once from front to back, digested on the way."""
 
 from __future__ import annotations
 
 import os
+import stat
 from typing import Any, NoReturn
 
 import numpy as np
@@ -12,7 +13,31 @@ from numpy.typing import NDArray
 
 from shmmap.formats.causes import refusal
 
-__all__ = ["SourceFile"]
+__all__ = ["SourceFile", "open_regular"]
+
+
+def open_regular(path: str) -> int:
+    """Open a file for reading; returns its descriptor.
+
+    Raises
+    ------
+    MapDataError
+        ``missing``, ``unreadable``, or ``not_regular``: no pipe keeps the caller waiting.
+    """
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise refusal("missing", "no such file", path=path) from None
+    except OSError as error:
+        raise refusal("unreadable", f"cannot be opened: {error.strerror}", path=path) from error
+    except ValueError as error:  # a NUL in it
+        raise refusal("unreadable", f"cannot be opened: {error}", path=path) from error
+    mode = os.fstat(fd).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(fd)
+        kind = "a directory, not a file" if stat.S_ISDIR(mode) else "not a regular file"
+        raise refusal("not_regular", kind, path=path)
+    return fd
 
 
 class SourceFile:
@@ -32,7 +57,7 @@ class SourceFile:
         try:
             self.size = os.fstat(fd).st_size
         except OSError as error:
-            raise refusal("unreadable", f"cannot be read: {error}", path=path) from error
+            raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
         self.at = 0
         self._hash = xxhash.xxh3_128()
         self._buffer: NDArray[np.uint8] = np.empty(0, np.uint8)
@@ -96,4 +121,6 @@ class SourceFile:
         self.at += at
 
     def _unreadable(self, error: OSError) -> NoReturn:
-        raise refusal("unreadable", f"cannot be read: {error}", path=self.path, offset=self.at) from error
+        raise refusal(
+            "unreadable", f"cannot be read: {error.strerror}", path=self.path, offset=self.at
+        ) from error

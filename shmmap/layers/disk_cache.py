@@ -28,7 +28,7 @@ from typing import Final
 
 import xxhash
 
-from shmmap.errors import SegmentCorrupt
+from shmmap.errors import CannotWrite, SegmentCorrupt
 from shmmap.layers.contract import Box
 from shmmap.layers.spec import LayerSpec
 from shmmap.segment.layout import (
@@ -210,6 +210,23 @@ class LayerCache:
             return True
 
     # --- storing --------------------------------------------------------------------------------
+
+    def make(self) -> None:
+        """Make the directory, and see whether files can be made in it.
+
+        Raises
+        ------
+        CannotWrite
+            They cannot.
+        """
+        try:
+            os.makedirs(self.directory, mode=0o755, exist_ok=True)
+            tempfile.TemporaryFile(dir=self.directory).close()
+        except OSError as error:
+            raise CannotWrite(
+                f"layers cannot be kept in {self.directory}: {error.strerror}",
+                hint="name another --cache-dir",
+            ) from error
 
     def store(self, key: CacheKey, header: SegmentHeader, fd: int) -> bool:
         """Keep a finished segment whose publish block is still empty; False where there is no room for it.

@@ -84,8 +84,10 @@ def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> Ma
     MapMissing
         There is nothing at ``path``, or nothing that could be a map.
     """
-    if not os.path.exists(path):
-        raise MapMissing(f"there is no map at {path}: no such file or directory")
+    try:
+        os.stat(path)
+    except OSError as error:
+        raise MapMissing(f"there is no map at {path}: {str(error.strerror).lower()}") from error
     if metadata is not None and not os.path.isfile(metadata):
         raise MapMissing(f"there is no metadata file at {metadata}")
     if os.path.isfile(path) and path.lower().endswith((".yaml", ".yml")):

@@ -231,9 +231,12 @@ def prepare_map(
     ------
     BadRequest
         If a layer is unknown.
+    CannotWrite
+        If nothing can be kept in ``cache_dir``.
     """
     names = canonical_layers(layers)
     cache = LayerCache(cache_dir, limit_bytes=cache_bytes)
+    cache.make()
     versions = LayerVersions(lambda: catalogue)
     recognise = not cache.is_empty
     crowded: list[Failure] = []

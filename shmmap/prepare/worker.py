@@ -96,7 +96,7 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: _Source) ->
     except ShmmapError as error:
         message = str(error)
     except OSError as error:
-        message = f"{job.path}: {error.strerror or error}"
+        message = f"{error.filename or job.path}: {error.strerror or error}"
     except MemoryError:
         message = f"{job.path}: building {name} ran out of memory"
     except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one layer

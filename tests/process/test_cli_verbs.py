@@ -279,8 +279,13 @@ def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:
         (["serve", ".", "--budget", "much"], 78),
         (["serve", ".", "--instance", "a/b"], 78),
         (["serve", ".", "--config", "missing.toml"], 78),
+        (["serve"], 78),
         (["inspect", "missing.pcd"], 66),
+        (["inspect", "missing"], 66),
         (["inspect", "broken.pcd"], 65),
+        (["inspect", "."], 65),
+        (["prepare", "missing", "--layer", "ndt"], 66),
+        (["prepare", "broken.pcd", "--layer", "ndt"], 2),
     ],
 )
 def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path) -> None:

@@ -148,13 +148,30 @@ def test_a_killed_run_leaves_no_worker_and_goes_on_where_it_was(tmp_path: Path) 
     assert done["kept"] + done["recognised"] + done["built"] == 64
 
 
+def test_a_cache_that_cannot_be_written_is_said_at_once(small_map: DividedMap, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = subprocess.run(
+        command(small_map, tmp_path / "file", NDT),
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 73
+    assert f"{tmp_path}/file/layers: Not a directory" in done.stderr
+
+
 def test_usage(small_map: DividedMap, tmp_path: Path) -> None:
-    for words, code in (([], 2), (["--layer", "nonsense"], 2), (["--layer", "ndt"], 2)):
+    for words, message in (
+        ([], "leaf"),
+        (["--layer", "nonsense"], "leaf"),
+        (["--layer", "ndt"], "leaf"),
+        (["--layer", "points", "--cache-size", "much"], "no size"),
+    ):
         done = subprocess.run(
             [sys.executable, "-m", "shmmap.cli", "prepare", str(small_map.root), *words],
             capture_output=True,
             text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)},
         )
-        assert done.returncode == code, done.stderr
-        assert "leaf" in done.stderr
+        assert done.returncode == 2, done.stderr
+        assert message in done.stderr

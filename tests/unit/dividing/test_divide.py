@@ -360,6 +360,23 @@ def test_bad_inputs_leave_nothing(
     assert sorted(os.listdir(tmp_path)) == before
 
 
+def test_a_directory_that_cannot_be_listed_is_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "in" / "deep").mkdir(parents=True)
+    cloud_file(tmp_path / "in" / "a.pcd", xyzircaedt(10))
+    scandir = os.scandir
+
+    def refuse(path: str) -> Any:
+        if path.endswith("deep"):
+            raise PermissionError(13, "Permission denied", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)  # root may list everything
+    with pytest.raises(MapMissing, match=r"in/deep: Permission denied"):
+        run([tmp_path / "in"], tmp_path / "map")
+
+
 def test_a_file_cut_short_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     file = cloud_file(tmp_path / "in.pcd", xyzircaedt(1000))
     os.truncate(file, file.stat().st_size - 1)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import builtins
+import os
 import struct
 import subprocess
 import sys
@@ -145,11 +146,20 @@ def test_bad_files_of_other_formats(tmp_path: Path, name: str, data: bytes, caus
     assert cause in CAUSES
 
 
-@pytest.mark.parametrize("name", ["absent.ply", "absent.pts", "absent.pcd"])
-def test_missing_files(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["a.ply", "a.pts", "a.pcd", "a.las", "a.txt", "a"])
+def test_what_is_no_file_is_refused_for_that(tmp_path: Path, name: str) -> None:
     with pytest.raises(MapDataError) as caught:
         describe(tmp_path / name)
     assert caught.value.cause == "missing"
+    (tmp_path / name).mkdir()
+    with pytest.raises(MapDataError, match="a directory") as caught:
+        describe(tmp_path / name)
+    assert caught.value.cause == "not_regular"
+    (tmp_path / name).rmdir()
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(MapDataError) as caught:
+        describe(tmp_path / name)
+    assert caught.value.cause == "not_regular"
 
 
 def test_lines_that_open3d_skips_are_noticed(tmp_path: Path) -> None:

@@ -267,6 +267,13 @@ def test_names_that_no_client_could_say(tmp_path: Path) -> None:
     assert lacking.endswith("entries without a file, not served: t_0_0.pcd")
 
 
+def test_why_there_is_no_map(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path, why in ((tmp_path / "gone", "no such file"), (tmp_path / "file" / "map", "not a directory")):
+        with pytest.raises(MapMissing, match=f"{path}: {why}"):
+            open_map(path)
+
+
 def test_path_that_no_client_could_name(tmp_path: Path) -> None:
     odd = os.fsencode(tmp_path) + b"/\xff"
     os.mkdir(odd)
