@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import zmq
 
 from shmmap import BadRequest
 
 __all__ = ["Publisher", "Subscriber", "is_endpoint"]
+
+_REPEAT_MS: Final = 100  # between two ends
 
 _Publisher = TypeVar("_Publisher", bound="Publisher")
 _Subscriber = TypeVar("_Subscriber", bound="Subscriber")
@@ -32,7 +35,7 @@ class Publisher:
     queue
         How many messages may wait for a slow reader; it misses what comes while so many wait.
     linger_ms
-        How long `close` may take to deliver what is queued.
+        How long `close` may take to deliver what is queued, and to wait for readers to hear the end.
 
     Raises
     ------
@@ -44,7 +47,9 @@ class Publisher:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.XPUB)
         self._socket.sndhwm = queue
-        self._socket.linger = linger_ms
+        self._socket.linger = self._linger_ms = linger_ms
+        self._listening = False
+        self._last: Sequence[bytes] | None = None
         try:
             self._socket.bind(endpoint)
         except zmq.ZMQError as error:
@@ -61,20 +66,41 @@ class Publisher:
         self.close()
 
     def wait_for_listener(self, timeout_s: float) -> bool:
-        """Wait until somebody has subscribed; False if nobody has in time."""
-        if not self._socket.poll(int(timeout_s * 1000)):
-            return False
-        self._socket.recv()
-        return True
+        """Wait until somebody listens; False if nobody does in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while not self._listening and self._socket.poll(max(0, int((deadline_s - time.monotonic()) * 1000))):
+            self._hear()
+        return self._listening
 
-    def publish(self, frames: Sequence[bytes]) -> None:
-        """Send one message."""
+    def publish(self, frames: Sequence[bytes], *, last: bool = False) -> None:
+        """Send one message.
+
+        Parameters
+        ----------
+        frames
+            Of the message.
+        last
+            It is the end, for which readers wait: `close` repeats it until nobody listens any more.
+        """
+        self._last = frames if last else None
         self._socket.send_multipart(frames)
 
     def close(self) -> None:
-        """Deliver what is queued, within the time for that, and close."""
+        """Deliver what is queued and the end, if there was one, within the time for that, and close."""
+        deadline_s = time.monotonic() + self._linger_ms / 1000
+        while self._last is not None:
+            while self._socket.poll(0):
+                self._hear()
+            if not self._listening or time.monotonic() >= deadline_s:
+                break
+            self._socket.send_multipart(self._last)  # a slow reader has missed it, as any other message
+            self._socket.poll(_REPEAT_MS)
         self._socket.close()
         self._context.term()
+
+    def _hear(self) -> None:
+        """Take in that the first listener has come, or the last one has gone."""
+        self._listening = self._socket.recv()[:1] == b"\1"
 
 
 class Subscriber:
@@ -112,6 +138,11 @@ class Subscriber:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return bool(self._socket.closed)
 
     def poll(self, timeout_ms: int) -> bool:
         """Wait until there is a message to receive; False if there was none in time."""

@@ -4,7 +4,8 @@
 A message has a first frame in msgpack, ``{"shmmap_scan": 1, "name", "stamp_s", "pose", "columns"}``,
 and one frame of plain bytes for each column.  ``pose`` is null or 16 numbers, the rows of
 T_map_sensor; ``columns`` are ``[name, dtype, shape]`` with numpy's dtype strings (``"<f4"``), in the
-order of the frames.  ``"last": true`` (without columns) says that no more scans come.
+order of the frames.  ``"last": true`` (without columns) says that no more scans come; it may come again
+and again until its reader unsubscribes.
 """
 
 from __future__ import annotations
@@ -106,11 +107,11 @@ class ScanPublisher(Publisher):
 
     def send(self, scan: Scan | None) -> None:
         """Send a scan; None: the last one was sent."""
-        self.publish(encode_scan(scan))
+        self.publish(encode_scan(scan), last=scan is None)
 
 
 class ScanSubscriber(Subscriber):
-    """Scans from a publisher: iterate until it sends the last one.
+    """Scans from a publisher: iterate until it has sent the last one; then nobody listens here any more.
 
     Parameters
     ----------
@@ -130,7 +131,8 @@ class ScanSubscriber(Subscriber):
         return self
 
     def __next__(self) -> Scan:
-        scan = decode_scan(self.receive())
+        scan = None if self.closed else decode_scan(self.receive())
         if scan is None:
+            self.close()  # the publisher repeats the end for as long as somebody listens
             raise StopIteration
         return scan

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from shmmap_clients.scans import scan_stream
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_source import open_scans
 from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber, decode_scan, encode_scan
@@ -128,11 +130,39 @@ def test_scans_over_a_socket(tmp_path: Path) -> None:
             publisher.send(Scan(f"s{n}", n, make_scan().columns))
         publisher.send(None)
         assert [scan.name for scan in subscriber] == ["s0", "s1", "s2"]
-        assert not publisher.wait_for_listener(0.0)
     with pytest.raises(BadRequest):
         ScanPublisher("nowhere")
     with pytest.raises(BadRequest):
         ScanSubscriber("nowhere")
+
+
+def test_a_slow_reader_hears_the_end(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/scans"
+    sent = 1000  # more than fit into both queues
+    publisher = ScanPublisher(endpoint)
+    with ScanSubscriber(endpoint) as subscriber:
+        assert publisher.wait_for_listener(30.0)
+        for n in range(sent):
+            publisher.send(Scan(str(n), n, {"xyz": np.zeros((1000, 3), np.float32)}))
+        publisher.send(None)
+        closing = threading.Thread(target=publisher.close)
+        closing.start()
+        heard = [int(scan.name) for scan in subscriber]
+        closing.join()
+        assert list(subscriber) == []
+    assert 0 < len(heard) < sent  # it was slow: it has missed some
+    assert heard == sorted(set(heard))
+
+
+def test_nobody_who_does_not_read_holds_up_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan_stream, "_LINGER_MS", 50)
+    endpoint = f"ipc://{tmp_path}/scans"
+    with ScanPublisher(endpoint) as publisher:
+        assert not publisher.wait_for_listener(0.0)
+        publisher.send(None)
+    with ScanSubscriber(endpoint), ScanPublisher(endpoint) as publisher:
+        assert publisher.wait_for_listener(30.0)
+        publisher.send(None)  # and closes, the reader still there
 
 
 def test_scans_as_an_option_names_them(tmp_path: Path) -> None:
