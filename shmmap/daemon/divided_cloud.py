@@ -63,7 +63,8 @@ def find_origin(config: DaemonConfig) -> MapOrigin:
     suffix = os.path.splitext(path)[1].lower()
     is_cloud = os.path.isfile(path) and suffix in CLOUD_SUFFIXES and not config.metadata
     if is_cloud and not (suffix == ".pcd" and is_served_whole(path)):
-        return DividedCloud(path, config.cache_dir or default_cache_directory(), strict=config.strict)
+        cache_dir = absolute_path(config.cache_dir or default_cache_directory())
+        return DividedCloud(path, cache_dir, strict=config.strict)
     return open_map(
         path,
         metadata=config.metadata or None,
@@ -80,7 +81,7 @@ class DividedCloud:
     path
         The cloud, absolute.
     cache_dir
-        Where divided clouds are kept, and indexes of large maps.
+        Where divided clouds are kept, and indexes of large maps; absolute.
     strict
         As in `open_map`.
     tell
@@ -132,8 +133,15 @@ class DividedCloud:
         _log.info("dividing %s into %s", self.path, out)
         command = [sys.executable, "-m", "shmmap.daemon.divider", self.path, out, str(os.getpid())]
         failure: dict[str, Any] = {}
-        pipe = subprocess.PIPE
-        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, text=True) as process:
+        with subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+            errors="replace",  # libraries may write there, too
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            cwd="/",  # nothing is imported from where the daemon happens to run
+        ) as process:
             try:
                 stage = ""
                 for line in process.stdout or ():
@@ -220,7 +228,7 @@ def _point(link: str, name: str) -> None:
 
 
 def _told(line: str) -> dict[str, Any]:
-    """What a line of the divider says; libraries may write there, too."""
+    """What a line of the divider says, empty if it is not its own."""
     try:
         told = json.loads(line)
     except ValueError:

@@ -76,6 +76,7 @@ from shmmap.daemon.time_slices import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.workers import WorkerPool
 from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
@@ -121,7 +122,12 @@ def run(config: DaemonConfig) -> int:
         stack.callback(directory.close)
         pins = choose_pins(directory)
         origin = find_origin(config)
-        config = dataclasses.replace(config, map_path=origin.path)
+        config = dataclasses.replace(  # loaders and clients run elsewhere
+            config,
+            map_path=origin.path,
+            shm_dir=directory.path,
+            cache_dir=absolute_path(config.cache_dir or default_cache_directory()),
+        )
         with signals.held():
             lock = InstanceLock(_lock_path(path))
             stack.callback(lock.release)
@@ -223,7 +229,7 @@ class _Life:
             config.load_timeout_s,
             watch=lambda fd: self._running.watch_worker(fd),
             unwatch=lambda fd: self._running.unwatch(fd),
-            cache_dir=config.cache_dir or default_cache_directory(),
+            cache_dir=config.cache_dir,
             cache_bytes=config.cache_bytes,
         )
         self._store = Store(

@@ -71,6 +71,16 @@ def test_a_change_is_seen_and_nothing_old_stays(tmp_path: Path) -> None:
     assert len([name for name in os.listdir(folder) if not name.startswith(".")]) == 2
 
 
+def test_where_the_daemon_was_started_plays_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What lies there is not imported, and a cache named from there is found again from elsewhere."""
+    (tmp_path / "json.py").write_text("raise SystemExit('somebody else wrote this')")
+    monkeypatch.chdir(tmp_path)
+    cloud(tmp_path / "a.laz.pcd")
+    monkeypatch.setattr(single_pcd, "MAX_SINGLE_PCD_BYTES", 500)
+    catalogue = find_origin(DaemonConfig(map_path="a.laz.pcd", cache_dir="cache")).load()
+    assert catalogue.id_prefix.startswith(f"{tmp_path}/cache/divided/")
+
+
 def test_errors_of_the_divider_are_the_daemon_s(tmp_path: Path) -> None:
     path = cloud(tmp_path / "a.pcd")
     os.truncate(path, path.stat().st_size - 3)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+import shmmap
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
@@ -233,3 +234,17 @@ def test_strangers_segments_are_left_alone(
     assert (other.read_bytes(), longer.read_bytes()) == (b"mine", b"mine")
     other.unlink()
     longer.unlink()
+
+
+def test_directories_are_named_from_where_the_daemon_was_started(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    """Its loaders and its clients, who are elsewhere, mean the same ones."""
+    one = daemon(divided_map.root, start=False)
+    one.command = ["env", "-C", str(tmp_path)]
+    one.arguments = ["--shm-dir", os.path.relpath(one.shm_dir, tmp_path), "--cache-dir", "cache"]
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        assert client.welcome.shm_dir == one.shm_dir
+        assert len(client.around(0, 0, 5, layers="voxel(leaf=1.0)")) == 4
+    assert list((tmp_path / "cache" / "layers").iterdir())
