@@ -50,7 +50,7 @@ from shmmap.daemon.event_socket import EventSocket, events_path
 from shmmap.daemon.eviction import POLICIES
 from shmmap.daemon.instance_lock import InstanceLock
 from shmmap.daemon.leftovers import Leftovers
-from shmmap.daemon.listening import bind_socket
+from shmmap.daemon.listening import bind_socket, remove_socket
 from shmmap.daemon.logs import set_up_logging
 from shmmap.daemon.map_watch import MapWatch, directories_of
 from shmmap.daemon.own_names import lock_name, stopped_early, take_away
@@ -336,8 +336,8 @@ class _Life:
             if self._map_watch is not None:
                 self._map_watch.close()
             if self._owns_socket:
-                Path(self._socket_path).unlink(missing_ok=True)
-            Path(events_path(self._socket_path)).unlink(missing_ok=True)
+                remove_socket(self._socket_path)
+            remove_socket(events_path(self._socket_path))
 
     def _watch_map(self, server: Server) -> None:
         config = self._config
