@@ -43,12 +43,21 @@ class Reloader:
 
     def ask(self, answer: Answer) -> None:
         """Have the catalogue loaded; ``answer`` is called from `collect`."""
-        if self._thread is not None:
-            self._next.append(answer)
-            return
-        self._asked = [answer]
+        self._next.append(answer)
+        if not self._asked:
+            self._begin()
+
+    def _begin(self) -> None:
+        self._asked, self._next = self._next, []
         self._thread = threading.Thread(target=self._load, name="reload", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError as error:  # there are as many threads as there may be
+            self._thread = None
+            self._result = ShmmapError(
+                f"{self._origin.path}: {error}", hint="raise the limit of processes (TasksMax=, ulimit -u)"
+            )
+            os.eventfd_write(self.fd, 1)
 
     def _load(self) -> None:
         try:
@@ -65,10 +74,9 @@ class Reloader:
     def collect(self, apply: Callable[[Catalogue], None], failed: Callable[[ShmmapError], None]) -> None:
         """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
         os.eventfd_read(self.fd)
-        if self._thread is None:
-            return
-        self._thread.join()
-        self._thread = None
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
         result, asked = self._result, self._asked
         self._result, self._asked = None, []
         if isinstance(result, Catalogue):
@@ -79,10 +87,8 @@ class Reloader:
         if result is not None:
             for answer in asked:
                 answer(result)
-        waiting, self._next = self._next, []
-        if waiting:
-            self.ask(waiting[0])
-            self._asked = waiting
+        if self._next and not self._asked:
+            self._begin()
 
     def close(self) -> None:
         """Forget a running load; its thread ends with the process."""
