@@ -70,7 +70,7 @@ class EventLog:
     def page(self, message: Recent) -> EventPage:
         """Answer who asks for events again."""
         first = self.last - len(self._kept) + 1
-        skip = max(0, message.after + 1 - first)
+        skip = min(max(0, message.after + 1 - first), len(self._kept))
         limit = max(0, min(message.limit, PAGE_EVENTS))
         kept = itertools.islice(self._kept, skip, None)
         chosen = (msgspec.Raw(data) for at_ns, data in kept if at_ns >= message.since_unix_ns)

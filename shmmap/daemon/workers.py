@@ -25,6 +25,9 @@ _log = logging.getLogger(__name__)
 JOBS_AHEAD = 4
 """Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
 
+END_PATIENCE_S = 0.1
+"""How long the loop waits for a killed worker to end; one that hangs in the kernel may take for ever."""
+
 START_DEADLINE_S = 60.0
 """How long a worker may take from its first job until it is ready: an interpreter and its imports."""
 
@@ -89,6 +92,7 @@ class WorkerPool:
         self._unwatch = unwatch
         self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
         self._workers: dict[int, Worker] = {}
+        self._ending: list[subprocess.Popen[bytes]] = []
         self.failed_starts = 0
 
     def __len__(self) -> int:
@@ -103,10 +107,16 @@ class WorkerPool:
 
     @property
     def has_room(self) -> bool:
-        """Whether a job can be given to somebody."""
-        return len(self._workers) < self._limit or any(
-            len(worker.queue) <= JOBS_AHEAD for worker in self._workers.values()
-        )
+        """Whether a job can be given to somebody.
+
+        Workers that were killed and have not ended count: on a file system that hangs they would pile up.
+        """
+        self._ending = [process for process in self._ending if process.poll() is None]
+        return self._may_start or any(len(worker.queue) <= JOBS_AHEAD for worker in self._workers.values())
+
+    @property
+    def _may_start(self) -> bool:
+        return len(self._workers) + len(self._ending) < self._limit
 
     def start_one(self) -> Worker:
         """Start a worker process."""
@@ -143,7 +153,7 @@ class WorkerPool:
     def submit(self, job: jobs.Job | jobs.Check, now_s: float) -> bool:
         """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
         worker = min(self._workers.values(), key=lambda w: len(w.queue), default=None)
-        if worker is None or (worker.queue and len(self._workers) < self._limit):
+        if worker is None or (worker.queue and self._may_start):
             try:
                 worker = self.start_one()
             except OSError as error:  # no more processes, memory or descriptors just now
@@ -210,8 +220,11 @@ class WorkerPool:
         if worker.segment_fd >= 0:
             os.close(worker.segment_fd)
         worker.process.kill()
-        code = worker.process.wait()
-        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        try:
+            how = _how(worker.process.wait(END_PATIENCE_S))
+        except subprocess.TimeoutExpired:
+            self._ending.append(worker.process)
+            how = "killed, and has not ended yet"
         return list(worker.queue.values()), how
 
     def overdue(self, now_s: float) -> list[Worker]:
@@ -229,3 +242,13 @@ class WorkerPool:
         """End every worker."""
         for worker in self:
             self.remove(worker)
+
+
+def _how(code: int) -> str:
+    """What an exit code says, for people."""
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return f"signal {signal.Signals(-code).name}"
+    except ValueError:  # those between SIGRTMIN and SIGRTMAX have no names
+        return f"signal {-code}"

@@ -34,6 +34,7 @@ def test_events_are_numbered_sent_and_remembered() -> None:
     assert (page.request, page.epoch, page.first, page.next, numbers(page)) == (5, 7, 1, 4, [1, 2, 3])
     assert numbers(log.page(e.Recent(5, after=1))) == [2, 3]
     assert numbers(log.page(e.Recent(5, after=99))) == []
+    assert numbers(log.page(e.Recent(5, after=2**64 - 1))) == []
     assert numbers(log.page(e.Recent(5, since_unix_ns=3))) == [3]
     assert numbers(log.page(e.Recent(5, limit=2))) == [1, 2]
     assert numbers(log.page(e.Recent(5, limit=-1))) == []

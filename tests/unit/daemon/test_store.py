@@ -170,6 +170,54 @@ def test_a_load_that_took_too_long_is_not_tried_again_at_once(
     puppet.channel.close()
 
 
+class Unkillable:
+    """A process that SIGKILL does not end: it waits in the kernel for a disk that never answers."""
+
+    def __init__(self) -> None:
+        self.code: int | None = None
+        self.killed = False
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def poll(self) -> int | None:
+        return self.code
+
+    def wait(self, timeout: float | None = None) -> int:
+        assert timeout is not None, "this would be for ever"
+        raise subprocess.TimeoutExpired("loader", timeout)
+
+
+def test_a_loader_that_cannot_be_killed(puppet: Puppet) -> None:
+    """The loop goes on without it, and starts no other in its place until it has ended."""
+    one, sleeper = puppet.one, puppet.worker.process
+    stuck = Unkillable()
+    puppet.worker.process = stuck  # type: ignore[assignment]
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
+    puppet.queue(1)
+    one.offset_s += 31.0
+    assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
+    assert stuck.killed
+    assert not one.pool.has_room
+    stuck.code = -signal.SIGKILL
+    one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=300.0), one.now_s())
+    assert len(one.cells_of(2).cells) == 1
+    sleeper.kill()
+    sleeper.wait()
+    puppet.channel.close()
+
+
+def test_a_signal_without_a_name(puppet: Puppet) -> None:
+    one = puppet.one
+    ask(one, 1)
+    puppet.queue(4)
+    puppet.worker.process.send_signal(signal.SIGRTMIN + 5)
+    puppet.worker.process.wait()
+    puppet.channel.close()
+    assert ["signal 39" in failure.message for failure in one.cells_of(1).failed] == [True]
+
+
 def test_done_without_a_segment(puppet: Puppet) -> None:
     """As when this process has no descriptor left: the load fails, nothing stays reserved for it."""
     one = puppet.one
