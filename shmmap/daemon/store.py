@@ -27,6 +27,7 @@ from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident, Slot
 from shmmap.daemon.resident_forms import cell_row, encode_handles
 from shmmap.daemon.workers import WorkerPool
+from shmmap.geometry import ZRange
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
@@ -149,6 +150,13 @@ class Store:
                 self._enter(resident, index)
                 self.events.revived(resident)
         return resident
+
+    def at_height(self, indices: list[int], z: ZRange | None) -> list[int]:
+        """Leave out cells whose heights, known once they were loaded, lie outside the range."""
+        if z is None:
+            return indices
+        heights = self.heights
+        return [i for i in indices if (known := heights.get(i)) is None or z.overlaps(*known)]
 
     def want(self, index: int, layer: str, priority: float, now_s: float, asker: Hashable = None) -> Slot:
         """Make sure that a load of a cold cell is under way, unless it failed too recently."""
