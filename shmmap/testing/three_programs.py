@@ -315,12 +315,20 @@ def _sample(result: ThreePrograms, programs: dict[str, _Program], shm_dir: Path,
     """Look at the memory of the programs, and at the daemon's segments."""
     for program in programs.values():
         program.sample()
-    total = 0
+    before, after = _segments(shm_dir, instance), _segments(shm_dir, instance)
+    # what was there both times was there at once; a sum over names as they come and go would be too large
+    result.segment_bytes.append(sum(after[inode][1] for inode in before.keys() & after.keys()))
+    result.segments_seen.update(name.removesuffix(".zombie") for name, _ in after.values())
+
+
+def _segments(shm_dir: Path, instance: str) -> dict[int, tuple[str, int]]:
+    """Name and bytes of each file of the daemon, by inode."""
+    found = {}
     for path in shm_dir.glob(f"shmmap.{instance}.*"):
         with contextlib.suppress(OSError):
-            total += path.stat().st_blocks * 512
-            result.segments_seen.add(path.name.removesuffix(".zombie"))
-    result.segment_bytes.append(total)
+            status = path.stat()
+            found[status.st_ino] = (path.name, status.st_blocks * 512)
+    return found
 
 
 def table(result: ThreePrograms) -> list[str]:

@@ -22,7 +22,7 @@ class ComparedScan:
     scan, comparison
         The scan, sensor frame, and which of its points are kept.
     complete
-        Whether every cell of the window was there.
+        Whether every cell of the window was there when it was compared.
     """
 
     scan: Scan
@@ -61,9 +61,14 @@ def compare_drive(
         T = scan.T_map_sensor
         if T is None:
             raise BadRequest(f"scan {scan.name} has no pose", hint="give poses with --poses FILE")
-        window.move_to(float(T[0, 3]), float(T[1, 3]), wait=patience)
-        if window.error is not None and not window.cells:
-            raise window.error
+        update = window.move_to(float(T[0, 3]), float(T[1, 3]), wait=patience)
+        error = window.error
+        # all from one state of the window: it may ask again while the scan is compared
+        cells = (*update.added, *update.kept, *update.changed)
+        if error is not None and not cells:
+            raise error
         patience = wait_s
-        comparison = compare.follow(window).apply(scan.xyz, T)
-        yield ComparedScan(scan, comparison, window.complete and window.error is None)
+        comparison = compare.use_cells(cells).apply(scan.xyz, T)
+        complete = update.complete and error is None
+        del update, cells  # what leaves the window is not held until the next scan has come
+        yield ComparedScan(scan, comparison, complete)
