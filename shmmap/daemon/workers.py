@@ -9,7 +9,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from shmmap.daemon import jobs
+from shmmap.daemon.worker_process import start_worker
 
 __all__ = ["Worker", "WorkerPool"]
 
@@ -120,30 +120,7 @@ class WorkerPool:
 
     def start_one(self) -> Worker:
         """Start a worker process."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        try:
-            process = subprocess.Popen(
-                [
-                    sys.executable, "-m", "shmmap.daemon.worker",
-                    str(theirs.fileno()), str(os.getpid()), self._shm_dir, *self._cache,
-                ],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                # one loader, one core: Open3D would start a thread for each
-                env={
-                    "OMP_NUM_THREADS": "1",
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-                },
-                cwd="/",  # nothing is imported from where the daemon happens to run
-                start_new_session=True,
-            )  # fmt: skip
-        except BaseException:
-            ours.close()
-            raise
-        finally:
-            theirs.close()
+        process, ours = start_worker("shmmap.daemon.worker", self._shm_dir, *self._cache, new_session=True)
         ours.setblocking(False)
         worker = Worker(process, ours)
         self._workers[worker.fd] = worker

@@ -9,12 +9,10 @@ what is in the cache is only looked at.
 from __future__ import annotations
 
 import contextlib
-import os
 import selectors
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -22,6 +20,7 @@ from typing import Final, Protocol
 import msgspec
 
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
+from shmmap.daemon.worker_process import start_worker
 from shmmap.errors import InternalError
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.spec import canonical_layers
@@ -124,23 +123,7 @@ class _Run:
         return task
 
     def _start(self, task: work.CellWork) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            process = subprocess.Popen(
-                [
-                    sys.executable, "-m", "shmmap.prepare.worker",
-                    str(theirs.fileno()), str(os.getpid()), *self._arguments,
-                ],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                env={
-                    "OMP_NUM_THREADS": "1",
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-                },
-                cwd="/",
-            )  # fmt: skip
+        process, ours = start_worker("shmmap.prepare.worker", *self._arguments, new_session=False)
         worker = _Worker(process, ours)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
