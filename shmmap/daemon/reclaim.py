@@ -73,8 +73,8 @@ class Reclaimer:
 
     Attributes
     ----------
-    freed_count, evicted_count
-        Segments whose memory went back to the kernel; segments retired to make room.
+    evicted_count
+        Segments retired to make room.
     on_retired, on_freed
         Called with a segment that left service and why (``room``, ``request``, ``map``,
         ``superseded``), and with one whose memory went back.
@@ -99,7 +99,6 @@ class Reclaimer:
         self._by_key: dict[Key, Zombie] = {}
         self.on_retired: Callable[[Resident, str], None] = _nothing_more
         self.on_freed: Callable[[Resident], None] = _nothing
-        self.freed_count = 0
         self.evicted_count = 0
         self.wake_s = float("inf")
 
@@ -176,7 +175,6 @@ class Reclaimer:
             session = self._sessions.by_slot(slot)
             if session is not None:
                 session.drop_segment(resident)
-        self.freed_count += 1
         self.on_freed(resident)
         return self._books.freed(resident.name)
 

@@ -370,11 +370,6 @@ class Residency:
         self.zombie_bytes -= zombie.resident.nbytes
         return zombie.resident.nbytes
 
-    def lost(self, resident: Resident) -> None:
-        """A segment's name vanished behind the daemon's back; it no longer counts."""
-        self.retire(resident)
-        self.freed(resident.name)
-
     def condemned_bytes(self) -> int:
         """Bytes of zombies that nobody had open at the last look: they are about to be freed."""
         return sum(z.resident.nbytes for z in self.zombies.values() if z.condemned)

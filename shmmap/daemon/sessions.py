@@ -150,7 +150,7 @@ def command_of(pid: int) -> str:
 
 
 class Sessions:
-    """All sessions of this epoch, by routing identity, slot and pidfd.
+    """All sessions of this epoch, by routing identity and slot.
 
     Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
     it maps is locked under its slot, also when a later life of the daemon asks whose that is.
@@ -161,7 +161,6 @@ class Sessions:
     def __init__(self) -> None:
         self._by_identity: dict[bytes, Session] = {}
         self._by_slot: dict[int, Session] = {}
-        self._by_pidfd: dict[int, Session] = {}
 
     def __len__(self) -> int:
         return len(self._by_slot)
@@ -176,10 +175,6 @@ class Sessions:
     def by_slot(self, slot: int) -> Session | None:
         """The session whose lock byte is ``slot``."""
         return self._by_slot.get(slot)
-
-    def by_pidfd(self, pidfd: int) -> Session | None:
-        """The session whose process this descriptor watches."""
-        return self._by_pidfd.get(pidfd)
 
     @property
     def full(self) -> bool:
@@ -224,8 +219,6 @@ class Sessions:
         )
         self._by_identity[identity] = session
         self._by_slot[slot] = session
-        if pidfd >= 0:
-            self._by_pidfd[pidfd] = session
         return session
 
     def close(self, session: Session) -> None:
@@ -235,7 +228,6 @@ class Sessions:
             del self._by_identity[session.identity]
         self._by_slot.pop(session.slot, None)
         if session.pidfd >= 0:
-            self._by_pidfd.pop(session.pidfd, None)
             os.close(session.pidfd)
             session.pidfd = -1
 

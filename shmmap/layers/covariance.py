@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["CONVENTIONS", "Convention", "unpacked", "voxel_covariances"]
+__all__ = ["CONVENTIONS", "Convention", "voxel_covariances"]
 
 Convention: TypeAlias = Literal["autoware", "pclomp", "pcl"]
 CONVENTIONS: Final[tuple[Convention, ...]] = ("autoware", "pclomp", "pcl")
@@ -69,8 +69,3 @@ def voxel_covariances(
         inverse,
     )
     return covariance, inverse
-
-
-def unpacked(packed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (V, 3, 3) symmetric matrices from (V, 6) xx, xy, xz, yy, yz, zz."""
-    return packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)

@@ -24,9 +24,6 @@ __all__ = [
 
 DaemonState: TypeAlias = Literal["healthy", "stopped", "hung", "dead"]
 
-BEAT_INTERVAL_S: Final = 0.5
-"""The daemon beats at least this often, however idle it is."""
-
 HUNG_AFTER_S: Final = 5.0
 """A running daemon without a beat for this long is called hung."""
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from functools import cached_property
 from types import TracebackType
-from typing import Literal
+from typing import Literal, TypeVar
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.names import statistics_name
@@ -30,6 +31,8 @@ from shmmap.statistics.layout import (
 )
 
 __all__ = ["Snapshot", "StatisticsReader", "read_statistics"]
+
+_Row = TypeVar("_Row")
 
 _ATTEMPTS = 100
 _TABLE_ATTEMPTS = 16
@@ -118,33 +121,30 @@ class Snapshot:
 
         A row the daemon was changing at that very moment (it was stopped in mid-write) is left out.
         """
-        found = []
-        for data in _pieces(self._rows, self._header.row_bytes if self._header is not None else 0):
-            try:
-                row = unpack_cell(data)
-            except SegmentCorrupt:
-                continue
-            if row is not None:
-                found.append(row)
-        return sorted(found, key=lambda row: (row.id, row.layer, row.version))
+        step = self._header.row_bytes if self._header is not None else 0
+        return sorted(
+            _in_use(self._rows, step, unpack_cell), key=lambda row: (row.id, row.layer, row.version)
+        )
 
     @cached_property
     def clients(self) -> list[ClientRow]:
         """The clients there is room for in the table, in the order they came."""
-        found = []
-        for data in _pieces(self._clients, self._header.client_row_bytes if self._header is not None else 0):
-            try:
-                row = unpack_client(data)
-            except SegmentCorrupt:
-                continue
-            if row is not None:
-                found.append(row)
-        return found
+        step = self._header.client_row_bytes if self._header is not None else 0
+        return _in_use(self._clients, step, unpack_client)
 
 
-def _pieces(data: bytes, step: int) -> list[memoryview]:
+def _in_use(data: bytes, step: int, unpack: Callable[[memoryview], _Row | None]) -> list[_Row]:
+    """The rows of a table that are in use, but for those that were being changed."""
+    found = []
     view = memoryview(data)
-    return [view[at : at + step] for at in range(0, len(view) - step + 1, step)] if step else []
+    for at in range(0, len(view) - step + 1, step) if step else ():
+        try:
+            row = unpack(view[at : at + step])
+        except SegmentCorrupt:
+            continue
+        if row is not None:
+            found.append(row)
+    return found
 
 
 class StatisticsReader:

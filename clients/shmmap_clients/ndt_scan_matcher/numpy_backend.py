@@ -66,6 +66,11 @@ class _Gaussians:
         return self._inverse[covariance]
 
 
+def _unpacked(packed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Symmetric matrices (V, 3, 3) from their xx, xy, xz, yy, yz, zz."""
+    return packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
 class NumpyBackend:
     """`Backend` by whole-array operations; ``threads`` are not used."""
 
@@ -166,7 +171,7 @@ class NumpyBackend:
             return sums
         near = inverse[voxel]
         d = moved[point] - self._gaussians.mean[voxel]
-        C = near[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        C = _unpacked(near)
         q = np.matmul(C, d[:, :, None])[:, :, 0]
         exponent = 0.5 * gauss.d2 * (d * q).sum(axis=1)
         e = np.exp(-exponent)
@@ -179,7 +184,7 @@ class NumpyBackend:
         upper = q[:, [0, 0, 0, 1, 1, 2]] * q[:, [0, 1, 2, 1, 2, 2]]
         a = np.add.reduceat(w[:, None] * q, starts)
         b = np.add.reduceat(w[:, None] * (near - gauss.d2 * upper), starts)
-        b_full = b[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        b_full = _unpacked(b)
         jacobian = np.matmul(x, J.transpose(2, 1, 0).reshape(3, 9)).reshape(-1, 3, 3)
         bj = np.matmul(b_full, jacobian)
         jbj = np.matmul(jacobian.transpose(0, 2, 1), bj).sum(axis=0)

@@ -89,15 +89,11 @@ def test_a_watched_process() -> None:
     assert f"Pid:\t{os.getpid()}" in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
     assert session.client == "x" * 64
     assert session.command == command_of(os.getpid()) != ""
-    assert sessions.by_pidfd(pidfd) is sessions.get(b"1") is sessions.by_slot(session.slot) is session
+    assert sessions.get(b"1") is sessions.by_slot(session.slot) is session
     sessions.close(session)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(pidfd)
-    assert (sessions.get(b"1"), sessions.by_slot(session.slot), sessions.by_pidfd(pidfd)) == (
-        None,
-        None,
-        None,
-    )
+    assert (sessions.get(b"1"), sessions.by_slot(session.slot)) == (None, None)
     sessions.close(session)  # twice does no harm
 
 

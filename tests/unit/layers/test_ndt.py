@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.build import build_layer
 from shmmap.layers.contract import LayerTable
-from shmmap.layers.covariance import CONVENTIONS, Convention, unpacked, voxel_covariances
+from shmmap.layers.covariance import CONVENTIONS, Convention, voxel_covariances
 from shmmap.testing.layer_clouds import CORNERS, corner, surface
 from shmmap.testing.layer_oracles import covariance_of, voxels_of
 
 MOVED = np.array([89570.0, 42300.0, 0.0])
+
+
+def unpacked(packed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(V, 3, 3) symmetric matrices from (V, 6) xx, xy, xz, yy, yz, zz."""
+    return packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def rows_of(layer: LayerTable) -> NDArray[np.int64]:
