@@ -7,7 +7,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb, numbers, size_bytes
-from shmmap.cli.output import format_bytes, format_duration, print_json, print_pairs
+from shmmap.cli.work_result import fields_text, print_result
 
 if TYPE_CHECKING:
     from shmmap.dividing.frame import Translation
@@ -106,7 +106,6 @@ def run(args: argparse.Namespace) -> int:
 
     from shmmap.cli.work_progress import StageProgress
     from shmmap.dividing.divide import divide
-    from shmmap.dividing.memory import peak_memory_bytes
     from shmmap.dividing.settings import DivideSettings
 
     origin_x, origin_y = args.origin
@@ -131,12 +130,7 @@ def run(args: argparse.Namespace) -> int:
         print("shmmap: interrupted\nhint: the same command with --resume goes on", file=sys.stderr)
         raise
     seconds = time.monotonic() - began_s
-    if args.json:
-        from dataclasses import asdict
-
-        print_json({**asdict(made), "seconds": seconds, "peak_memory_bytes": peak_memory_bytes()})
-        return 0
-    print_pairs([*_lines(made), ("time", f"{format_duration(seconds)}, {format_bytes(peak_memory_bytes())}")])
+    print_result(made, _lines(made), seconds=seconds, as_json=args.json)
     return 0
 
 
@@ -162,7 +156,7 @@ def _lines(made: DividedMap) -> list[tuple[str, str]]:
         ("map", made.path),
         ("cells", f"{made.cells:,} of {made.cell_size:g} m"),
         ("points", f"{made.points:,} of {made.points_read:,}{left_out}"),
-        ("fields", " ".join(f"{name}:{dtype.lstrip('<|')}" for name, dtype in made.fields)),
+        ("fields", fields_text(made.fields)),
     ]
     if made.resumed_points:
         lines.append(("resumed", f"after {made.resumed_points:,} points"))

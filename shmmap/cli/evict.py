@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.options import Subparsers, add_cells_argument, add_daemon_options, add_verb, cells_or_all
 from shmmap.cli.output import print_json
 
 __all__ = ["add_parser", "run"]
@@ -27,7 +27,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Retire cells from shared memory.  Those a process maps are freed when it lets go.",
         json=_JSON,
     )
-    parser.add_argument("cells", metavar="CELL", nargs="*", help="ids, or file names where unique")
+    add_cells_argument(parser)
     parser.add_argument("--all", action="store_true", help="every cell")
     add_daemon_options(parser)
 
@@ -35,12 +35,10 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what became free."""
     from shmmap.cli.daemon_address import connect
-    from shmmap.errors import BadRequest
 
-    if bool(args.cells) == args.all:
-        raise BadRequest("evict: say which cells, or --all", hint="shmmap evict --help")
+    cells = cells_or_all(args, "evict")
     with connect(args) as client:
-        answer = client.evict(None if args.all else args.cells)
+        answer = client.evict(cells)
     if args.json:
         print_json(
             {

@@ -4,9 +4,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
-from shmmap.cli.output import format_bytes, format_duration, print_json, print_pairs
+from shmmap.cli.output import format_bytes
+from shmmap.cli.work_result import fields_text, print_result
+
+if TYPE_CHECKING:
+    from shmmap.dividing.merge import MergedCloud
 
 __all__ = ["add_parser", "run"]
 
@@ -48,7 +53,6 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.work_progress import StageProgress
-    from shmmap.dividing.memory import peak_memory_bytes
     from shmmap.dividing.merge import merge
 
     began_s = time.monotonic()
@@ -62,21 +66,18 @@ def run(args: argparse.Namespace) -> int:
         progress=StageProgress(quiet=args.quiet),
     )
     seconds = time.monotonic() - began_s
-    if args.json:
-        from dataclasses import asdict
-
-        print_json({**asdict(made), "seconds": seconds, "peak_memory_bytes": peak_memory_bytes()})
-        return 0
-    print_pairs(
-        [
-            ("cloud", f"{made.path} ({format_bytes(made.bytes)})"),
-            ("points", f"{made.points:,} of {made.files:,} files"),
-            ("fields", " ".join(f"{name}:{dtype.lstrip('<|')}" for name, dtype in made.fields)),
-            *(
-                ("note", f"moved by ({', '.join(f'{v:.12g}' for v in origin)}) m, to the frame before {path}")
-                for path, origin in made.origin.items()
-            ),
-            ("time", f"{format_duration(seconds)}, {format_bytes(peak_memory_bytes())}"),
-        ]
-    )
+    print_result(made, _lines(made), seconds=seconds, as_json=args.json)
     return 0
+
+
+def _lines(made: MergedCloud) -> list[tuple[str, str]]:
+    notes = [
+        ("note", f"moved by ({', '.join(f'{v:.12g}' for v in origin)}) m, to the frame before {path}")
+        for path, origin in made.origin.items()
+    ]
+    return [
+        ("cloud", f"{made.path} ({format_bytes(made.bytes)})"),
+        ("points", f"{made.points:,} of {made.files:,} files"),
+        ("fields", fields_text(made.fields)),
+        *notes,
+    ]

@@ -16,11 +16,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Subparsers",
     "add_area_options",
+    "add_cells_argument",
     "add_daemon_options",
     "add_json_option",
     "add_statistics_options",
     "add_verb",
     "area_from",
+    "cells_or_all",
     "numbers",
     "seconds",
     "size_bytes",
@@ -113,6 +115,18 @@ def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) ->
         type=seconds,
         help="how long to wait for an answer (default: 0.9 to connect, then 5)",
     )
+
+
+def add_cells_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``CELL...``."""
+    parser.add_argument("cells", metavar="CELL", nargs="*", help="ids, or file names where unique")
+
+
+def cells_or_all(args: argparse.Namespace, verb: str) -> list[str] | None:
+    """Return the cells that were named, or None for ``--all``; one of both has to be given."""
+    if bool(args.cells) == args.all:
+        raise BadRequest(f"{verb}: say which cells, or --all", hint=f"shmmap {verb} --help")
+    return args.cells or None
 
 
 def add_area_options(parser: argparse.ArgumentParser, group: argparse._MutuallyExclusiveGroup) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.options import Subparsers, add_cells_argument, add_daemon_options, add_verb
 from shmmap.cli.output import Column, format_bytes, print_json, print_table
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "Without cells: list what is pinned.",
         json=PINS_JSON,
     )
-    parser.add_argument("cells", metavar="CELL", nargs="*", help="ids, or file names where unique")
+    add_cells_argument(parser)
     parser.add_argument(
         "--layer", metavar="SPEC", nargs="+", default=["points"], help="layers to keep (default: points)"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.options import Subparsers, add_cells_argument, add_daemon_options, add_verb, cells_or_all
 from shmmap.cli.pin import PINS_JSON, print_pins
 
 __all__ = ["add_parser", "run"]
@@ -22,7 +22,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "pinned.",
         json=PINS_JSON,
     )
-    parser.add_argument("cells", metavar="CELL", nargs="*", help="ids, or file names where unique")
+    add_cells_argument(parser)
     parser.add_argument("--all", action="store_true", help="every pinned cell")
     add_daemon_options(parser)
 
@@ -30,10 +30,8 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what stays pinned."""
     from shmmap.cli.daemon_address import connect
-    from shmmap.errors import BadRequest
 
-    if bool(args.cells) == args.all:
-        raise BadRequest("unpin: say which cells, or --all", hint="shmmap unpin --help")
+    cells = cells_or_all(args, "unpin")
     with connect(args) as client:
-        answer = client.unpin(None if args.all else args.cells)
+        answer = client.unpin(cells)
     return print_pins(answer, as_json=args.json)
