@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.drive_errors import pose_errors
 from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
 from shmmap_clients.ndt_scan_matcher.follower import Follower, Frame
 from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
@@ -21,6 +22,7 @@ from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
 from tests.process.conftest import DaemonFactory
+from tests.support.drive_sender import PERIOD_S, to_and_fro
 from tests.support.town_drive import TownDrive, make_town_drive
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher"]
@@ -63,15 +65,64 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     # the drive is 72 m long: no map is outrun, however fast
     words += ["--update-distance", "20", "--map-radius", "200", "--lidar-radius", "100", "--thin", "0.5"]
     words += ["--steady", "--odometry", str(drive.truth), "--tum", str(tmp_path / "out.tum")]
-    words += ["--plot", str(tmp_path / "out.svg"), "--publish", f"ipc://{tmp_path}/poses", "--json"]
-    done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr + done.stdout
+    address = f"ipc://{tmp_path}/poses"
+    words += ["--plot", str(tmp_path / "out.svg"), "--publish", address, "--listener-wait", "60", "--json"]
+    listener = subprocess.Popen(
+        [sys.executable, "-m", "tests.support.pose_listener", address, "36"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr + done.stdout
+        heard = json.loads(listener.communicate(timeout=60.0)[0])
+    finally:
+        listener.kill()
+        listener.wait()
     summary = json.loads(done.stdout)
     assert summary["frames"] == summary["trustworthy"] == 36
     assert summary["errors"]["ate_m"]["max"] < 0.2
     assert summary["errors"]["rte"]["10.0"] < 2.0
-    assert len(read_trajectory(tmp_path / "out.tum")) == 36
+    written = read_trajectory(tmp_path / "out.tum")
+    assert len(written) == 36
     ElementTree.parse(tmp_path / "out.svg")
+    # the listener has every pose, in order
+    assert [pose["name"] for pose in heard] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]
+    assert all(pose["shmmap_pose"] == 1 and pose["trustworthy"] for pose in heard)
+    np.testing.assert_allclose([pose["stamp_s"] for pose in heard], written.stamps_s)
+    poses = np.array([pose["T"] for pose in heard]).reshape(-1, 4, 4)
+    np.testing.assert_allclose(poses, written.T_map_sensor, atol=1e-5)
+
+
+def test_scans_and_odometry_come_from_another_process(
+    drive: TownDrive, daemon: DaemonFactory, tmp_path: Path
+) -> None:
+    one = daemon(drive.map_dir)
+    scans, odometry, poses = (f"ipc://{tmp_path}/{name}" for name in ("scans", "odometry", "poses"))
+    words = ["follow", "--endpoint", one.endpoint, "--scans", scans, "--thin", "0.5"]
+    words += ["--odometry", odometry, "--odometry-wait", "60", "--publish", poses, "--listener-wait", "60"]
+    words += ["--init", ",".join(repr(float(value)) for value in drive.poses[0])]
+    words += ["--map-radius", "200", "--tum", str(tmp_path / "out.tum"), "--json"]
+    sender = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "tests.support.drive_sender"),
+            *(drive.scans, drive.truth, scans, odometry, poses),
+        ]
+    )
+    try:
+        done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr + done.stdout
+        assert sender.wait(60.0) == 0
+    finally:
+        sender.kill()
+        sender.wait()
+    assert json.loads(done.stdout)["trustworthy"] == 36
+    found = read_trajectory(tmp_path / "out.tum")
+    np.testing.assert_allclose(found.stamps_s, PERIOD_S * np.arange(36))
+    true = np.array([matrix_from_pose(drive.poses[index]) for index in to_and_fro(36)])
+    metres, degrees = pose_errors(found.T_map_sensor, true)
+    assert metres.max() < 0.2
+    assert degrees.max() < 0.5
 
 
 def test_a_map_that_cannot_keep_up_is_an_error(drive: TownDrive, daemon: DaemonFactory) -> None:

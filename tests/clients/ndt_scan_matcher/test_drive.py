@@ -131,7 +131,8 @@ def test_poses_and_odometry_travel(tmp_path: Path) -> None:
             assert publisher.wait_for_listener(60.0)
             for index, T in enumerate(drive.T_map_sensor):
                 publisher.send(frame(index, T, None))
-            assert listener.wait_for(5, 60.0)
+            assert listener.wait_until(float(drive.stamps_s[-1]), 60.0)
+            assert not listener.wait_until(float(drive.stamps_s[-1]) + 0.1, 0.0)
             heard = listener.trajectory
         finally:
             listener.close()

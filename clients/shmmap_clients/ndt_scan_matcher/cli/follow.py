@@ -42,6 +42,14 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--odometry", metavar="FILE|ENDPOINT", help="TUM file, or poses over ZeroMQ")
     parser.add_argument(
+        "--odometry-wait",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="how long a scan may wait until an endpoint's odometry has reached its time (default: not at"
+        " all; what is not there yet is predicted at constant velocity)",
+    )
+    parser.add_argument(
         "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m; 0: all)"
     )
     parser.add_argument("--frames", type=int, metavar="N", help="stop after so many scans")
@@ -57,6 +65,13 @@ def add_parser(subparsers: Any) -> None:
     out = parser.add_argument_group("output")
     out.add_argument("--tum", metavar="FILE", help="write poses in the TUM format")
     out.add_argument("--publish", metavar="ENDPOINT", help="bind a ZeroMQ publisher of poses")
+    out.add_argument(
+        "--listener-wait",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="how long to wait for the first subscriber, which then gets every pose (default: not at all)",
+    )
     out.add_argument("--plot", metavar="FILE", help="write an SVG of way, errors and latency")
     add_json_option(out)
     add_daemon_options(parser)
@@ -81,8 +96,16 @@ def run(args: argparse.Namespace) -> int:
 
     frames: list[Frame] = []
     with contextlib.ExitStack() as stack:
+        # all sockets before the first scan: who waits for this program's subscription finds it
+        publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
+        listener = None
+        if args.odometry is not None and is_endpoint(args.odometry):
+            listener = OdometryListener(args.odometry)
+            stack.callback(listener.close)
         source = open_scans(args.scans, args.truth, stack)
         scans = iter(_paced(source, args.rate) if args.rate and not is_endpoint(args.scans) else source)
+        if publisher is not None and args.listener_wait > 0:
+            publisher.wait_for_listener(args.listener_wait)
         first = next(scans, None)
         if first is None:
             raise BadRequest("there are no scans")
@@ -93,12 +116,11 @@ def run(args: argparse.Namespace) -> int:
         else:
             raise BadRequest("where does the drive begin?", hint="give --init, or poses with --truth")
         prediction: Prediction
-        if args.odometry is None:
+        if listener is not None:
+            heard = listener
+            prediction = Odometry(T_first, lambda: heard.trajectory)
+        elif args.odometry is None:
             prediction = ConstantVelocity(T_first)
-        elif is_endpoint(args.odometry):
-            listener = OdometryListener(args.odometry)
-            stack.callback(listener.close)
-            prediction = Odometry(T_first, lambda: listener.trajectory)
         else:
             read = read_trajectory(args.odometry)
             prediction = Odometry(T_first, lambda: read)
@@ -109,11 +131,12 @@ def run(args: argparse.Namespace) -> int:
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(MapUpdater(client, rules, prepare=matcher.prepare))
         follower = Follower(matcher, maps, prediction, thin=args.thin or None)
-        publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
         tum = stack.enter_context(open(args.tum, "w", encoding="utf-8")) if args.tum else None
         told = 0
         scan = first
         while scan is not None and (args.frames is None or len(frames) < args.frames):
+            if listener is not None and args.odometry_wait > 0:
+                listener.wait_until(scan.stamp_s, args.odometry_wait)
             frame = follower.follow(scan)
             frames.append(frame)
             if publisher is not None:
