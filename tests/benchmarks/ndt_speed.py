@@ -12,21 +12,17 @@ fresh process within 1 s once the kernels are cached.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, pose_from_matrix, voxel_cell
 
 from tests.benchmarks.ndt_clouds import Pair, data_dir, real_pair, synthetic
-
-LIBRARIES = ("registration", "filters", "search", "kdtree", "common")
+from tests.support.pcl_ndt import PclNdt, build_pcl_ndt
 
 
 def align_ms(
@@ -55,32 +51,6 @@ def evaluation_ms(pair: Pair, repeats: int) -> tuple[float, float]:
             (at,) = matcher.evaluate(pair.source, pose)
             costs.append(time.process_time() - begin)
     return min(costs) * 1e3, at.score
-
-
-def pcl_evaluation_ms(program: Path, pair: Pair, repeats: int) -> tuple[float, float]:
-    """Return the same of PCL's."""
-    folder = program.parent
-    for name, cloud in (("target", pair.target), ("source", pair.source)):
-        np.ascontiguousarray(cloud, np.float32).tofile(folder / name)
-    words = [str(folder / "target"), str(folder / "source"), pair.leaf, *pair.guess, repeats]
-    done = subprocess.run([program, *map(str, words)], capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    return found["ms"], found["score"]
-
-
-def built_pcl(folder: Path) -> Path | None:
-    """Compile the PCL program; None where it cannot be."""
-    headers = sorted(Path("/usr/include").glob("pcl-*"))
-    if shutil.which("g++") is None or not headers:
-        return None
-    program = folder / "ndt_pcl"
-    # not -march=native: Eigen would align otherwise than in Debian's libraries, and crash
-    command = ["g++", "-O3", "-msse4.2", "-std=c++17", f"-I{headers[-1]}", "-I/usr/include/eigen3"]
-    source = Path(__file__).with_name("ndt_pcl.cpp")
-    subprocess.run(
-        [*command, str(source), "-o", str(program), *(f"-lpcl_{name}" for name in LIBRARIES)], check=True
-    )
-    return program
 
 
 FIRST = """
@@ -122,16 +92,17 @@ def main() -> None:
         print(f"working point, {backend}, {threads} thread(s) {took}")
     print(f"first alignment of a fresh process, kernels cached: {first_alignment_s():.2f} s")
     with tempfile.TemporaryDirectory() as folder:
-        program = built_pcl(Path(folder))
+        program = build_pcl_ndt(Path(folder))
         if program is None:
             print("PCL: not measured, g++ or libpcl-dev is missing")
             return
         for cloud in (pair, city):
             ours, score = evaluation_ms(cloud, args.repeats)
-            theirs, their_score = pcl_evaluation_ms(program, cloud, args.repeats)
+            with PclNdt(program, cloud.target, cloud.source, cloud.leaf) as pcl:
+                theirs = pcl.evaluate(pose_from_matrix(cloud.T_guess), args.repeats)
             print(
-                f"one evaluation, {cloud.name:9} PCL {theirs:7.3f} ms, ours {ours:7.3f} ms, ratio"
-                f" {ours / theirs:.3f}; scores {their_score:.4f} and {score:.4f}"
+                f"one evaluation, {cloud.name:9} PCL {theirs.ms:7.3f} ms, ours {ours:7.3f} ms, ratio"
+                f" {ours / theirs.ms:.3f}; scores {theirs.score:.4f} and {score:.4f}"
             )
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The line search of More and Thuente (1994) as PCL and ndt_omp have it, to the letter.
 
-Where the originals divide by zero they go on with an infinity or a NaN; so does this.
+Where the originals divide by zero they go on with an infinity or a NaN; so does this.  They differ in one
+case, see `search_step`.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ def search_step(
     phi_0: float,
     slope_0: float,
     phi: Callable[[float], tuple[float, float]],
+    *,
+    by_upper_end: bool,
 ) -> tuple[float, int]:
     """Return a step length along a descent direction, and how many trials it took after the first.
 
@@ -48,9 +51,12 @@ def search_step(
         The negated score and its slope at the start; the slope is negative.
     phi
         The same at a step length.
+    by_upper_end
+        Where the last trial has become the lower end: PCL 1.13 takes the cubic through the upper end,
+        ndt_omp divides by zero.
     """
     with np.errstate(all="ignore"):
-        return _search(first, step_min, step_max, np.float64(phi_0), np.float64(slope_0), phi)
+        return _search(first, step_min, step_max, np.float64(phi_0), np.float64(slope_0), phi, by_upper_end)
 
 
 def _search(
@@ -60,6 +66,7 @@ def _search(
     phi_0: np.float64,
     slope_0: np.float64,
     phi: Callable[[float], tuple[float, float]],
+    by_upper_end: bool,
 ) -> tuple[float, int]:
     zero = np.float64(0.0)
     # psi(a) = phi(a) - phi(0) - mu phi'(0) a, eq. 2.1
@@ -72,7 +79,9 @@ def _search(
     at_psi = _psi(at_phi, phi_0, slope_0)
     trials = 0
     while not converged and trials < MAX_TRIALS and not (at_psi.f <= 0 and at_phi.g <= -_NU * slope_0):
-        a = np.float64(_clip(_trial(low, high, at_psi if opened else at_phi), step_min, step_max))
+        a = np.float64(
+            _clip(_trial(low, high, at_psi if opened else at_phi, by_upper_end), step_min, step_max)
+        )
         value, slope = phi(float(a))
         at_phi = _Point(a, np.float64(value), np.float64(slope))
         at_psi = _psi(at_phi, phi_0, slope_0)
@@ -126,8 +135,10 @@ def _secant(end: _Point, at: _Point) -> np.float64:
     return crossing
 
 
-def _trial(low: _Point, high: _Point, at: _Point) -> float:
+def _trial(low: _Point, high: _Point, at: _Point, by_upper_end: bool) -> float:
     """Trial value selection, section 4 of More and Thuente 1994."""
+    if by_upper_end and at.a == low.a:
+        return float(at.a if at.a == high.a else _cubic(high, at))
     if at.f > low.f:
         cubic = _cubic(low, at)
         quadratic = low.a - 0.5 * (low.a - at.a) * low.g / (low.g - (low.f - at.f) / (low.a - at.a))

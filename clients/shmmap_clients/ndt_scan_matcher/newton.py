@@ -161,7 +161,9 @@ def _take_step(
         length = max(min(length, longest), shortest)
         phi(length)
         return length, direction, latest
-    length, trials = search_step(length, shortest, longest, -at.score, slope, phi)
+    length, trials = search_step(
+        length, shortest, longest, -at.score, slope, phi, by_upper_end=rule.convention.name == "pcl"
+    )
     if trials and sign > 0:
         # ndt_omp computes the Hessian anew after a search, and there with the right sign
         latest = evaluate(start + direction * length, -1.0)

@@ -8,11 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.ndt_scan_matcher import Caps, Evaluation, VoxelMap, matrix_from_pose, pose_from_matrix
+from shmmap_clients.ndt_scan_matcher import (
+    Caps,
+    Evaluation,
+    VoxelMap,
+    matrix_from_pose,
+    pose_from_matrix,
+    voxel_cell,
+)
 from shmmap_clients.ndt_scan_matcher.backend import backend_named
 
 from tests.clients.ndt_scan_matcher.brute_force import rotation, score
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+from tests.clients.ndt_scan_matcher.textbook import Textbook
 
 NEIGHBORS = ("direct1", "direct7", "radius")
 COVARIANCES = ("autoware", "pclomp", "pcl")
@@ -71,6 +79,24 @@ def test_the_backends_agree_and_equal_the_definition(
     assert (compiled.found, compiled.neighbours) == (found, number)
     assert compiled.score == pytest.approx(total, rel=1e-12)
     assert compiled.nearest == pytest.approx(nearest, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("neighbors", NEIGHBORS)
+@pytest.mark.parametrize("covariance", COVARIANCES)
+def test_any_leaf_and_pose_equal_the_textbook(
+    points: NDArray[np.float64], neighbors: str, covariance: str, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    leaf = float(rng.uniform(0.6, 4.0))
+    pose = TRUTH + rng.uniform(-1, 1, 6) * [1.0, 1.0, 0.5, 0.1, 0.1, 0.5]
+    scan = scan_from(points, TRUTH, 150, seed)
+    expected, gradient, hessian = Textbook(points, leaf, covariance).derivatives(scan, pose, neighbors)
+    settings: dict[str, Any] = {"neighbors": neighbors, "covariance": covariance}
+    found = evaluated("numba", VoxelMap({"map": voxel_cell(points, leaf)}), scan, pose, **settings)
+    assert found.score == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(found.gradient, gradient, rtol=0, atol=1e-8 * np.abs(gradient).max())
+    np.testing.assert_allclose(found.hessian, hessian, rtol=0, atol=1e-6 * np.abs(hessian).max())
 
 
 @pytest.mark.parametrize("backend", ["numba", "numpy"])

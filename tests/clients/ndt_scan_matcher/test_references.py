@@ -78,6 +78,32 @@ def test_alignments_equal_the_originals(data_dir: Path, backend: str) -> None:
     assert checked == 32
 
 
+def test_alignments_equal_the_originals_at_other_leaf_sizes_and_guesses(data_dir: Path) -> None:
+    folder = data_dir / "ndt"
+    rows = json.loads(Path(__file__).with_name("reference_alignments.json").read_text(encoding="utf-8"))
+    for row in rows["alignments"]:
+        settings = Settings(
+            "autoware" if row["program"] == "autoware" else "pclomp",
+            row["neighbors"],
+            epsilon=row["epsilon"],
+            max_iterations=row["max_iterations"],
+        )
+        with NdtMatcher(settings) as matcher:
+            matcher.set_map(target(folder, row["dataset"], row["leaf"]))
+            result = matcher.align(
+                clouds(folder, row["dataset"])[1], matrix_from_pose(np.array(row["guess"]))
+            )
+        T = np.array(row["T"]).reshape(3, 4)
+        what = str({name: value for name, value in row.items() if name != "T"})
+        assert result.iterations == row["iterations"], what
+        np.testing.assert_allclose(result.T_map_base[:3, 3], T[:, 3], atol=1e-4, err_msg=what)
+        np.testing.assert_allclose(result.T_map_base[:3, :3], T[:, :3], atol=1e-5, err_msg=what)
+        assert result.transform_probability == pytest.approx(row["transform_probability"], abs=1e-4), what
+        if "nvtl" in row:
+            assert result.nvtl == pytest.approx(row["nvtl"], abs=1e-4), what
+    assert len(rows["alignments"]) == 78
+
+
 @pytest.mark.parametrize("leaf", [1.0, 2.0])
 @pytest.mark.parametrize("covariance", ["autoware", "pclomp", "pcl"])
 def test_voxel_statistics_equal_the_originals(data_dir: Path, leaf: float, covariance: str) -> None:
