@@ -57,7 +57,7 @@ class CellAnswers:
 
     def answer(self, wanted: Wanted, now_s: float) -> None:
         """Send what there is by now of everything that is wanted."""
-        warm = self._store.warm
+        warm = self._store.warm.layers
         answer = Answer()
         if wanted.area is not None and wanted.area.z is not None:
             inside = set(self._store.at_height([index for index, _ in wanted.cells], wanted.area.z))

@@ -141,7 +141,7 @@ class CellRequests:
 
     def _begin(self, wanted: Wanted, wait_s: float | None, now_s: float) -> None:
         check_count(len(wanted.cells))
-        warm = self._store.warm
+        warm = self._store.warm.layers
         find = self._store.find_warm
         cold = [
             (index, layer)

@@ -41,7 +41,7 @@ def warm_difference(
 
     ``found`` are the catalogue indices of the area's cells, ascending.
     """
-    known = store.versions.get(layer)
+    known = store.warm.versions.get(layer)
     if known is None:
         return None
     versions = known[found].tolist()
@@ -55,7 +55,7 @@ def warm_difference(
         held.update(cast("list[int]", given))
     if 0 in current:
         return None  # 0 stands for "not in memory"
-    warm, index_of = store.warm[layer], store.index_of_version
+    warm, index_of = store.warm.layers[layer], store.index_of_version
     missing = [index_of[version] for version in current - held]
     missing.sort()
     removed: tuple[str, ...] = ()
@@ -79,7 +79,7 @@ def _removed_names(
     removed: dict[str, None] = {}
     for cell_id in [cell.id for cell in named if cell.version in gone]:
         index = store.index_of(cell_id)
-        resident = store.warm[layer].get(index) if index is not None else None
+        resident = store.warm.get(index, layer) if index is not None else None
         if resident is None or resident.version not in current:
             removed[cell_id] = None
     return tuple(removed)

@@ -84,10 +84,7 @@ class Heartbeat:
         set_value("workers", len(self._store.loads.pool))
         set_value("load_queue", books.queued)
         set_value("cells_resident", books.resident_count)
-        set_value(
-            "stale_cells",
-            books.resident_count - books.unchecked_count - sum(map(len, self._store.warm.values())),
-        )
+        set_value("stale_cells", books.resident_count - books.unchecked_count - len(self._store.warm))
         set_value("bytes_resident", books.resident_bytes)
         set_value("zombies", len(books.zombies))
         set_value("bytes_zombie", books.zombie_bytes)

@@ -67,11 +67,11 @@ def admitted_layers(store: Store, specs: Sequence[str]) -> tuple[str, ...]:
     if len(specs) > MOST_LAYERS:
         raise BadRequest(f"{len(specs)} layers in one request; {MOST_LAYERS} is the most")
     layers = canonical_layers(specs)
-    new = [layer for layer in layers if layer not in store.warm]
+    new = [layer for layer in layers if layer not in store.warm.layers]
     most = max(LEAST_LAYERS_IN_MEMORY, LAYER_TABLES_BYTES // (8 * max(1, len(store.catalogue))))
-    if new and len(store.warm) >= most:
+    if new and len(store.warm.layers) >= most:
         raise BadRequest(
-            f"{len(store.warm)} different layers are in memory already, {most} is the most",
+            f"{len(store.warm.layers)} different layers are in memory already, {most} is the most",
             hint="agree on parameters, or `shmmap evict` what nobody needs",
         )
     return layers

@@ -42,12 +42,12 @@ class SessionQuota:
 
     def check(self, wanted: Wanted, cold: Sequence[tuple[int, str]]) -> None:
         """Note in ``wanted.refused`` what is too much, farthest cells first; ``cold`` is not in memory."""
-        session, store = wanted.session, self._store
+        session, store, warm = wanted.session, self._store, self._store.warm.layers
         if self.is_out_of_reach(session) and not cold:
             return
         chilled = set(cold)
         sizes = [
-            store.estimate(index, layer) if (index, layer) in chilled else store.warm[layer][index].nbytes
+            store.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes
             for index, layer in wanted.cells
         ]
         if session.held_bytes + sum(sizes) <= self._nbytes:
@@ -64,7 +64,7 @@ class SessionQuota:
                 continue
             counted.add((index, layer))
             key = Key(store.catalogue.id(index), layer)
-            resident = None if (index, layer) in chilled else store.warm[layer][index]
+            resident = None if (index, layer) in chilled else warm[layer][index]
             if resident is not None and resident.sessions:
                 continue  # somebody keeps it anyway, perhaps this session itself
             left -= sizes[position] - replaced.get(key, 0)

@@ -14,9 +14,6 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from shmmap.daemon import jobs
 from shmmap.daemon.cell_events import CellEvents
 from shmmap.daemon.event_log import EventLog
@@ -26,6 +23,7 @@ from shmmap.daemon.name_watch import NameWatch
 from shmmap.daemon.reclaim import Reclaimer
 from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident, Slot
 from shmmap.daemon.resident_forms import cell_row, encode_handles
+from shmmap.daemon.warm_cells import WarmCells
 from shmmap.daemon.workers import WorkerPool
 from shmmap.geometry import ZRange
 from shmmap.layers.points import LAYER
@@ -70,10 +68,10 @@ class Store:
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
     used : set
         Segments handed out since the statistics last showed them.
-    warm : dict
-        Per layer, catalogue index to resident segment of the cell's *current* version.
-    versions : dict
-        Per layer, (cells,) uint64: that version, 0 where the cell is not in memory.
+    warm
+        The cells that are in memory at their current version.
+    heights : dict
+        Catalogue indices to lowest and highest z, metres, of cells that were loaded since they changed.
     index_of_version : dict
         Versions handed out (current and earlier ones) to catalogue indices.
     """
@@ -100,8 +98,7 @@ class Store:
         self.reclaimer = reclaimer
         self.layers = LayerVersions(lambda: self.catalogue)
         self.loads = Loading(self, residency, reclaimer, pool, statistics, on_settled)
-        self.warm: dict[str, dict[int, Resident]] = {}
-        self.versions: dict[str, NDArray[np.uint64]] = {}
+        self.warm = WarmCells(lambda: len(self.catalogue))
         self.id_prefix = id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
@@ -142,7 +139,7 @@ class Store:
 
     def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
         """The current version of a cell, if it is in memory (retired ones are put back in service)."""
-        resident = self.warm.get(layer, {}).get(index)
+        resident = self.warm.get(index, layer)
         if resident is None and self.books.zombies:
             key = Key(self.catalogue.id(index), layer)
             resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
@@ -199,7 +196,7 @@ class Store:
                 return None
             load.estimate = self.estimate(index, load.key.layer)
         layer = load.key.layer
-        points = self.warm.get(LAYER, {}).get(index) if layer != LAYER else None
+        points = self.warm.get(index, LAYER) if layer != LAYER else None
         return jobs.Job(
             number,
             load.key.cell_id,
@@ -325,11 +322,7 @@ class Store:
         encode_handles(resident, *self._names_of(resident))
         current = resident.version == self.layers.version(index, resident.key.layer)
         if current:
-            self.warm.setdefault(resident.key.layer, {})[index] = resident
-            versions = self.versions.get(resident.key.layer)
-            if versions is None:
-                versions = self.versions[resident.key.layer] = np.zeros(len(self.catalogue), np.uint64)
-            versions[index] = resident.version
+            self.warm.enter(resident, index)
             self.heights[index] = (resident.z_min, resident.z_max)
         self.index_of_version[resident.version] = index
         self._indices[self.wire_id(resident.key.cell_id)] = index
@@ -340,12 +333,8 @@ class Store:
         self.events.retired(resident, why)
         self.used.discard(resident)
         index = self.index_of(resident.key.cell_id)
-        warm = self.warm.get(resident.key.layer, {})
-        if index is not None and warm.get(index) is resident:
-            del warm[index]
-            self.versions[resident.key.layer][index] = 0
-            if not warm:  # whoever asks for ever new layers must not fill the daemon's memory
-                del self.warm[resident.key.layer], self.versions[resident.key.layer]
+        if index is not None and self.warm.get(index, resident.key.layer) is resident:
+            self.warm.leave(index, resident.key.layer)
         self._show(resident, "zombie")
 
     def _show(self, resident: Resident, state: str = "resident") -> None:
@@ -380,15 +369,9 @@ class Store:
         """
         self.heights.pop(index, None)
         self.layers.forget()
-        for layer, warm in self.warm.items():
+        for layer in list(self.warm.layers):
             for cell in (index, *self.layers.neighbours(index, layer)):
-                if warm.pop(cell, None) is not None:
-                    self.versions[layer][cell] = 0
-
-    def _chill_one(self, resident: Resident, index: int) -> None:
-        warm = self.warm.get(resident.key.layer, {})
-        if warm.pop(index, None) is not None:
-            self.versions[resident.key.layer][index] = 0
+                self.warm.leave(cell, layer)
 
     def evict(self, resident: Resident, now_s: float, why: str = "request") -> bool:
         """Retire on request; True if nobody has it mapped."""
@@ -413,7 +396,6 @@ class Store:
         if renumbered:
             self._indices.clear()
             self.warm.clear()
-            self.versions.clear()
             self.heights.clear()
             self.index_of_version.clear()
             for zombie in self.books.zombies.values():
@@ -435,7 +417,7 @@ class Store:
                 self.evict(resident, now_s, "map")
                 self.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
-            self._chill_one(resident, index)
+            self.warm.leave(index, resident.key.layer)
             if not resident.checked and not self.is_current(resident):
                 self.evict(resident, now_s, "map")
                 continue

@@ -191,7 +191,7 @@ def test_heights_of_a_replaced_file_are_unknown(inner: Inner, small_map: Divided
 def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     everything(one)
-    evicted = one.store.warm["points"][one.store.index_of("0_0.pcd") or 0]
+    evicted = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
     with open(path_of(one, evicted.name.rsplit(".", 1)[1]), "rb") as held:
         one.store.evict(evicted, one.now_s())  # a zombie while it moves
         small_map.corners["0_0.pcd"] = (400, 400)
@@ -238,8 +238,8 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
     session = one.session()
     one.cells.selected(session, Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0), one.now_s())
     one.cells_of(1)
-    first = one.store.warm["points"][one.store.index_of("0_0.pcd") or 0]
-    second = one.store.warm["points"][one.store.index_of("20_20.pcd") or 0]
+    first = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    second = one.store.warm.layers["points"][one.store.index_of("20_20.pcd") or 0]
     wanted = ("0_0.pcd", "20_20.pcd", "20_0.pcd")
     with loaders_standing_still(one), open(path_of(one, second.name.rsplit(".", 1)[1]), "rb"):
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
@@ -488,7 +488,7 @@ def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
     session = one.session()
     one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
     one.cells_of(1)
-    first = one.store.warm["points"][one.store.index_of("0_0.pcd") or 0]
+    first = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
     wanted = ("0_0.pcd", "0_0.pcd", "20_0.pcd")
     with loaders_standing_still(one):
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())

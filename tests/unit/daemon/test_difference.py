@@ -63,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     inner.reload()
     after = ask(inner, 2, EVERYWHERE)
     names = sorted(made.corners)
-    inner.store.evict(inner.store.warm["points"][names.index(COLD)], inner.now_s() - 1.0)
+    inner.store.evict(inner.store.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
     inner.run_until(lambda: not inner.books.zombies)
     assert set(before) == set(names)
     assert set(after) == set(names) - {BROKEN}

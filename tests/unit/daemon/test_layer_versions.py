@@ -69,9 +69,9 @@ def test_forgotten_layers_leave_no_tables(tmp_path: Path, inner: Inner) -> None:
     session = one.session()
     for number in range(1, 4):
         ask(one, session, number, f"voxel(leaf={number}.0)")
-    assert len(one.store.warm) == len(one.store.versions) == 3
+    assert len(one.store.warm.layers) == len(one.store.warm.versions) == 3
     for resident in list(one.books.residents()):
         one.store.evict(resident, one.now_s())
-    assert one.store.warm == {}
-    assert one.store.versions == {}
+    assert one.store.warm.layers == {}
+    assert one.store.warm.versions == {}
     assert len(ask(one, session, 9, "voxel(leaf=1.0)").cells) == 2
