@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import weakref
 from collections.abc import Sequence
+from itertools import chain
 from types import TracebackType
-from typing import Final
+from typing import Any, Final
+
+from numpy.typing import NDArray
 
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
@@ -163,7 +167,7 @@ class MapWindow:
         vx: float = 0.0,
         vy: float = 0.0,
         heading: float | None = None,
-        route: Sequence[tuple[float, float]] = (),
+        route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         wait: float | None = None,
     ) -> WindowUpdate:
         """Tell the window the pose; returns what has changed since the last call.
@@ -177,7 +181,7 @@ class MapWindow:
         heading
             Radians, counter-clockwise from the map's x axis.
         route
-            The polyline ahead, (x, y) each; the daemon keeps what lies along it.
+            The polyline ahead, (x, y) each or (N, 2); the daemon keeps what lies along it.
         wait
             Seconds this call may take until the window is current.  None: no waiting in the background mode,
             5 s in the blocking one, which waits no longer than half a second for cells that do not fit in
@@ -186,14 +190,15 @@ class MapWindow:
         Raises
         ------
         BadRequest
-            The pose makes no sense, the window is closed, or this is a forked child.
+            A number is missing or makes no sense, the window is closed, or this is a forked child.
         ShmmapError
             Only in the blocking mode: the daemon cannot be asked; the window keeps what it has.
         """
-        Circle(x, y, 0.0)
+        pose = _intent(x, y, vx, vy, heading, route)
+        if wait is not None and not wait >= 0:
+            raise BadRequest(f"wait must not be negative, it is {wait!r}")
         if self._closed:
             raise BadRequest("this window is closed")
-        pose = Intent(x, y, vx, vy, heading, tuple(route))
         follower = self._follower
         if follower is None:
             self._refresh(pose, _BLOCKING_WAIT_S if wait is None else wait)
@@ -318,3 +323,23 @@ class MapWindow:
             Circle(x, y, radius)
             return PointsAround(x, y, radius, (), ())
         return points_around(cells, state.boxes[name], x, y, radius)
+
+
+def _intent(
+    x: float,
+    y: float,
+    vx: float,
+    vy: float,
+    heading: float | None,
+    route: Sequence[tuple[float, float]] | NDArray[Any],
+) -> Intent:
+    """Return a pose as it travels, whatever kind of numbers it came in."""
+    try:
+        path = tuple([(float(route_x), float(route_y)) for route_x, route_y in route])
+        angle = None if heading is None else float(heading)
+        pose = Intent(float(x), float(y), float(vx), float(vy), angle, path)
+    except (TypeError, ValueError) as error:
+        raise BadRequest(f"pose: numbers are needed, and two for each point of a route: {error}") from error
+    if not all(map(math.isfinite, (pose.x, pose.y, pose.vx, pose.vy, angle or 0.0, *chain(*path)))):
+        raise BadRequest("pose: every number in it must be finite")
+    return pose

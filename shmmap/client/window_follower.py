@@ -90,7 +90,7 @@ class WindowFollower:
     def wait_until_current(self, timeout_s: float) -> bool:
         """Wait until the state answers the latest pose and nothing is missing; False at the deadline."""
         with self._changed:
-            return self._changed.wait_for(self._is_current, timeout_s)
+            return self._changed.wait_for(self._is_current, min(timeout_s, threading.TIMEOUT_MAX))
 
     def _is_current(self) -> bool:
         pose = self._pose
@@ -107,8 +107,8 @@ class WindowFollower:
             return
         self._stopping = True
         self._mailbox.put(None)
-        self._thread.join()
-        self._unmapper.stop_deferring(self._mailbox)
+        if threading.current_thread() is not self._thread:  # else garbage is being collected in it
+            self._thread.join()
 
     # --- the thread -----------------------------------------------------------------------------------
 
@@ -126,6 +126,8 @@ class WindowFollower:
         except BaseException as error:
             self._publish(self.state, InternalError(f"the window's thread ended: {error!r}"))
             raise
+        finally:
+            self._unmapper.stop_deferring(self._mailbox)
 
     def _wait(self, until_s: float) -> bool:
         """Unmap what arrives, until it is time to ask or there is a new pose; False at the end."""

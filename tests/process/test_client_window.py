@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import shutil
@@ -10,13 +11,14 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import shmmap
+from shmmap.client.retention import Departed
 from shmmap.errors import BadRequest, DaemonUnreachable, NoAnswer
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -283,6 +285,88 @@ cells = window.cells
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert int(done.stdout) == len(divided_map.in_circle(0, 0, 30))
+
+
+def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: DividedMap) -> None:
+    """Garbage is collected in whatever thread: the window's own one ends all the same, and keeps nothing."""
+    one = daemon(divided_map.root)
+    dropped, collected = threading.Event(), threading.Event()
+
+    class Collects:
+        """A policy that is asked in the window's thread."""
+
+        def keep(self, departed: Sequence[Departed]) -> list[bool]:
+            assert dropped.wait(LONG_S)
+            gc.collect()
+            collected.set()
+            return [False] * len(departed)
+
+    with shmmap.connect(one.endpoint) as client:
+        window = shmmap.MapWindow(client, 30, retention=Collects())
+        window.move_to(0, 0, wait=LONG_S)
+        view = window.cells[0].xyz
+        thread = window._follower._thread  # type: ignore[union-attr]
+        gc.collect()
+        gc.disable()
+        try:
+            window.move_to(60, 60)
+            cycle = [window]
+            cycle.append(cycle)  # type: ignore[arg-type]
+            del window, cycle
+            dropped.set()
+            assert collected.wait(LONG_S)
+        finally:
+            gc.enable()
+        thread.join(LONG_S)
+        assert not thread.is_alive()
+        client.release()
+        assert np.isfinite(view).all()
+        del view
+        assert client.release() == 1, "what ends now is unmapped at once, and told"
+
+
+def test_a_window_whose_thread_ended(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy of the user's that fails: the window says so, and what is dropped is unmapped."""
+    one = daemon(divided_map.root)
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+
+    class Fails:
+        def keep(self, departed: Sequence[Departed]) -> list[bool]:
+            raise ZeroDivisionError(len(departed))
+
+    with shmmap.connect(one.endpoint) as client:
+        window = shmmap.MapWindow(client, 30, retention=Fails())
+        window.move_to(0, 0, wait=LONG_S)
+        thread = window._follower._thread  # type: ignore[union-attr]
+        window.move_to(60, 60)
+        thread.join(LONG_S)
+        assert "ZeroDivisionError" in str(window.error)
+        cells = client.around(-50, -50, 5)
+        client.release()
+        del cells
+        assert client.release() > 0
+        window.close()
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_poses_as_planners_have_them(daemon: Factory, divided_map: DividedMap, background: bool) -> None:
+    """A route may be an array; what makes no sense is refused in the caller's thread."""
+    one = daemon(divided_map.root)
+    with shmmap.MapWindow(one.endpoint, 30, update_distance=0, background=background) as window:
+        route = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
+        assert window.move_to(0, 0, vx=np.float32(1.0), route=route, wait=LONG_S).complete
+        for odd in (
+            {"vx": np.nan}, {"heading": np.inf}, {"route": [(1.0, np.nan)]}, {"route": [(1.0,)]},
+            {"route": np.zeros((2, 3))}, {"route": ["ab"]}, {"route": [3.0]}, {"vy": None}, {"heading": "N"},
+            {"wait": np.nan}, {"wait": -1.0},
+        ):  # fmt: skip
+            with pytest.raises(BadRequest):
+                window.move_to(50, 50, **odd)  # type: ignore[arg-type]
+        assert window.move_to(1, 0, route=route, wait=np.inf).complete
+        assert window.wait_until_current(np.inf)
+        assert window.error is None
 
 
 def test_a_closed_window(daemon: Factory, divided_map: DividedMap) -> None:
