@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import threading
 import time
@@ -140,6 +141,8 @@ class Session:
         populate
             Let the kernel map every page now.
         """
+        if wait_s is not None and not 0 <= wait_s < math.inf:
+            raise BadRequest(f"wait must be a number of seconds, not {wait_s!r}")
         quiet_s = wait_s or 0.0
         timeout_s = self.timeout_s + quiet_s
         deadline_s = time.monotonic() + timeout_s
@@ -151,12 +154,14 @@ class Session:
             step("client.answer")
             answer = Answer(lambda handle: self._attach(handle, connection, populate), self.whole_id)
             answer.take(reply, range(len(reply.cells)))
-            if answer.gone:
-                check_visible(self._shm_dir or self.welcome.shm_dir, self.welcome.segment_prefix)
             for _ in range(_STALE_ROUNDS):
                 if not answer.gone or time.monotonic() >= deadline_s:
                     break
                 answer.ask_again(connection, deadline_s)
+                if answer.gone:  # not at first: a daemon that ends takes all its segments away
+                    check_visible(
+                        self._shm_dir or connection.welcome.shm_dir, connection.welcome.segment_prefix
+                    )
             self.welcome = connection.welcome
             return answer.result(reply, removed)
 

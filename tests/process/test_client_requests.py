@@ -252,7 +252,28 @@ def test_handles_that_stay_stale_end_as_pending(
         assert answer.pending == (shmmap.PendingLayer(divided_map.id("0_0.pcd"), "points"),)
 
 
+@pytest.mark.parametrize("wait", [-1.0, -6.0, np.inf, np.nan])
+def test_waits_that_make_no_sense(daemon: Factory, divided_map: DividedMap, wait: float) -> None:
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        with pytest.raises(BadRequest, match="wait"):
+            client.around(0, 0, 5, wait=wait)
+        assert client.around(0, 0, 5).complete
+
+
 # --- the daemon's ends and beginnings -----------------------------------------------------------
+
+
+def test_a_daemon_that_ends_between_its_answer_and_the_attaching(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It took its segments away: that is no reason to look for them in another directory."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, timeout=1.0) as client:
+        assert client.around(0, 0, 5).complete
+        stops = iter([one.stop])
+        monkeypatch.setattr("shmmap.client.session.step", lambda _: next(stops, lambda: 0)())
+        with pytest.raises(NoAnswer):
+            client.around(0, 0, 5, wait=None)
 
 
 def test_views_and_client_survive_a_killed_and_restarted_daemon(
