@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every name an instance has in the shared-memory directory, taken away by what is on disk alone."""
+"""The names of an instance, and how they are taken away by what is on disk alone."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ import contextlib
 import os
 from collections.abc import Iterable
 
-from shmmap.daemon.start_signals import StartSignals
+from shmmap.daemon.signals import StartSignals
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import segment_prefix
 
-__all__ = ["lock_name", "stopped_early", "take_away"]
+__all__ = ["lock_name", "lock_path", "stopped_early", "take_away"]
 
 
 def lock_name(instance: str) -> str:
     """Return the name of the lock that says whose the instance's names are."""
     return segment_prefix(instance) + "lock"
+
+
+def lock_path(socket_path: str) -> str:
+    """Return the path of the lock that says whose the request socket is."""
+    return socket_path.removesuffix(".sock") + ".lock"
 
 
 def take_away(directory: ShmDirectory, instance: str, more: Iterable[str] = ()) -> None:
