@@ -152,12 +152,12 @@ class EventStream:
     # --- numbers ----------------------------------------------------------------------------------
 
     def _begin(self, since: float | None) -> None:
-        self._expected = 1
         page = self._ask(Recent(0, limit=0))
-        self.epoch, self._expected = page.epoch, page.next
+        self.epoch, self._expected, self._highest = page.epoch, page.next, 0
         if since is not None:
-            started_ns = time.time_ns() - int(since * 1e9)
-            self._catch_up(after=0, since_ns=max(started_ns, 0))
+            since_ns = max(time.time_ns() - int(since * 1e9), 0)
+            while not self._catch_up(after=0, since_ns=since_ns):  # it was restarted just now
+                self.epoch = self._ask(Recent(0, limit=0)).epoch
 
     def _hear(self, data: bytes) -> None:
         self.heard_s = time.monotonic()
@@ -168,31 +168,38 @@ class EventStream:
         else:
             number, epoch = event.seq, event.epoch
         if epoch != self.epoch:
-            self.epoch, self._expected = epoch, 1
-        if isinstance(event, Beat):
-            if number >= self._expected:
-                self._try_to_catch_up()
-        elif number == self._expected:
+            self._miss(self._highest)
+            self.epoch, self._expected, self._highest = epoch, 1, 0
+        self._highest = max(self._highest, number)
+        before = number if isinstance(event, Beat) else number - 1
+        if before >= self._expected and not self._try_to_catch_up():
+            self._miss(before)
+        if number == self._expected and not isinstance(event, Beat):
             self._expected += 1
             if event is not None:
                 self._ready.append(event)
-        elif number > self._expected:
-            self._try_to_catch_up()
 
-    def _try_to_catch_up(self) -> None:
-        """Fetch what is missing; a daemon that does not answer now has more to say when it is back."""
+    def _miss(self, last: int) -> None:
+        """Nobody will ever tell what is missing up to this number: its epoch has ended."""
+        if last >= self._expected:
+            self._ready.append(Missed(self.epoch, self._expected, last))
+            self._expected = last + 1
+
+    def _try_to_catch_up(self) -> bool:
+        """Fetch what is missing, False if it is of an earlier life of the daemon.
+
+        A daemon that does not answer now has more to say when it is back.
+        """
         with contextlib.suppress(NoAnswer):
-            self._catch_up(after=self._expected - 1)
+            return self._catch_up(after=self._expected - 1)
+        return True
 
-    def _catch_up(self, *, after: int, since_ns: int = 0) -> None:
-        """Fetch what the daemon remembers after this number."""
+    def _catch_up(self, *, after: int, since_ns: int = 0) -> bool:
+        """Fetch what the daemon remembers after this number; False if it is another epoch's."""
         while True:
             page = self._ask(Recent(0, after=after, since_unix_ns=since_ns))
             if page.epoch != self.epoch:
-                # it was restarted just now: nobody will ever tell the rest of the old epoch
-                self.epoch, after = page.epoch, 0
-                since_ns = 0
-                continue
+                return False
             if page.first > after + 1 and not since_ns:
                 self._ready.append(Missed(page.epoch, after + 1, page.first - 1))
                 after = page.first - 1
@@ -203,9 +210,9 @@ class EventStream:
                     self._ready.append(event)
                 else:
                     after = int(msgspec.msgpack.decode(data)[1])
+            self._expected = after + 1 if page.events else page.next
             if not page.events:
-                self._expected = page.next
-                return
+                return True
 
     def _ask(self, message: Recent) -> EventPage:
         message.request = self._connection.new_request()
