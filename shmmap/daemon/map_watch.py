@@ -25,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 SETTLE_S: Final = 0.5
 MOST_S: Final = 5.0
+LOOK_S: Final = 1.0
+"""How often a directory that has vanished is looked for."""
 
 # inotify(7); linux/inotify.h
 IN_CLOSE_WRITE: Final = 0x8
@@ -78,7 +80,7 @@ class MapWatch:
     Parameters
     ----------
     directories
-        What to watch; those that vanish are watched again when `follow` names them anew.
+        What to watch; those that vanish are watched again when something is there, which is a change.
 
     Attributes
     ----------
@@ -98,9 +100,13 @@ class MapWatch:
             number = ctypes.get_errno()
             raise _refusal(number)
         self._since_s: float | None = None
-        self._last_s = 0.0
+        self._last_s = self._look_s = 0.0
+        self._paths: dict[int, str] = {}
+        self._missing: set[str] = set()
         try:
-            self.follow(directories)
+            for directory in directories:
+                if (number := self._add(directory)) not in (0, errno.ENOENT, errno.ENOTDIR):
+                    raise _refusal(number)
         except BaseException:
             self.close()
             raise
@@ -112,25 +118,40 @@ class MapWatch:
                 )  # fmt: skip
 
     def follow(self, directories: Iterable[str]) -> None:
-        """Watch these too; watching one twice is the same as once."""
+        """Watch these too, from when on that can be; watching one twice is the same as once."""
         for directory in directories:
-            found = self._libc.inotify_add_watch(self.fd, os.fsencode(directory), _MASK)
-            if found < 0 and (number := ctypes.get_errno()) not in (errno.ENOENT, errno.ENOTDIR):
-                raise _refusal(number)
+            self._add(directory)
+
+    def _add(self, directory: str) -> int:
+        """Watch a directory; returns why that cannot be (errno), or 0."""
+        found = self._libc.inotify_add_watch(self.fd, os.fsencode(directory), _MASK)
+        if found < 0:
+            self._missing.add(directory)
+            return ctypes.get_errno()
+        self._paths[found] = directory
+        self._missing.discard(directory)
+        return 0
 
     def drain(self, now_s: float) -> None:
         """Take note of what the kernel tells."""
         while data := self._read():
             at = 0
             while at + _EVENT.size <= len(data):
-                _, mask, _, length = _EVENT.unpack_from(data, at)
+                watch, mask, _, length = _EVENT.unpack_from(data, at)
                 at += _EVENT.size + length
+                if mask & IN_MOVE_SELF:  # what is followed is a path, not what used to be there
+                    self._libc.inotify_rm_watch(self.fd, watch)
+                if mask & (IN_MOVE_SELF | IN_IGNORED) and watch in self._paths:
+                    self._missing.add(self._paths.pop(watch))
                 # a file that is only created has nothing in it yet: its writer closes or renames it
                 if mask & IN_IGNORED or (mask & IN_CREATE and not mask & IN_ISDIR):
                     continue
-                if self._since_s is None:
-                    self._since_s = now_s
-                self._last_s = now_s
+                self._note(now_s)
+
+    def _note(self, now_s: float) -> None:
+        if self._since_s is None:
+            self._since_s = now_s
+        self._last_s = now_s
 
     def _read(self) -> bytes:
         try:
@@ -140,6 +161,12 @@ class MapWatch:
 
     def due(self, now_s: float) -> bool:
         """Whether it is time to read the map again; says so once."""
+        if self._missing and now_s >= self._look_s:
+            self._look_s = now_s + LOOK_S
+            before = len(self._missing)
+            self.follow(sorted(self._missing))
+            if len(self._missing) < before and self._since_s is None:
+                self._note(now_s)
         since_s = self._since_s
         if since_s is None or (now_s - self._last_s < SETTLE_S and now_s - since_s < MOST_S):
             return False

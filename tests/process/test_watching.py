@@ -9,7 +9,7 @@ from shmmap import EventStream, connect
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.process.test_reload import change
-from tests.support.divided_map import DividedMap, random_points
+from tests.support.divided_map import DividedMap, make_map, random_points
 
 
 def next_reload(stream: EventStream) -> e.Reloaded:
@@ -40,6 +40,25 @@ def test_what_is_written_is_served(daemon: DaemonFactory, divided_map: DividedMa
             told = next_reload(stream)
             added, removed = added + told.added, removed + told.removed
         assert client.selected([divided_map.id("60_0.pcd")], wait=30.0)
+
+
+def test_a_map_that_is_away_for_a_while(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    """Until another one is in its place the old one is served; then that one, and its changes too."""
+    one = daemon(divided_map.root, "--watch")
+    with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
+        aside = divided_map.root.with_name("aside")
+        divided_map.root.rename(aside)
+        assert "no map" in next_reload(stream).error
+        assert client.selected(["0_0.pcd"], wait=None).failed == ()
+        next_map = make_map(divided_map.root.with_name("next"), columns=2, rows=2, seed=5)
+        next_map.root.rename(divided_map.root)
+        told = next_reload(stream)
+        assert (told.error, told.removed) == ("", 32)
+        next_map.root = divided_map.root
+        change(next_map, "0_0.pcd", 7)
+        assert next_reload(stream).changed == 1
+        change(divided_map, "0_0.pcd", 8)
+        assert next_reload(stream).changed == 1
 
 
 def test_without_the_setting_nothing_is_watched(daemon: DaemonFactory, divided_map: DividedMap) -> None:

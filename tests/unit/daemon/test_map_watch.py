@@ -95,6 +95,43 @@ def test_a_directory_that_comes_later_is_followed(watch: MapWatch, tmp_path: Pat
     assert watch.due(4.0)
 
 
+def test_a_directory_that_may_not_be_watched_ends_nothing(watch: MapWatch, tmp_path: Path) -> None:
+    """The metadata may name a place that is none: it is looked for again."""
+    odd = tmp_path / "odd"
+    odd.symlink_to(odd)
+    watch.follow([str(odd)])
+    assert not watch.due(1.0)
+    odd.unlink()
+    watch.drain(2.0)
+    assert watch.due(3.0)
+    odd.mkdir()
+    watch.drain(4.0)
+    assert watch.due(5.0)
+    (odd / "a.pcd").write_bytes(b"a")
+    watch.drain(6.0)
+    assert watch.due(7.0)
+
+
+def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
+    """Moved aside, it is of no interest any more; what takes its place is, however late it comes."""
+    place, aside = tmp_path / "map", tmp_path / "aside"
+    place.mkdir()
+    watch = MapWatch([str(place)])
+    place.rename(aside)
+    watch.drain(10.0)
+    assert watch.due(11.0)
+    (aside / "a.pcd").write_bytes(b"a")
+    watch.drain(12.0)
+    assert not watch.due(13.0)
+    place.mkdir()
+    assert not watch.due(14.1), "it may be being filled"
+    assert watch.due(14.1 + SETTLE_S)
+    (place / "a.pcd").write_bytes(b"a")
+    watch.drain(15.0)
+    assert watch.due(16.0)
+    watch.close()
+
+
 def test_a_full_queue_counts_as_a_change(watch: MapWatch, monkeypatch: pytest.MonkeyPatch) -> None:
     overflow = map_watch._EVENT.pack(-1, 0x4000, 0, 0)
     told = iter([overflow, b""])
