@@ -119,6 +119,21 @@ def test_a_scan_is_compared_with_one_state_of_the_window(daemon: Factory, divide
             assert np.array_equal(compared.comparison.kept[near], expected[near])
 
 
+def test_of_several_layers_the_rule_s_own_counts(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    near, far = CompareRule("distance", 0.5), CompareRule("distance", 1.0)
+    scan = make_scan(divided_map, 0)
+    with shmmap.MapWindow(one.endpoint, 200.0, layers=(far.layer, near.layer)) as window:
+        window.move_to(0.0, 0.0, wait=LONG_S)
+        for rule in (near, far):
+            compare = CompareMapFilter(rule).follow(window)
+            expected = kept_by_brute_force(scan, divided_map, rule.distance)
+            assert np.array_equal(compare.apply(scan.xyz, scan.T_map_sensor).kept, expected)
+            compare.use_cells(())
+        with pytest.raises(shmmap.BadRequest, match="the window has search"):
+            CompareMapFilter(CompareRule("voxel", 0.5)).follow(window)
+
+
 @pytest.fixture
 def drive(tmp_path: Path, divided_map: DividedMap) -> list[Scan]:
     """Three scans as NPZ files in ``scans``, their poses in ``poses.txt``."""

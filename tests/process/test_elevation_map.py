@@ -144,7 +144,8 @@ def test_heights_follow_a_window(daemon: Factory, divided_map: DividedMap) -> No
     for name in ("min", "mean", "max"):
         rule = ElevationRule(name, 1.3)
         expected = in_one_go(cloud, rule)
-        with shmmap.MapWindow(one.endpoint, 40.0, layers=rule.layer, update_distance=0.0) as window:
+        layers = ("elevation(resolution=2.6)", rule.layer)  # not the only one of its kind
+        with shmmap.MapWindow(one.endpoint, 40.0, layers=layers, update_distance=0.0) as window:
             for x, y in ((-30.0, 5.0), (12.0, -7.0)):
                 window.move_to(x, y, wait=LONG_S)
                 xy = rng.uniform((x - 27, y - 27), (x + 27, y + 27), (400, 2))
@@ -153,6 +154,8 @@ def test_heights_follow_a_window(daemon: Factory, divided_map: DividedMap) -> No
                 want = np.array([expected.get((i, j), np.nan) for i, j in keys])
                 assert np.array_equal(np.isnan(got), np.isnan(want))
                 assert np.nanmax(np.abs(got - want)) < 1e-5
+            nowhere = np.array([[np.nan, 0.0], [0.0, np.inf], [-1e300, 0.0], [1e12, -1e12]])
+            assert np.isnan(WindowHeights(window, rule).at(nowhere)).all()
     with pytest.raises(shmmap.BadRequest), shmmap.MapWindow(one.endpoint, 40.0) as window:
         WindowHeights(window, ElevationRule())
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Cell, LayerTable, MapWindow
+from shmmap import BadRequest, Cell, LayerTable, MapWindow, canonical_layer
 from shmmap_clients.compare_map_filter import numpy_path
 from shmmap_clients.compare_map_filter.rule import CompareRule
 from shmmap_clients.compare_map_filter.search_cell import SearchCell
@@ -84,6 +84,7 @@ class CompareMapFilter:
             raise BadRequest(f"backend {backend!r} is unknown", hint=f"use one of {', '.join(BACKENDS)}")
         self.rule = rule if rule is not None else CompareRule()
         self.backend = backend
+        self._layer = canonical_layer(self.rule.layer)
         self._table = SearchTable.of_cells(())
         self._known: dict[int, SearchCell] = {}
         self._update_s = 0.0
@@ -93,28 +94,54 @@ class CompareMapFilter:
             self._explain = kernel.explain
 
     def follow(self, window: MapWindow) -> CompareMapFilter:
-        """Take the cells of a window as it is now; nothing to do where it has not changed."""
-        return self.use_cells(cell for cell in window.cells if cell.layer.startswith("search("))
+        """Take the cells of a window as it is now; nothing to do where it has not changed.
+
+        Raises
+        ------
+        BadRequest
+            The window has `search` layers, but not the rule's.
+        """
+        cells = [cell for cell in window.cells if cell.layer.startswith("search(")]
+        mine = [cell for cell in cells if cell.layer == self._layer]
+        if cells and not mine:
+            raise BadRequest(f"the window has {cells[0].layer}", hint=f"this rule needs {self._layer}")
+        return self.use_cells(mine)
 
     def use_cells(self, cells: Iterable[Cell]) -> CompareMapFilter:
-        """Compare with these cells of a ``search`` layer from now on."""
+        """Compare with these cells of a ``search`` layer from now on.
+
+        Raises
+        ------
+        BadRequest
+            The layer's leaf is not the rule's distance.
+        """
         begin = time.perf_counter()
         wanted = {id(cell): cell for cell in cells}
         if wanted.keys() != self._known.keys():
-            self._known = {key: self._known.get(key) or _wrapped(cell) for key, cell in wanted.items()}
-            self._table = SearchTable.of_cells(list(self._known.values()))
+            self._use({key: self._known.get(key) or _wrapped(cell) for key, cell in wanted.items()})
             self._update_s += time.perf_counter() - begin
         return self
 
     def use_tables(self, tables: Iterable[LayerTable]) -> CompareMapFilter:
-        """Compare with tables made by `shmmap.build_layer`, without a daemon."""
-        self._known = {
-            id(table): SearchCell.of_table(table.columns, table.lattice, table)
-            for table in tables
-            if table.lattice is not None
-        }
-        self._table = SearchTable.of_cells(list(self._known.values()))
+        """Compare with tables made by `shmmap.build_layer`, without a daemon; errors as in `use_cells`."""
+        self._use(
+            {
+                id(table): SearchCell.of_table(table.columns, table.lattice, table)
+                for table in tables
+                if table.lattice is not None
+            }
+        )
         return self
+
+    def _use(self, cells: dict[int, SearchCell]) -> None:
+        leaves = {cell.leaf for cell in cells.values()} - {self.rule.distance}
+        if leaves:  # its columns would not hold the neighbours
+            raise BadRequest(
+                f"columns of {leaves.pop():g} m do not answer a distance of {self.rule.distance:g} m",
+                hint=f"this rule needs {self._layer}",
+            )
+        self._table = SearchTable.of_cells(list(cells.values()))
+        self._known = cells
 
     def apply(self, points: NDArray[Any], T_map_sensor: NDArray[np.float64] | None = None) -> Comparison:
         """Compare one scan.

@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest
 from shmmap_clients.compare_map_filter.search_cell import SearchCell
 
 __all__ = [
@@ -26,6 +25,7 @@ __all__ = [
 ]
 
 _MAX_BINS: Final = 1 << 16
+_REACH_COLUMNS: Final = 2  # a place's neighbours within one leaf, and what rounding adds
 
 # What lies where in a row of the table.
 ADDRESS_XYZ, ADDRESS_TILE, ADDRESS_START, TILES_X, TILES_Y, FIRST_X, FIRST_Y, IS_DOUBLE = range(8)
@@ -47,7 +47,7 @@ class SearchTable:
     bin_columns, bin_first, bin_shape
         The grid: columns in a bin, first bin along x and y, bins along x and y.
     bin_start, bin_cells
-        (bins + 1,) and (entries,) int32: the cells of each bin, those within one column of it included.
+        (bins + 1,) and (entries,) int32: the cells of each bin, those within a leaf of it included.
     """
 
     cells: tuple[SearchCell, ...]
@@ -60,24 +60,9 @@ class SearchTable:
     bin_cells: NDArray[np.int32]
 
     @classmethod
-    def of_cells(cls, given: Sequence[SearchCell], reach_columns: int = 1) -> SearchTable:
-        """Make the table.
-
-        Parameters
-        ----------
-        given
-            Cells, all of one ``leaf``; empty ones are left out.
-        reach_columns
-            How many columns away from a place its neighbours may lie.
-
-        Raises
-        ------
-        BadRequest
-            Cells of different ``leaf``.
-        """
+    def of_cells(cls, given: Sequence[SearchCell]) -> SearchTable:
+        """Make the table of cells, all of one ``leaf``; empty ones are left out."""
         cells = tuple(cell for cell in given if len(cell.xyz))
-        if len({cell.leaf for cell in cells}) > 1:
-            raise BadRequest("search layers of different leaf cannot be searched together")
         nothing = np.zeros(1, np.int32)
         if not cells:
             return cls((), np.empty((0, 8), np.int64), 1.0, 1, (0, 0), (0, 0), nothing, nothing[:0])
@@ -91,8 +76,8 @@ class SearchTable:
             ],
             np.int64,
         )  # fmt: skip
-        low = np.array([cell.first for cell in cells], np.int64) - reach_columns - 1
-        high = np.array([cell.columns_end for cell in cells], np.int64) + reach_columns + 1
+        low = np.array([cell.first for cell in cells], np.int64) - _REACH_COLUMNS
+        high = np.array([cell.columns_end for cell in cells], np.int64) + _REACH_COLUMNS
         # about a cell in each bin, and never more bins than a cache holds
         span = high.max(axis=0) - low.min(axis=0)
         wide = max(1, int(np.median(high - low)))

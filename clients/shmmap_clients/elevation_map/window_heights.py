@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapWindow
+from shmmap import BadRequest, MapWindow, canonical_layer
 from shmmap_clients.elevation_map.rule import ElevationRule
 
 __all__ = ["WindowHeights"]
+
+_FARTHEST: Final = 1 << 40  # columns; no layer has any so far away
 
 
 class WindowHeights:
@@ -44,20 +46,22 @@ class WindowHeights:
             )
         self._window = window
         self._rule = rule
+        self._layer = canonical_layer(rule.layer)
 
     def at(self, xy: NDArray[Any]) -> NDArray[np.float64]:
         """Heights at places, (N, 2) metres, map frame: (N,) float64 metres, NaN where there is no point.
 
         A column that a border cuts is answered from both cells together.
         """
-        column = np.floor(np.asarray(xy, np.float64) * (1.0 / self._rule.resolution)).astype(np.int64)
+        column = np.floor(np.asarray(xy, np.float64) * (1.0 / self._rule.resolution))
+        column = np.where(np.abs(column) < _FARTHEST, column, _FARTHEST).astype(np.int64)
         name = self._rule.name
         empty = {"min": np.inf, "max": -np.inf, "mean": 0.0}[name]
         result = np.full(len(column), empty)
         count = np.zeros(len(column), np.int64)
         for cell in self._window.cells:
             lattice = cell.header.lattice
-            if not cell.layer.startswith("elevation(") or lattice is None:
+            if cell.layer != self._layer or lattice is None:
                 continue
             at = column - np.array(lattice.first[:2])
             inside = np.flatnonzero(((at >= 0) & (at < np.array(lattice.shape[:2]))).all(axis=1))

@@ -194,8 +194,17 @@ def test_refusals() -> None:
     with pytest.raises(BadRequest):
         CompareMapFilter().apply(np.zeros((3, 2), np.float32))
     cloud = np.zeros((2, 3), np.float32)
-    mixed: list[LayerTable] = [build_layer("search(leaf=0.5)", cloud), build_layer("search(leaf=0.6)", cloud)]
-    with pytest.raises(BadRequest):
-        CompareMapFilter().use_tables(mixed)
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequest, match="no column"):
         CompareMapFilter().use_tables([build_layer("voxel(leaf=0.5)", cloud)])
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("leaf", [0.1, 0.6])
+def test_columns_of_another_edge_than_the_distance_are_refused(mode: str, leaf: float) -> None:
+    cloud = np.zeros((2, 3), np.float32)
+    compare = CompareMapFilter(CompareRule(mode, 0.5)).use_tables([build_layer("search(leaf=0.5)", cloud)])
+    mixed: list[LayerTable] = [build_layer(f"search(leaf={edge})", cloud + 9) for edge in (0.5, leaf)]
+    for _ in range(2):
+        with pytest.raises(BadRequest, match=f"{leaf} m do not answer"):
+            compare.use_tables(mixed)
+    assert not compare.apply(cloud).kept.any()  # what it had is still what it has
