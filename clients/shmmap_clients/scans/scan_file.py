@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from typing import Any, Final
 
 import numpy as np
@@ -41,18 +42,21 @@ def read_scan_fields(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
     suffix = os.path.splitext(name)[1].lower()
     if not os.path.exists(name):
         raise MapMissing(f"there is no file {name}")
-    if suffix == ".npz":
-        return _finite(_from_npz(name))
-    if suffix == ".bin":
-        return _finite(_from_bin(name))
+    try:
+        if suffix == ".npz":
+            return _finite(_from_npz(name))
+        if suffix == ".bin":
+            return _finite(_from_bin(name))
+    except OSError as error:
+        raise MapDataError(f"{name}: cannot be read: {error.strerror}") from error
     return dict(read_cloud(name).columns)
 
 
 def _from_npz(name: str) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(name, allow_pickle=False) as archive:
+        with zipfile.ZipFile(name), np.load(name, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+    except (ValueError, KeyError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise MapDataError(f"{name}: not an NPZ archive of plain arrays: {error}") from None
     for key, metres in _METRES.items():
         if key in arrays:

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapMissing
+from shmmap import BadRequest, MapDataError, MapMissing
 from shmmap_clients.scans.scan_file import SCAN_SUFFIXES, read_scan_fields
 from shmmap_clients.scans.trajectory import Trajectory
 
@@ -75,6 +75,8 @@ class ScanSequence:
             self.files = sorted(p for p in Path(directory).iterdir() if p.suffix.lower() in SCAN_SUFFIXES)
         except (FileNotFoundError, NotADirectoryError):
             raise MapMissing(f"{os.fspath(directory)} is no directory") from None
+        except OSError as error:
+            raise MapDataError(f"{os.fspath(directory)}: cannot be read: {error.strerror}") from error
         if not self.files:
             raise MapMissing(
                 f"{os.fspath(directory)} has no scans", hint=f"names end in {', '.join(SCAN_SUFFIXES)}"

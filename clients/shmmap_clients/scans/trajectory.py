@@ -122,6 +122,8 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
                 poses.append(matrix_of(values[1:4], values[4:]))
     except FileNotFoundError:
         raise MapMissing(f"there is no file {name}") from None
+    except OSError as error:
+        raise MapDataError(f"{name}: cannot be read: {error.strerror}", cause="trajectory") from error
     except UnicodeDecodeError:
         raise MapDataError(f"{name}: not a text file", cause="trajectory") from None
     return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.scans import scan_stream
+from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_source import open_scans
 from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber, decode_scan, encode_scan
@@ -53,6 +55,8 @@ def test_a_wrong_line_is_named(tmp_path: Path, line: str) -> None:
 
 
 def test_trajectory_refusals(tmp_path: Path) -> None:
+    with pytest.raises(MapDataError, match="cannot be read"):
+        read_trajectory(tmp_path)
     with pytest.raises(MapMissing):
         read_trajectory(tmp_path / "none.txt")
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
@@ -91,6 +95,35 @@ def test_poses_go_to_scans_by_place_or_by_number(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(MapMissing):
         ScanSequence(tmp_path / "empty")
+
+
+def test_files_that_are_no_scans_are_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    np.savez_compressed(tmp_path / "good.npz", xyz=rng.normal(size=(5000, 3)))
+    assert read_scan(tmp_path / "good.npz").shape == (5000, 3)
+    good = (tmp_path / "good.npz").read_bytes()
+    np.save(tmp_path / "one.npy", np.zeros((3, 3)))
+    (tmp_path / "one.npy").rename(tmp_path / "array.npz")
+    (tmp_path / "text.npz").write_text("no archive")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    (tmp_path / "cut.npz").write_bytes(good[:-40])
+    np.savez(tmp_path / "flat.npz", xyz=np.zeros(9))
+    np.savez(tmp_path / "other.npz", points=np.zeros((9, 3)))
+    np.savez(tmp_path / "objects.npz", xyz=np.array([None]))
+    (tmp_path / "odd.bin").write_bytes(bytes(17))
+    for name in ("folder.npz", "folder.bin"):
+        (tmp_path / name).mkdir()
+    for at in range(0, len(good), len(good) // 97):  # damage anywhere: an error, or what does not matter
+        damaged = bytearray(good)
+        damaged[at] ^= 0x55
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        with contextlib.suppress(MapDataError):
+            assert read_scan(tmp_path / "damaged.npz").shape == (5000, 3)
+    for path in {*tmp_path.iterdir()} - {tmp_path / "good.npz", tmp_path / "damaged.npz"}:
+        with pytest.raises(MapDataError, match=path.name):
+            read_scan(path)
+    with pytest.raises(MapMissing):
+        read_scan(tmp_path / "nothing.npz")
 
 
 def make_scan(pose: bool = True) -> Scan:
