@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.drive_errors import pose_errors
 from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
 from shmmap_clients.ndt_scan_matcher.follower import Follower, Frame
@@ -142,6 +142,35 @@ def test_a_map_that_cannot_keep_up_is_an_error(drive: TownDrive, daemon: DaemonF
         assert maps.too_slow == 1
         assert other.cells.keys() != first.cells.keys()
     assert first.voxels > 0  # what was taken stays readable
+
+
+def test_a_map_that_cannot_be_made_is_an_error_and_not_the_end(
+    drive: TownDrive, daemon: DaemonFactory
+) -> None:
+    one = daemon(drive.map_dir)
+    rules = MapRules(update_distance=5.0, map_radius=60.0, lidar_radius=40.0)
+    x, y = drive.poses[0, :2]
+    impossible = {1, 3}
+    made = 0
+
+    def prepare(voxel_map: VoxelMap) -> VoxelMap:
+        nonlocal made
+        made += 1
+        if made in impossible:
+            raise shmmap.BadRequest("the cells span too much")
+        return voxel_map
+
+    with MapUpdater(one.endpoint, rules, prepare=prepare) as maps:
+        with pytest.raises(shmmap.BadRequest, match="span too much"):
+            maps.map_at(x, y)
+        first, waited = maps.map_at(x, y)
+        assert waited
+        far = (x + 50.0, y + 50.0)  # waited for until the second attempt has succeeded
+        other, waited = maps.map_at(*far)
+        assert waited
+        assert other.cells.keys() != first.cells.keys()
+        assert made == 4
+        assert maps.error is None
 
 
 def test_rules_that_make_no_sense_are_refused() -> None:

@@ -195,6 +195,8 @@ class MapUpdater:
                 self._asked = (x, y, vx, vy)
                 self._changed.notify_all()
             if not reached:
+                if self._latest is None:
+                    self._error = None  # of an earlier attempt
                 self._wait_for(x, y)
             assert self._latest is not None  # noqa: S101  # waited for
             return self._latest[0], not reached
@@ -246,14 +248,8 @@ class MapUpdater:
                 self._changed.notify_all()
 
     def _update(self, x: float, y: float, vx: float, vy: float) -> None:
-        begin_s = time.perf_counter()
         try:
-            self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
-            cells = self._window.cells
-            if not cells and not self._window.complete:
-                raise NoAnswer("none of the cells could be had", hint="`shmmap status` tells why")
-            request_s = time.perf_counter() - begin_s
-            known = {cell.id: self._voxels(cell) for cell in cells}
+            self._follow(x, y, vx, vy)
         except Exception as error:  # noqa: BLE001  # a thread that ended would keep all scans waiting
             with self._changed:
                 if isinstance(error, ShmmapError):
@@ -262,7 +258,15 @@ class MapUpdater:
                     self._error = InternalError(f"the map's update failed: {error!r}")
                 self._failed = (x, y, vx, vy)
                 self._changed.notify_all()
-            return
+
+    def _follow(self, x: float, y: float, vx: float, vy: float) -> None:
+        begin_s = time.perf_counter()
+        self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
+        cells = self._window.cells
+        if not cells and not self._window.complete:
+            raise NoAnswer("none of the cells could be had", hint="`shmmap status` tells why")
+        request_s = time.perf_counter() - begin_s
+        known = {cell.id: self._voxels(cell) for cell in cells}
         before = self._latest
         changed = {key for key in known if self._known.get(key) is not known[key]}
         gone = self._known.keys() - known.keys()

@@ -16,6 +16,9 @@ from shmmap import MapDataError, MapMissing, read_cloud
 __all__ = ["SCAN_SUFFIXES", "read_scan", "read_scan_fields"]
 
 SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
+_NO_ARCHIVE: Final = (
+    ValueError, KeyError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 _METRES: Final = {"xyz": 1.0, "xyz_4mm": 0.004}
 
 
@@ -56,7 +59,7 @@ def _from_npz(name: str) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(name), np.load(name, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, KeyError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except _NO_ARCHIVE as error:
         raise MapDataError(f"{name}: not an NPZ archive of plain arrays: {error}") from None
     for key, metres in _METRES.items():
         if key in arrays:
