@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from shmmap.dividing.divide import divide
+from shmmap.dividing.report import DividedMap
+from shmmap.dividing.settings import DivideSettings
+from shmmap.formats.pcd_writer import write_pcd
 from tests.support.pcd_files import read_pcd
 
 Columns = dict[str, NDArray[Any]]
@@ -36,6 +40,17 @@ def xyzircaedt(count: int, *, seed: int = 0, reach: float = 90.0) -> Columns:
         "distance": rng.uniform(0, 200, count).astype(np.float32),
         "time_stamp": np.arange(count, dtype=np.uint32),
     }
+
+
+def cloud_file(path: Path, columns: Columns, encoding: str = "binary") -> Path:
+    """Write a cloud as PCD; returns its path."""
+    write_pcd(path, columns, encoding=encoding)
+    return path
+
+
+def divide_quickly(inputs: Sequence[Path], out: Path, **options: Any) -> DividedMap:
+    """Divide without forcing anything to the disk."""
+    return divide(inputs, out, DivideSettings(**{"durable": False, **options}))
 
 
 def rows_of(columns: Mapping[str, NDArray[Any]]) -> list[Row]:

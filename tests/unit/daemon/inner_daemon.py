@@ -6,12 +6,15 @@ Files are real, segments are real, loaders are real processes.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import shutil
+import signal
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from shmmap.daemon.admin import Admin
@@ -27,7 +30,7 @@ from shmmap.daemon.workers import WorkerPool
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
-from shmmap.protocol.messages import Cells
+from shmmap.protocol.messages import Area, BoxMessage, Cells
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.identity import DaemonIdentity
@@ -35,6 +38,12 @@ from shmmap.statistics.writer import StatisticsWriter
 
 EPOCH = 77
 PATIENCE_S = 30.0
+EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
+
+
+def names(reply: Cells) -> list[str]:
+    """File names of the cells that a reply has, in its order."""
+    return [Path(cell.id).name for cell in reply.cells]
 
 
 class InnerDaemon:
@@ -150,6 +159,32 @@ class InnerDaemon:
         assert isinstance(reply, Cells)
         return reply
 
+    def everything(self, request: int = 1) -> Cells:
+        """Ask for all cells and wait for them."""
+        self.cells.area(self.session(), Area(request, EVERYWHERE, wait=30.0), self.now_s())
+        return self.cells_of(request)
+
+    def path_of(self, segment: str) -> str:
+        """Path of a segment that a reply names."""
+        return f"{self.shm_dir}{self.store.segment_prefix}{segment}"
+
+    @contextlib.contextmanager
+    def loaders_standing_still(self) -> Iterator[list[int]]:
+        """Stop the loaders (one is started if there is none); on the way out they go on."""
+        if not len(self.pool):
+            self.pool.start_one()
+        self.run_until(lambda: all(worker.ready for worker in self.pool))
+        pids = [worker.process.pid for worker in self.pool]
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+            os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOWAIT)
+        try:
+            yield pids
+        finally:
+            for pid in pids:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
+
     def reload(self) -> Catalogue:
         """Read the map again and serve what it is now."""
         old = self.store.catalogue
@@ -171,3 +206,7 @@ class InnerDaemon:
         """End everything and remove the directory."""
         self.leave()
         shutil.rmtree(self.shm_dir)
+
+
+Inner = Callable[..., InnerDaemon]
+"""The fixture that makes them."""

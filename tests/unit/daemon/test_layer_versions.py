@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ from shmmap.origin.map_directory import open_map
 from shmmap.protocol import messages as m
 from shmmap.protocol.messages import Selected
 from tests.support.divided_map import make_map, random_points
-from tests.unit.daemon.inner_daemon import InnerDaemon
+from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
-Inner = Callable[..., InnerDaemon]
 NDT = "ndt(leaf=5.0,min_points=3)"
 
 

@@ -4,19 +4,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 
 from shmmap.daemon import request_limits as limits
 from shmmap.daemon.sessions import ROUTE_VERTICES
 from shmmap.errors import BadRequest
-from shmmap.protocol.messages import Area, BoxMessage, Differential, HeldCell, Intent, Selected
+from shmmap.protocol.messages import Area, Differential, HeldCell, Intent, Selected
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import InnerDaemon
-
-Inner = Callable[..., InnerDaemon]
-EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
 
 
 def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:

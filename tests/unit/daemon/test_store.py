@@ -9,20 +9,16 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 
 import pytest
 
 from shmmap.daemon import jobs
 from shmmap.daemon.residency import Key
 from shmmap.daemon.workers import Worker
-from shmmap.protocol.messages import Area, BoxMessage, CircleMessage, Selected
+from shmmap.protocol.messages import Area, CircleMessage, Selected
 from tests.support.daemon_process import wait_readable
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import InnerDaemon
-
-Inner = Callable[..., InnerDaemon]
-EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon
 
 
 def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: DividedMap) -> None:

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests for cells where memory is short: evictions, full budgets, loaders that wait for room."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+from shmmap.protocol.messages import (
+    Area,
+    CircleMessage,
+    Selected,
+)
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import Inner, names
+
+
+def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: DividedMap) -> None:
+    """It is put back or loaded once more while there is time: never forgotten."""
+    one = inner(small_map.root)
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0), one.now_s())
+    one.cells_of(1)
+    first = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    second = one.store.warm.layers["points"][one.store.index_of("20_20.pcd") or 0]
+    wanted = ("0_0.pcd", "20_20.pcd", "20_0.pcd")
+    with one.loaders_standing_still(), open(one.path_of(second.name.rsplit(".", 1)[1]), "rb"):
+        one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
+        one.store.evict(first, one.now_s() - 1.0)
+        one.store.evict(second, one.now_s() - 1.0)
+        one.run_until(lambda: first.name not in one.books.zombies)
+        assert second.name in one.books.zombies, "somebody has it open"
+        os.kill(next(iter(one.pool)).process.pid, signal.SIGCONT)
+        reply = one.cells_of(2)
+    assert names(reply) == list(wanted)
+    assert reply.cells[0].segment != first.name.rsplit(".", 1)[1], "loaded once more"
+    assert reply.cells[1].segment == second.name.rsplit(".", 1)[1], "put back in service"
+    assert reply.pending == ()
+
+
+def sizes(small_map: DividedMap, inner: Inner) -> int:
+    """Bytes of one ordinary segment of this map (all are alike)."""
+    one = inner(small_map.root)
+    one.everything()
+    return min(resident.nbytes for resident in one.books.residents())
+
+
+def test_a_budget_that_is_just_enough(inner: Inner, small_map: DividedMap) -> None:
+    """While cells load more is reserved than they come to need: no reason to refuse the last ones."""
+    each = sizes(small_map, inner)
+    one = inner(small_map.root, workers=2)
+    estimate = one.store.estimate(0, "points")
+    assert estimate > each
+    one.books.budget_bytes = one.books.overhead_bytes + 15 * each + estimate
+    reply = one.everything()
+    assert (len(reply.cells), reply.failed) == (16, ())
+    other = inner(small_map.root, workers=2)
+    other.books.budget_bytes = other.books.overhead_bytes + 15 * each + estimate - 4096
+    reply = other.everything()
+    assert (len(reply.cells), [failure.code for failure in reply.failed]) == (15, ["over_budget"])
+
+
+def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
+    inner: Inner, small_map: DividedMap
+) -> None:
+    """Somebody else is told at once, though each answer begins another grace for what it hands out."""
+    each = sizes(small_map, inner)
+    one = inner(small_map.root)
+    one.books.budget_bytes = one.books.overhead_bytes + 4 * each + 8192
+    reader, other = one.session("reader"), one.session("other")
+    one.cells.area(reader, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    opened = [os.open(one.path_of(cell.segment), os.O_RDONLY) for cell in one.cells_of(1).cells]
+    assert len(opened) == 4
+    one.cells.selected(other, Selected(2, ("20_20.pcd",), wait=3000.0), one.now_s())
+    request = 10
+
+    def answered() -> bool:
+        nonlocal request
+        request += 1
+        one.cells.area(reader, Area(request, CircleMessage(0, 0, 5)), one.now_s())
+        return any(reply.request == 2 for _, reply in one.replies)
+
+    one.run_until(answered)
+    (failure,) = one.cells_of(2).failed
+    assert failure.code == "over_budget"
+    assert [(holder.session, holder.cells) for holder in failure.holders] == [(0, 4)]
+    for fd in opened:
+        os.close(fd)
+    one.cells.let_go(reader.drop(list(reader.held)))
+    one.offset_s += 2.0
+    one.cells.selected(other, Selected(3, ("20_20.pcd",), wait=30.0), one.now_s())
+    assert names(one.cells_of(3)) == ["20_20.pcd"]
+
+
+def ascii_cell(made: DividedMap, name: str, points: int) -> None:
+    """Write a file that needs more memory than it is long."""
+    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
+    path = made.pcd_dir / name
+    path.write_text(f"{head}POINTS {points}\nDATA ascii\n" + "1 2 3\n" * points)
+
+
+def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: DividedMap) -> None:
+    """One is refused, and its room given to the other: no deadlock, no deadline."""
+    for name in ("0_0.pcd", "20_20.pcd"):
+        ascii_cell(small_map, name, 50_000)
+    one = inner(small_map.root, workers=2)
+    half = one.store.estimate(one.store.index_of("0_0.pcd") or 0, "points")
+    one.books.budget_bytes = one.books.overhead_bytes + 2 * half + 100_000
+    one.cells.selected(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0), one.now_s())
+    reply = one.cells_of(1)
+    assert len(reply.cells) == 1
+    assert [failure.code for failure in reply.failed] == ["over_budget"]
+    assert one.statistics.values["loads_timed_out"] == 0
+    assert one.books.reserved_bytes == 0
+
+
+def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
+    ascii_cell(small_map, "20_20.pcd", 50_000)
+    each = sizes(small_map, inner)
+    one = inner(small_map.root)
+    one.books.budget_bytes = one.books.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
+    session = one.session()
+    one.stop_clock()  # the cells handed out first stay in their grace
+    one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    assert len(one.cells_of(1).cells) == 4
+    one.cells.selected(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0), one.now_s())
+    one.run_until(lambda: one.store.loads.hungry)
+    (worker,) = one.pool
+    worker.process.kill()
+    one.run_until(lambda: worker not in list(one.pool))
+    one.offset_s += 31.0
+    reply = one.cells_of(2)
+    assert [failure.code for failure in reply.failed] == ["load_failed"]
+    assert "SIGKILL" in reply.failed[0].message
+    one.run_until(lambda: not one.books.reserved_bytes)
+    assert one.store.loads.hungry == {}
+
+
+def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
+    ascii_cell(small_map, "20_20.pcd", 50_000)
+    each = sizes(small_map, inner)
+    one = inner(small_map.root, load_timeout_s=0.5)
+    one.books.budget_bytes = one.books.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
+    session = one.session()
+    one.stop_clock()
+    one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    assert len(one.cells_of(1).cells) == 4
+    one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=30.0), one.now_s())
+    one.run_until(lambda: one.store.loads.hungry)
+    one.offset_s += 0.6
+    assert [failure.code for failure in one.cells_of(2).failed] == ["load_timeout"]
+    assert (one.books.reserved_bytes, one.store.loads.hungry, len(one.pool)) == (0, {}, 0)
+
+
+def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:
+    quota = 3 * inner(small_map.root).store.estimate(0, "points")
+    one = inner(small_map.root, quota_bytes=quota)
+    session, ids = one.session(), ("0_0.pcd",) * 10 + ("20_20.pcd",) * 10
+    for request in (1, 2):  # cold, then warm
+        one.cells.selected(session, Selected(request, ids, wait=30.0), one.now_s())
+        reply = one.cells_of(request)
+        assert (names(reply), reply.failed) == (list(ids), ())
+    reply = one.everything(3)
+    assert {failure.code for failure in reply.failed} == {"over_budget"}
+    assert one.statistics.values["refused_quota"] == len(reply.failed)
+
+
+def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
+    inner: Inner, small_map: DividedMap
+) -> None:
+    """It is loaded once more, and the request is answered once."""
+    one = inner(small_map.root)
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.cells_of(1)
+    first = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    wanted = ("0_0.pcd", "0_0.pcd", "20_0.pcd")
+    with one.loaders_standing_still():
+        one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
+        one.store.evict(first, one.now_s() - 1.0)
+        one.run_until(lambda: first.name not in one.books.zombies)
+    assert names(one.cells_of(2)) == list(wanted)
+    assert sum(reply.request == 2 for _, reply in one.replies) == 1
+    assert len(one.cells) == 0

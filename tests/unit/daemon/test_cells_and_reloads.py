@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests for cells while files, cells and whole maps are replaced."""
+
+from __future__ import annotations
+
+import mmap
+from pathlib import Path
+
+import numpy as np
+
+from shmmap.origin.catalogue import Catalogue
+from shmmap.protocol.messages import (
+    Area,
+    Cells,
+    CircleMessage,
+    Differential,
+    Hello,
+    Metadata,
+    Selected,
+)
+from tests.support.divided_map import DividedMap, random_points
+from tests.support.segment_reader import map_segment, parse
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
+
+
+def rewrite(made: DividedMap, name: str, points: int, corner: tuple[int, int] | None = None) -> None:
+    made.write_cell(
+        name,
+        corner or made.corners[name],
+        random_points(np.random.default_rng(points), corner or made.corners[name], points),
+    )
+
+
+def test_indices_change_while_requests_wait(inner: Inner, small_map: DividedMap) -> None:
+    """A cell that comes first in the order, and one that vanishes: others must not be mixed up."""
+    one = inner(small_map.root)
+    with one.loaders_standing_still():
+        one.cells.area(one.session(), Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+        wanted = ["20_20.pcd", "0_0.pcd", "20_20.pcd", "0_-20.pcd"]
+        one.cells.selected(one.session(), Selected(2, tuple(wanted), wait=30.0), one.now_s())
+        one.turn()
+        rewrite(small_map, "-100_-100.pcd", 9, (-100, -100))
+        small_map.remove_cell("0_-20.pcd")
+        small_map.write_metadata()
+        one.reload()
+    assert names(one.cells_of(1)) == ["-20_-20.pcd", "-20_0.pcd", "0_0.pcd"]
+    reply = one.cells_of(2)
+    assert names(reply) == ["20_20.pcd", "0_0.pcd", "20_20.pcd"]
+    assert [(f.id.rsplit("/", 1)[-1], f.code) for f in reply.failed] == [("0_-20.pcd", "unknown_cell")]
+    for cell in (*one.cells_of(1).cells, *reply.cells):
+        assert (cell.min_x, cell.min_y) == small_map.corners[Path(cell.id).name]
+    one.run_until(lambda: not one.books.reserved_bytes)
+    assert {Path(key.cell_id).name for key in one.books.slots} == set(names(one.cells_of(1))) | {"20_20.pcd"}
+
+
+def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: DividedMap) -> None:
+    """What was read counts, and both the version and the map's version say so."""
+    one = inner(small_map.root)
+    session, before = one.session(), one.store.catalogue.map_version
+    with one.loaders_standing_still():
+        one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+        one.turn()
+        rewrite(small_map, "0_0.pcd", 33)
+    reply = one.cells_of(1)
+    assert [cell.points for cell in reply.cells] == [33]
+    assert reply.map_version != before
+    page = one.admin.answer(Metadata(2, since=before), one.now_s())
+    assert [Path(row.id).name for row in page.rows] == ["0_0.pcd"]  # type: ignore[union-attr]
+    assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
+    one.reload()
+    assert one.store.catalogue.version(one.store.index_of("0_0.pcd") or 0) == reply.cells[0].version
+
+
+def test_a_map_switched_back_by_its_symlink(inner: Inner, small_map: DividedMap, tmp_path: Path) -> None:
+    """The files are older than those the daemon knows, which never happens to one file: served, once."""
+    older = small_map.pcd_dir.rename(tmp_path / "older")
+    newer = tmp_path / "newer"
+    newer.mkdir()
+    for path in older.iterdir():
+        (newer / path.name).write_bytes(path.read_bytes())
+    small_map.pcd_dir.symlink_to(newer)
+    one = inner(small_map.root)
+    (small_map.root / "link").symlink_to(older)
+    (small_map.root / "link").rename(small_map.pcd_dir)
+    reply = one.everything()
+    assert len(reply.cells) == 16
+    assert (reply.failed, reply.pending) == ((), ())
+    assert one.statistics.values["loads_started"] == 16
+
+
+def test_a_map_that_comes_and_goes(inner: Inner, small_map: DividedMap, tmp_path: Path) -> None:
+    """Two states in turn, a reader of the first all the time: each time exactly the state's versions."""
+    other = tmp_path / "other"
+    other.mkdir()
+    for path in small_map.pcd_dir.iterdir():
+        (other / path.name).write_bytes(path.read_bytes())
+    first = small_map.pcd_dir.rename(tmp_path / "first")
+    small_map.pcd_dir.symlink_to(first)
+    one = inner(small_map.root)
+    versions = []
+    mapped: list[mmap.mmap] = []
+    for turn in range(6):
+        reply = one.everything(turn + 1)
+        assert not any(cell.stale for cell in reply.cells)
+        versions.append([cell.version for cell in reply.cells])
+        if not mapped:
+            for cell in reply.cells:
+                with open(one.path_of(cell.segment), "rb") as file:
+                    mapped.append(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
+        assert one.books.resident_count == 16
+        assert {slot.resident.name for slot in one.books.slots.values() if slot.resident} == {
+            resident.name for resident in one.books.residents()
+        }
+        (small_map.root / "link").symlink_to(other if turn % 2 == 0 else first)
+        (small_map.root / "link").rename(small_map.pcd_dir)
+        one.reload()
+    assert versions[0] == versions[2] == versions[4]
+    assert versions[1] == versions[3] == versions[5]
+    assert not set(versions[0]) & set(versions[1])
+    for one_map in mapped:
+        one_map.close()
+
+
+def test_heights_of_a_replaced_file_are_unknown(inner: Inner, small_map: DividedMap) -> None:
+    """The old version lay below the range: the new one must be looked at before it is left out."""
+    one = inner(small_map.root)
+    session, high = one.session(), CircleMessage(10, 10, 1, 50.0, 60.0)
+    one.everything()
+    one.cells.area(session, Area(2, high, wait=30.0), one.now_s())
+    assert one.cells_of(2).cells == ()
+    columns = random_points(np.random.default_rng(1), (0, 0), 20)
+    columns["z"] = columns["z"] + np.float32(52.0)
+    small_map.write_cell("0_0.pcd", (0, 0), columns)
+    one.reload()
+    one.cells.area(session, Area(3, high, wait=30.0), one.now_s())
+    assert names(one.cells_of(3)) == ["0_0.pcd"]
+    one.cells.differential(
+        session, Differential(4, CircleMessage(10, 10, 1, 0.0, 8.0), wait=30.0), one.now_s()
+    )
+    assert one.cells_of(4).cells == ()
+
+
+def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    one.everything()
+    evicted = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    with open(one.path_of(evicted.name.rsplit(".", 1)[1]), "rb") as held:
+        one.store.evict(evicted, one.now_s())  # a zombie while it moves
+        small_map.corners["0_0.pcd"] = (400, 400)
+        small_map.corners["20_20.pcd"] = (500, 500)
+        small_map.write_metadata()
+        one.reload()
+        one.cells.selected(one.session(), Selected(2, ("0_0.pcd", "20_20.pcd"), wait=30.0), one.now_s())
+        reply = one.cells_of(2)
+        held.close()
+    assert [(cell.min_x, cell.min_y) for cell in reply.cells] == [(400.0, 400.0), (500.0, 500.0)]
+    for cell in reply.cells:
+        assert parse(map_segment(one.path_of(cell.segment))).fields["box"][:2] == (cell.min_x, cell.min_y)
+
+
+def nowhere(index: int) -> int | None:
+    """Say of every cell that it left the map."""
+    del index
+    return None
+
+
+def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    before = one.everything()
+    empty = Catalogue.from_cells([])
+    one.cells.renumber(nowhere, one.store.catalogue.id)
+    one.store.replace_catalogue(empty, one.now_s())
+    assert one.everything(2) == Cells(2, 77, empty.map_version)
+    packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
+    one.cells.differential(one.session(), Differential(3, EVERYWHERE, packed=packed), one.now_s())
+    assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
+    welcome = one.admin.welcome(one.session(), Hello(4, 1, 0))
+    assert (welcome.cells, welcome.bounds) == (0, None)
+    one.run_until(lambda: one.books.used_bytes == one.books.overhead_bytes)
+    one.reload()
+    assert len(one.everything(5).cells) == 16
