@@ -21,13 +21,12 @@ import platform
 import re
 import resource
 import select
-import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from shmmap.daemon.own_sockets import looked_at, open_descriptors
+from shmmap.daemon.own_sockets import listens, looked_at, open_descriptors, target
 
 __all__ = ["ListenGate"]
 
@@ -79,7 +78,7 @@ class ListenGate:
 
         libzmq's thread begins to watch a socket a moment after it was bound, and nothing tells when.
         """
-        listening = {fd for fd in open_descriptors() if _listens(fd)}
+        listening = {fd for fd in open_descriptors() if listens(fd)}
         deadline_s = time.monotonic() + PATIENCE_S
         while not self._find(listening) and time.monotonic() < deadline_s:
             time.sleep(0.001)
@@ -92,7 +91,7 @@ class ListenGate:
     def _find(self, listening: set[int]) -> bool:
         """Look for listening sockets in all epoll sets; True when each was found."""
         for fd in open_descriptors():
-            if _target(fd) == "anon_inode:[eventpoll]":
+            if target(fd) == "anon_inode:[eventpoll]":
                 with contextlib.suppress(OSError):
                     text = Path(f"/proc/self/fdinfo/{fd}").read_text()
                     found = {int(watched): int(data, 16) for watched, data in _WATCHED.findall(text)}
@@ -157,25 +156,6 @@ class ListenGate:
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         # a session takes a second descriptor, the one that tells when its process ends
         self._room = (limit - used - max(LEAST_RESERVE, limit // 16)) // 2
-
-
-def _target(fd: int) -> str:
-    try:
-        return os.readlink(f"/proc/self/fd/{fd}")
-    except OSError:
-        return ""
-
-
-def _listens(fd: int) -> bool:
-    if not _target(fd).startswith("socket:"):
-        return False
-    try:
-        with looked_at(fd) as view:
-            return view.family == socket.AF_UNIX and bool(
-                view.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-            )
-    except OSError:
-        return False
 
 
 def _path(fd: int) -> str:

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Iterator
 from typing import Final
 
-__all__ = ["looked_at", "open_descriptors"]
+__all__ = ["listens", "looked_at", "open_descriptors", "target"]
 
 _DIRECTORY: Final = "/proc/self/fd"
 
@@ -49,3 +49,24 @@ def looked_at(fd: int) -> Iterator[socket.socket]:
         raise
     with view:
         yield view
+
+
+def target(fd: int) -> str:
+    """Return what a descriptor refers to, as the kernel writes it; empty for a closed one."""
+    try:
+        return os.readlink(f"{_DIRECTORY}/{fd}")
+    except OSError:
+        return ""
+
+
+def listens(fd: int) -> bool:
+    """Whether this is a Unix socket that accepts connections."""
+    if not target(fd).startswith("socket:"):
+        return False
+    try:
+        with looked_at(fd) as view:
+            return view.family == socket.AF_UNIX and bool(
+                view.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+            )
+    except OSError:
+        return False

@@ -19,7 +19,7 @@ from pathlib import Path
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.following_client import FollowingClient
-from tests.support.shared_memory_use import proportional_bytes, proportional_bytes_under
+from tests.support.process_costs import proportional_bytes, proportional_bytes_under
 
 _PRIVATE = """
 import sys

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,16 +14,15 @@ from typing import Any
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.accounts import DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
+from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 pytestmark = pytest.mark.root
 Connect = Callable[..., RawClient]
 
-DAEMON_UID, GROUP, MEMBER, STRANGER = 61001, 61002, 61003, 61004
 
 ATTEMPTS = """
 import ctypes, fcntl, json, mmap, os, sys
@@ -77,29 +75,6 @@ print(json.dumps({
     "lease": attempt(from_reader(lambda fd: fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK))),
 }))
 """
-
-
-def as_user(uid: int, gid: int, *command: str) -> subprocess.CompletedProcess[str]:
-    """Run a command as somebody else, without any other group."""
-    return subprocess.run(
-        ["setpriv", f"--reuid={uid}", f"--regid={gid}", "--clear-groups", "--inh-caps=-all", *command],
-        capture_output=True,
-        text=True,
-        cwd="/",
-        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT)},
-    )
-
-
-def python_for_others() -> str:
-    """Path of a Python that other accounts can start; the test is skipped where there is none."""
-    own = os.path.realpath(sys.executable)  # the environment itself may not be open to others
-    for python in (own, "/usr/bin/python3"):
-        if (
-            os.path.exists(python)
-            and not as_user(STRANGER, STRANGER, python, "-I", "-c", "import json").returncode
-        ):
-            return python
-    pytest.skip("this Python cannot be started by other accounts")
 
 
 def attempts(path: str, uid: int, gid: int) -> dict[str, Any]:
@@ -213,7 +188,5 @@ def test_a_daemon_without_privileges_serves_the_group(
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (len(handles) - 1, 1)
         assert reader.checksums() == before
-    waiting = Patience()
-    while waiting(bool(one.segments())):
-        client.ask("stats")
+    one.until_segments(0, lambda: client.ask("stats"))
     assert client.ask("reload")[3:6] == [0, 0, 0]

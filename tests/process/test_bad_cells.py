@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.process.test_faults import peak_memory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.process_costs import peak_bytes
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 
@@ -41,7 +41,7 @@ def assert_outcomes(
     """Ask for each cell alone, then all at once; None stands for a refusal, else points in the file."""
     client.area(circle(0, 0, 5))
     (loader,) = one.children()
-    idle = peak_memory(loader)
+    idle = peak_bytes(loader)
     for name, points in expected.items():
         reply = client.selected([name])
         if points is None:
@@ -56,7 +56,7 @@ def assert_outcomes(
             assert handle.points == points - segment.fields["dropped_points"]
             assert np.isfinite(segment.columns["xyz"]).all()
     assert one.children() == [loader]  # none of them cost a loader its life
-    assert peak_memory(loader) - idle < (100 << 20) + largest
+    assert peak_bytes(loader) - idle < (100 << 20) + largest
     everything = client.area(circle(0, 0, 1e5))
     assert {f.id.rsplit("/", 1)[-1] for f in everything.failed} == {
         n for n, p in expected.items() if p is None

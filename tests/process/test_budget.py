@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.process.test_requests import assert_same_points, names
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.memory_watch import MemoryWatch
 from tests.support.patience import Patience
 from tests.support.raw_client import RawCells, RawClient, RawHandle, circle
 from tests.support.segment_reader import map_segment
+from tests.support.served_cells import assert_same_points, names
 
 Connect = Callable[..., RawClient]
 CELL_BYTES = 72 << 10  # 4200 points of 16 bytes, header, whole pages

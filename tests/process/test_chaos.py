@@ -143,7 +143,5 @@ def test_a_random_life(daemon: DaemonFactory, connect: Connect, divided_map: Div
         for reader in life.readers:
             reader.process.end()
     client.ask("evict")
-    waiting = Patience()
-    while waiting(bool(one.segments())):
-        client.ask("stats")
+    one.until_segments(0, lambda: client.ask("stats"))
     life.check_books()

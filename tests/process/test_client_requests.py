@@ -29,12 +29,9 @@ from shmmap.errors import (
 from shmmap.segment.attach import attach
 from tests.support.daemon_process import DaemonProcess, open_files
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.served_cells import names
 
 Factory = Callable[..., DaemonProcess]
-
-
-def names(cells: object) -> list[str]:
-    return [Path(cell.id).name for cell in cells]  # type: ignore[attr-defined]
 
 
 def assert_bits(cell: shmmap.Cell, made: DividedMap) -> None:

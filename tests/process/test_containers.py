@@ -144,9 +144,7 @@ def test_a_daemon_that_does_not_see_its_clients_pids(
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (0, len(paths))
         assert reader.checksums() == before
-    waiting = Patience()
-    while waiting(bool(one.segments())):
-        client.ask("stats")
+    one.until_segments(0, lambda: client.ask("stats"))
     assert client.ask("shutdown")[0] == "stopping"
     assert one.process is not None
     process, one.process = one.process, None

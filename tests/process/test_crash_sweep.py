@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.errors import LoadFailed
 from shmmap.segment.crash_steps import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.patience import Patience
+from tests.support.served_cells import assert_right, whole
 
 STEPS_AT_START = (
     "daemon.lock",
@@ -108,25 +108,6 @@ def crashing(
         assert (state.f_blocks - state.f_bfree) * state.f_frsize == named
 
 
-def assert_right(cells: shmmap.CellSet, made: DividedMap, wanted: list[str]) -> None:
-    """All of them are there, each with exactly its file's bytes."""
-    assert sorted(cell.id.rsplit("/", 1)[1] for cell in cells) == wanted
-    for cell in cells:
-        expected = made.points(cell.id.rsplit("/", 1)[1])
-        assert cell.xyz[:, 0].tobytes() == expected["x"].tobytes()
-        assert cell["intensity"].tobytes() == expected["intensity"].tobytes()
-
-
-def whole(client: shmmap.Client, x: float, y: float, radius: float) -> shmmap.CellSet:
-    """Ask until every cell is there: one that a loader died of is retried."""
-    found = client.around(x, y, radius, wait=30.0)
-    waiting = Patience()
-    while waiting(not found.complete):
-        assert all(isinstance(failure, LoadFailed) for failure in found.failed), found
-        found = client.around(x, y, radius, wait=30.0)
-    return found
-
-
 def live(client: shmmap.Client, made: DividedMap) -> None:
     """Come by every step: load, hand out, retire while held, revive, free, change, reload."""
     near, far = made.in_circle(0, 0, 5), made.in_circle(40, 40, 5)
@@ -162,9 +143,7 @@ def test_daemon_and_worker(
         while waiting(not _books_agree(one, client)):
             pass
         client.evict()
-        waiting = Patience()
-        while waiting(bool(one.segments())):
-            client.stats()
+        one.until_segments(0, client.stats)
 
 
 def _books_agree(one: DaemonProcess, client: shmmap.Client) -> bool:
@@ -197,9 +176,7 @@ def test_client(daemon: DaemonFactory, divided_map: DividedMap, label: str, numb
         )
         assert done.returncode == -9
         assert other.evict().pinned == len(held)
-        waiting = Patience()
-        while waiting(len(one.segments()) > len(held)):
-            other.stats()
+        one.until_segments(len(held), lambda: other.stats())
         assert_right(whole(other, 0, 0, 30), divided_map, near)
         waiting = Patience()
         while waiting(len(other.stats().sessions) > 1):

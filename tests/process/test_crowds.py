@@ -11,10 +11,10 @@ from contextlib import contextmanager
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.process.test_hostile_clients import descriptors, resident_memory
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.patience import Patience
+from tests.support.process_costs import descriptors, resident_bytes
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -152,7 +152,7 @@ def test_replies_that_nobody_reads(daemon: DaemonFactory, connect: Connect, divi
     one = daemon(divided_map.root)
     client = connect(one)
     client.area(circle(0, 0, 500))
-    before = resident_memory(one.pid)
+    before = resident_bytes(one.pid)
     program = """
 one = zmtp()
 one.settimeout(20.0)
@@ -171,7 +171,7 @@ except OSError:
         assert said(process) == "ended"
         serves(client)
         assert f"connection of process {process.pid}: it left" in one.log
-    assert resident_memory(one.pid) - before < 96 << 20
+    assert resident_bytes(one.pid) - before < 96 << 20
 
 
 def test_a_message_that_never_ends(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
@@ -194,7 +194,7 @@ except OSError:
         serves(client)
         assert f"process {process.pid}: it made the daemon take too much memory" in one.log
     waiting = Patience()
-    while waiting(resident_memory(one.pid) > 400 << 20):
+    while waiting(resident_bytes(one.pid) > 400 << 20):
         client.ask("stats")
 
 

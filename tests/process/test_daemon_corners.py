@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +15,6 @@ from tests.support.divided_map import DividedMap, random_points
 from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
-
-
-def names(handles: list[Any]) -> list[str]:
-    """Base names of the cells of a reply."""
-    return [handle.id.rsplit("/", 1)[-1] for handle in handles]
 
 
 # --- signals ----------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ import zmq
 from shmmap import EventStream, Missed
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
-from tests.process.test_reload import change
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import unpack
@@ -63,7 +62,7 @@ def test_what_happens_is_told_in_order(
     stream = listen(one, since=60)
     client = connect(one, name="driver")
     loaded = client.selected(["0_0.pcd"]).cells[0]
-    change(divided_map, "0_0.pcd", 5)
+    divided_map.change("0_0.pcd", 5)
     divided_map.remove_cell("20_20.pcd")
     divided_map.write_metadata()
     client.ask("reload")
@@ -99,11 +98,11 @@ def test_retries_and_pressure(
     client, stream = connect(one), listen(one)
     (divided_map.pcd_dir / "0_0.pcd").write_bytes(b"this is no point cloud")
     client.selected(["0_0.pcd"])
-    change(divided_map, "0_0.pcd", 5)
+    divided_map.change("0_0.pcd", 5)
     client.selected(["0_0.pcd"])
     found = until(stream, lambda h: isinstance(h, e.Loaded))
     assert kinds(found)[-4:] == ["failed", "retried", "changed", "loaded"]
-    change(divided_map, "0_0.pcd", 6, 80_000)  # larger than the budget
+    divided_map.change("0_0.pcd", 6, 80_000)  # larger than the budget
     client.ask("reload")
     client.selected(["0_0.pcd"])
     pressure = until(stream, lambda h: isinstance(h, e.Pressure))[-1]

@@ -8,29 +8,18 @@ import resource
 import signal
 import struct
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.daemon_process import wait_ended
 from tests.support.divided_map import DividedMap
 from tests.support.patience import Patience
+from tests.support.process_costs import peak_bytes
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
-
-
-def stop_loaders(one: DaemonProcess) -> list[int]:
-    """SIGSTOP every loader there is, wait until they stand still."""
-    loaders = one.children()
-    for pid in loaders:
-        os.kill(pid, signal.SIGSTOP)
-        waiting = Patience()
-        while waiting(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T"):
-            os.sched_yield()
-    return loaders
 
 
 def test_one_load_for_many_who_ask(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
@@ -53,7 +42,7 @@ def test_a_cold_request_delays_nobody_s_warm_one(
     one = daemon(divided_map.root, "--workers", "1")
     warm, cold = connect(one), connect(one)
     warm.area(circle(0, 0, 5))
-    (loader,) = stop_loaders(one)
+    (loader,) = one.stop_loaders()
     request = cold.send("area", circle(40, 40, 5), ["points"], 60.0)
     partly = cold.area(circle(20, 20, 5), wait=None)  # the same session is not held up either
     assert len(partly.cells) + len(partly.pending) == 4
@@ -69,7 +58,7 @@ def test_patience_ends(daemon: DaemonFactory, connect: Connect, divided_map: Div
     one = daemon(divided_map.root, "--workers", "1")
     client = connect(one)
     client.area(circle(0, 0, 5))
-    (loader,) = stop_loaders(one)
+    (loader,) = one.stop_loaders()
     reply = client.area(circle(10, 0, 15), wait=0.2)
     assert len(reply.cells) == 4
     assert len(reply.pending) == len(divided_map.in_circle(10, 0, 15)) - 4
@@ -83,7 +72,7 @@ def test_a_loader_that_hangs_ends_at_its_deadline(
     one = daemon(divided_map.root, "--workers", "1", "--load-timeout", "4")
     client = connect(one)
     client.area(circle(0, 0, 5))
-    (loader,) = stop_loaders(one)
+    (loader,) = one.stop_loaders()
     reply = client.area(circle(40, 40, 5))
     assert wait_ended(loader)
     assert [failure.code for failure in reply.failed] == ["load_timeout"]  # the one it stood still at
@@ -97,7 +86,7 @@ def test_a_loader_that_is_killed_costs_one_cell(
     one = daemon(divided_map.root, "--workers", "1")
     client = connect(one)
     client.area(circle(0, 0, 5))
-    (loader,) = stop_loaders(one)
+    (loader,) = one.stop_loaders()
     started = client.ask("stats")[4]["loads_started"]
     request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
     waiting = Patience()
@@ -190,7 +179,7 @@ def test_a_header_that_promises_the_moon_costs_no_memory(
     client = connect(one)
     client.area(circle(0, 0, 5))
     (loader,) = one.children()
-    idle = peak_memory(loader)
+    idle = peak_bytes(loader)
     header = (
         b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 300000000\nHEIGHT 1\n"
         b"POINTS 300000000\nDATA "
@@ -204,7 +193,7 @@ def test_a_header_that_promises_the_moon_costs_no_memory(
         reply = client.selected([name])
         assert [f.code for f in reply.failed] == ["load_failed"]
     assert one.children() == [loader]
-    assert peak_memory(loader) - idle < 100 << 20
+    assert peak_bytes(loader) - idle < 100 << 20
 
 
 def test_statistics_that_cannot_be_written_end_nobody(
@@ -227,11 +216,3 @@ def test_statistics_that_cannot_be_written_end_nobody(
     while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
         os.sched_yield()
     assert one.log.count(told) == 1
-
-
-def peak_memory(pid: int) -> int:
-    """Most memory a process ever had, bytes."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024
-    raise AssertionError("no VmHWM")

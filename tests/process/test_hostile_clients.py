@@ -10,31 +10,19 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import zmq
 
 from tests.process.conftest import DaemonFactory
-from tests.process.test_faults import peak_memory
 from tests.support.daemon_process import DaemonProcess, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
 from tests.support.patience import Patience
+from tests.support.process_costs import descriptors, peak_bytes, resident_bytes
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
-
-
-def descriptors(pid: int) -> int:
-    return len(os.listdir(f"/proc/{pid}/fd"))
-
-
-def resident_memory(pid: int) -> int:
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) * 1024
-    raise AssertionError("no VmRSS")
 
 
 def test_a_frame_larger_than_any_request(
@@ -43,18 +31,18 @@ def test_a_frame_larger_than_any_request(
     """The socket itself ends the connection: the daemon never holds those bytes."""
     one = daemon(divided_map.root)
     client = connect(one)
-    before = peak_memory(one.pid)
+    before = peak_bytes(one.pid)
     big = connect(one)
     big.send_bytes(bytes(100_000_000))
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    assert peak_memory(one.pid) - before < 16 << 20
+    assert peak_bytes(one.pid) - before < 16 << 20
 
 
 def test_a_flood_that_never_listens(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     client, deaf = connect(one), connect(one)
     client.area(circle(0, 0, 60))
-    before = resident_memory(one.pid)
+    before = resident_bytes(one.pid)
     request = pack(["area", 1, circle(0, 0, 60), ["points"], 10.0])
     deaf.socket.setsockopt(zmq.SNDTIMEO, 0)
     sent = 0
@@ -68,7 +56,7 @@ def test_a_flood_that_never_listens(daemon: DaemonFactory, connect: Connect, div
             assert len(client.area(circle(0, 0, 5)).cells) == 4
     assert sent > 1000
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    assert resident_memory(one.pid) - before < 64 << 20
+    assert resident_bytes(one.pid) - before < 64 << 20
 
 
 def test_many_frames_and_no_frames(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:

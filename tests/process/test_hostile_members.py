@@ -13,10 +13,9 @@ from typing import Any
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.process.test_access import GROUP, MEMBER, python_for_others
+from tests.support.accounts import GROUP, MEMBER, python_for_others
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 pytestmark = pytest.mark.root
@@ -95,6 +94,4 @@ def test_locks_hold_nobody_up(daemon: DaemonFactory, connect: Connect, divided_m
         again = connect(one)
         assert len(again.area(circle(0, 0, 500)).cells) == 36
         assert again.ask("evict")[2:4] == [0, 36]
-    waiting = Patience()
-    while waiting(bool(one.segments())):
-        again.ask("stats")
+    one.until_segments(0, lambda: again.ask("stats"))

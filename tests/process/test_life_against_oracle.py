@@ -32,7 +32,6 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.holding_client import HeldRow, Holding, HoldingClient
-from tests.support.patience import Patience
 
 STEPS = int(os.environ.get("SHMMAP_TEST_STEPS", "120"))
 SEED = int(os.environ.get("SHMMAP_TEST_SEED", "1"))
@@ -251,9 +250,7 @@ class Life:
             assert {row.segment: row for row in holder.process.tell(None).cells} == holder.expected
         self.close()
         self.admin.evict()
-        waiting = Patience()
-        while waiting(bool(self.one.segments())):
-            self.admin.stats()
+        self.one.until_segments(0, self.admin.stats)
         counters = self.admin.stats().counters
         assert (counters["bytes_resident"], counters["bytes_zombie"], counters["bytes_reserved"]) == (0, 0, 0)
 

@@ -228,9 +228,7 @@ def test_strangers_segments_are_left_alone(
     one.start()
     client = connect(one)
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    waiting = Patience()
-    while waiting(len(one.segments()) > 4):
-        client.ask("stats")
+    one.until_segments(4, lambda: client.ask("stats"))
     assert (other.read_bytes(), longer.read_bytes()) == (b"mine", b"mine")
     other.unlink()
     longer.unlink()

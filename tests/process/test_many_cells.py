@@ -66,9 +66,7 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
         assert (evicted[2], evicted[3]) == (0, 3000)
         holder.stdin.write("\n")
         assert holder.stdout.readline() == "released\n"
-        waiting = Patience()
-        while waiting(bool(one.segments())):
-            raw.ask("stats")
+        one.until_segments(0, lambda: raw.ask("stats"))
         waiting = Patience()
         while waiting(bool(read_statistics(one.instance, one.shm_dir).cells)):
             raw.ask("stats")

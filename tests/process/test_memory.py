@@ -8,7 +8,7 @@ from pathlib import Path
 from tests.process.conftest import DaemonFactory
 from tests.support.divided_map import make_map
 from tests.support.following_client import FollowingClient
-from tests.support.shared_memory_use import proportional_bytes, proportional_bytes_under
+from tests.support.process_costs import proportional_bytes, proportional_bytes_under
 
 PROCESSES = 8
 

@@ -22,8 +22,7 @@ import pytest
 import shmmap as client_library
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
-from tests.process.test_cli_verbs import Shmmap
-from tests.process.test_reload import change
+from tests.support.command_line import Shmmap
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.patience import Patience
 
@@ -104,7 +103,7 @@ def test_six_questions(tight: Shmmap) -> None:
 def test_tail_in_json_and_what_it_leaves_out(shmmap: Shmmap, divided_map: DividedMap) -> None:
     with client_library.connect(shmmap.daemon.endpoint, name="driver") as client:
         client.selected([divided_map.id("0_0.pcd")], wait=20.0)
-        change(divided_map, "0_0.pcd", 5)
+        divided_map.change("0_0.pcd", 5)
         client.reload()
     lines = [json.loads(line) for line in shmmap("tail", "--json").splitlines()]
     kinds = [line["event"] for line in lines]

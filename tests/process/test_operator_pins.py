@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.accounts import ADMINS, GROUP, MEMBER
 from tests.support.daemon_process import ROOT, DaemonProcess, wait_ended
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
-GROUP, ADMINS, MEMBER = 61002, 61005, 61003
 
 
 def pins(client: RawClient) -> dict[str, str]:

@@ -15,20 +15,12 @@ import pytest
 import shmmap
 from shmmap.daemon.inotify import NAME_GONE, Inotify
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
 from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
-
-
-def until_freed(one: DaemonProcess, client: RawClient) -> None:
-    """Ask until no segment is left (the daemon looks at retired ones by itself)."""
-    waiting = Patience()
-    while waiting(bool(one.segments())):
-        client.ask("stats")
 
 
 def test_evicting_everything_frees_what_nobody_maps(
@@ -42,9 +34,7 @@ def test_evicting_everything_frees_what_nobody_maps(
     with MappingProcess(paths) as reader:
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (len(handles) - 2, 2)
-        waiting = Patience()
-        while waiting(len(one.segments()) > 2):
-            client.ask("stats")
+        one.until_segments(2, lambda: client.ask("stats"))
         assert all(name.endswith(".zombie") for name in one.segments())
         waiting = Patience()
         while waiting(client.ask("stats")[4]["zombies"] != 2):  # gauges are written a few times a second
@@ -59,7 +49,7 @@ def test_evicting_everything_frees_what_nobody_maps(
         assert again.segment == handles[0].segment
         assert client.ask("stats")[4]["loads_finished"] == loads
         client.ask("evict")
-    until_freed(one, client)
+    one.until_segments(0, lambda: client.ask("stats"))
 
 
 def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unknown(
@@ -83,7 +73,7 @@ def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unk
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
         os.kill(stranger.pid, signal.SIGCONT)
         assert stranger.checksums() == [expected]
-    until_freed(one, client)
+    one.until_segments(0, lambda: client.ask("stats"))
     stats = client.ask("stats")
     assert (stats[6], stats[7]) == (0, 0)
 
@@ -100,7 +90,7 @@ def test_clients_that_die_let_go(daemon: DaemonFactory, connect: Connect, divide
     finally:
         for reader in readers:
             reader.end()
-    until_freed(one, client)
+    one.until_segments(0, lambda: client.ask("stats"))
 
 
 @pytest.mark.parametrize("at_once", [False, True])
@@ -141,9 +131,7 @@ def test_where_there_are_no_leases(daemon: DaemonFactory, divided_map: DividedMa
         assert [zlib.crc32(cell.xyz.data) for cell in held] == expected
         del held
         client.release()
-        waiting = Patience()
-        while waiting(bool(one.segments())):
-            client.stats()
+        one.until_segments(0, client.stats)
     assert "grants no leases" in one.log
 
 

@@ -11,20 +11,14 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.process.test_requests import assert_same_points, names
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 from tests.support.segment_reader import map_segment, parse
+from tests.support.served_cells import assert_same_points, names
 
 Connect = Callable[..., RawClient]
-
-
-def change(made: DividedMap, name: str, seed: int, count: int = 700) -> None:
-    """Give a cell other points."""
-    corner = made.corners[name]
-    made.write_cell(name, corner, random_points(np.random.default_rng(seed), corner, count, made.size))
 
 
 def test_changed_new_and_deleted_cells(
@@ -33,7 +27,7 @@ def test_changed_new_and_deleted_cells(
     client = connect(daemon(divided_map.root))
     first = client.area(circle(0, 0, 25))
     held = {handle.id.rsplit("/", 1)[1]: handle.version for handle in first.cells}
-    change(divided_map, "0_0.pcd", 5)
+    divided_map.change("0_0.pcd", 5)
     divided_map.remove_cell("0_-20.pcd")
     corner = (60, 0)
     divided_map.write_cell("60_0.pcd", corner, random_points(np.random.default_rng(8), corner, 100))
@@ -63,7 +57,7 @@ def test_metadata_since_a_map_version(
     before = client.map_version
     nothing = client.ask("metadata", None, before)
     assert (nothing[4], nothing[6], nothing[7]) == ([], True, [])
-    change(divided_map, "0_0.pcd", 5)
+    divided_map.change("0_0.pcd", 5)
     divided_map.remove_cell("0_-20.pcd")
     divided_map.write_metadata()
     client.ask("reload")
@@ -79,7 +73,7 @@ def test_the_signal(daemon: DaemonFactory, connect: Connect, divided_map: Divide
     one = daemon(divided_map.root)
     client = connect(one)
     old = client.selected(["0_0.pcd"])
-    change(divided_map, "0_0.pcd", 5)
+    divided_map.change("0_0.pcd", 5)
     one.send(signal.SIGHUP)
     reply = client.selected(["0_0.pcd"])
     waiting = Patience()
@@ -123,7 +117,7 @@ def test_a_half_written_file_leaves_the_old_version_in_service(
         kept = client.differential(circle(10, 10, 1), rows, packed=packed)  # who has it keeps it
         assert (kept.cells, kept.removed, kept.removed_versions) == ([], [], [])
         assert [f.code for f in kept.failed] == ["load_failed"]
-    change(divided_map, "0_0.pcd", 6)
+    divided_map.change("0_0.pcd", 6)
     client.ask("reload")
     reply = client.differential(circle(10, 10, 1), packed=[old.version])
     assert (len(reply.cells), reply.failed) == (1, [])
@@ -159,7 +153,7 @@ def test_old_versions_stay_while_somebody_maps_them(
     old = client.selected(["0_0.pcd"]).cells[0]
     with MappingProcess([client.path(old)]) as reader:
         before = reader.checksums()
-        change(divided_map, "0_0.pcd", 5)
+        divided_map.change("0_0.pcd", 5)
         client.ask("reload")
         new = client.selected(["0_0.pcd"]).cells[0]
         assert new.segment != old.segment
@@ -168,9 +162,7 @@ def test_old_versions_stay_while_somebody_maps_them(
         while waiting(not any(name.endswith(".zombie") for name in one.segments())):
             client.ask("stats")
         assert len(one.segments()) == 2
-    waiting = Patience()
-    while waiting(len(one.segments()) > 1):
-        client.ask("stats")
+    one.until_segments(1, lambda: client.ask("stats"))
 
 
 def test_reload_again_and_again_while_clients_ask(
@@ -181,7 +173,7 @@ def test_reload_again_and_again_while_clients_ask(
     asker, changer = connect(one), connect(one)
     states = {divided_map.points("0_0.pcd")["x"].tobytes()}
     for round_ in range(12):
-        change(divided_map, "0_0.pcd", round_, 200 + 10 * round_)
+        divided_map.change("0_0.pcd", round_, 200 + 10 * round_)
         states.add(divided_map.points("0_0.pcd")["x"].tobytes())
         pending = changer.send("reload")
         for _ in range(5):

@@ -13,29 +13,10 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
-from tests.support.raw_client import DaemonError, RawClient, RawHandle, circle, square
-from tests.support.segment_reader import read_segment
+from tests.support.raw_client import DaemonError, RawClient, circle, square
+from tests.support.served_cells import assert_same_points, names
 
 Connect = Callable[..., RawClient]
-
-
-def names(handles: list[RawHandle]) -> list[str]:
-    return [handle.id.rsplit("/", 1)[1] for handle in handles]
-
-
-def assert_same_points(client: RawClient, handle: RawHandle, made: DividedMap) -> None:
-    """The segment holds exactly what an independent reader finds in the file."""
-    name = handle.id.rsplit("/", 1)[1]
-    segment = read_segment(client.path(handle))
-    source = made.points(name)
-    expected = np.column_stack([source["x"], source["y"], source["z"]])
-    assert segment.columns["xyz"].tobytes() == expected.tobytes()
-    assert segment.columns["intensity"].tobytes() == source["intensity"].tobytes()
-    assert segment.fields["cell_id"] == made.id(name) == handle.id
-    assert segment.fields["box"] == made.box(name) == handle.box
-    assert (segment.epoch, segment.version) == (client.epoch, handle.version)
-    assert handle.points == segment.fields["rows"] == len(expected)
-    assert segment.fields["dropped_points"] == 0
 
 
 def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:

@@ -21,15 +21,14 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.process.test_crash_sweep import assert_right, whole
-from tests.process.test_faults import stop_loaders
-from tests.process.test_warm_restart import damage_header, damage_payload, other_layout
 from tests.support.daemon_process import DaemonProcess
+from tests.support.damage import damage_header, damage_payload, other_layout
 from tests.support.divided_map import DividedMap
 from tests.support.holding_client import HoldingClient
 from tests.support.mapping_process import MappingProcess
 from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient
+from tests.support.served_cells import assert_right, whole
 
 
 class Bystanders:
@@ -52,9 +51,7 @@ class Bystanders:
 
     def freed(self, keep: int) -> None:
         """Wait until only this many segments are left."""
-        waiting = Patience()
-        while waiting(len(self.one.segments()) > keep):
-            self.client.evict()
+        self.one.until_segments(keep, self.client.evict)
 
     def end(self) -> None:
         """Check for the last time; then everything is freed."""
@@ -125,7 +122,7 @@ def test_3_a_handle_is_overtaken_by_eviction(bystanders: Bystanders, monkeypatch
 def test_4_the_daemon_is_killed_at_work(bystanders: Bystanders) -> None:
     """Every step has its own test (`test_crash_sweep`); here in the middle of a load."""
     one = bystanders.one
-    stop_loaders(one)
+    one.stop_loaders()
     found: list[shmmap.CellSet] = []
     with shmmap.connect(one.endpoint, timeout=60.0) as asking:
         before = bystanders.client.stats().counters["loads_started"]
@@ -179,7 +176,7 @@ def test_7_a_file_changes_under_its_loader_and_the_loader_is_killed(bystanders: 
     one, made = bystanders.one, bystanders.made
     path = made.pcd_dir / "40_40.pcd"
     good = path.read_bytes()
-    (loader,) = stop_loaders(one)
+    (loader,) = one.stop_loaders()
     found: list[shmmap.CellSet] = []
 
     def ask() -> None:

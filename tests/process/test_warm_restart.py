@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import struct
 import threading
 import zlib
 from collections.abc import Callable
@@ -17,8 +16,15 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.process.test_faults import stop_loaders
 from tests.support.daemon_process import DaemonProcess
+from tests.support.damage import (
+    damage_header,
+    damage_payload,
+    damage_publish_block,
+    other_layout,
+    punch,
+    shorten,
+)
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.patience import Patience
@@ -112,7 +118,7 @@ def test_a_waiting_request_is_answered_by_the_next_life(
     with shmmap.connect(one.endpoint, timeout=60.0) as client:
         held = list(client.around(0, 0, 5).raise_for_failures())
         loads = client.stats().counters["loads_started"]
-        stop_loaders(one)
+        one.stop_loaders()
         found: list[shmmap.CellSet] = []
         thread = threading.Thread(target=lambda: found.append(client.around(40, 40, 15, wait=60.0)))
         thread.start()
@@ -128,55 +134,8 @@ def test_a_waiting_request_is_answered_by_the_next_life(
         assert {id(cell) for cell in again} == {id(cell) for cell in held}  # nothing was mapped anew
 
 
-def damage_payload(path: str) -> None:
-    _poke(path, 4096 + 64 * 3 + 1)
-
-
-def damage_header(path: str) -> None:
-    _poke(path, 96)
-
-
-def other_layout(path: str) -> None:
-    """Another major layout version, checksum and all."""
-    os.chmod(path, 0o600)
-    with open(path, "r+b") as file:
-        page = bytearray(file.read(4096))
-        struct.pack_into("<H", page, 8, 2)
-        end = 4096 - 72
-        struct.pack_into("<I", page, end, zlib.crc32(page[:end]))
-        file.seek(0)
-        file.write(page)
-    os.chmod(path, 0o400)
-
-
-def damage_publish_block(path: str) -> None:
-    _poke(path, 4096 - 64 + 17)
-
-
-def shorten(path: str) -> None:
-    os.truncate(path, 4096)
-
-
-def punch(path: str) -> None:
-    os.chmod(path, 0o600)
-    with open(path, "r+b") as file:
-        file.seek(4096)
-        file.write(bytes(4096))
-    os.chmod(path, 0o400)
-
-
 def open_to_others(path: str) -> None:
     os.chmod(path, 0o660)
-
-
-def _poke(path: str, at: int) -> None:
-    os.chmod(path, 0o600)
-    with open(path, "r+b") as file:
-        file.seek(at)
-        byte = file.read(1)
-        file.seek(at)
-        file.write(bytes([byte[0] ^ 0x10]))
-    os.chmod(path, 0o400)
 
 
 @pytest.mark.parametrize(
@@ -196,9 +155,7 @@ def test_a_damaged_leftover_is_never_served(
     reply = client.selected(["0_0.pcd"])
     assert reply.cells[0].segment != handle.segment
     assert_right(client, reply, divided_map)
-    waiting = Patience()
-    while waiting(len(one.segments()) > 1):
-        client.ask("stats")
+    one.until_segments(1, lambda: client.ask("stats"))
 
 
 def test_a_damaged_leftover_that_somebody_maps_is_known_until_it_is_let_go(
@@ -219,9 +176,7 @@ def test_a_damaged_leftover_that_somebody_maps_is_known_until_it_is_let_go(
             [(reply.cells[0].segment, "resident"), (handle.segment, "zombie")]
         )
         assert reader.checksums()
-    waiting = Patience()
-    while waiting(len(one.segments()) > 1):
-        client.ask("stats")
+    one.until_segments(1, lambda: client.ask("stats"))
 
 
 def test_what_changed_while_nobody_looked_is_loaded_anew(
@@ -250,9 +205,7 @@ def test_what_changed_while_nobody_looked_is_loaded_anew(
             (after[changed], "resident"), (before[changed], "zombie"),
         ]  # fmt: skip
         assert reader.checksums() == [checksum]
-    waiting = Patience()
-    while waiting(len(one.segments()) > 35):
-        client.ask("stats")
+    one.until_segments(35, lambda: client.ask("stats"))
 
 
 def test_names_that_are_no_segments_hinder_nobody(

@@ -8,7 +8,6 @@ import numpy as np
 from shmmap import EventStream, connect
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
-from tests.process.test_reload import change
 from tests.support.divided_map import DividedMap, make_map, random_points
 
 
@@ -24,7 +23,7 @@ def test_what_is_written_is_served(daemon: DaemonFactory, divided_map: DividedMa
     one = daemon(divided_map.root, "--watch")
     with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
         old = client.selected([divided_map.id("0_0.pcd")], wait=30.0)[0].version
-        change(divided_map, "0_0.pcd", 5)
+        divided_map.change("0_0.pcd", 5)
         told = next_reload(stream)
         assert (told.changed, told.added, told.removed, told.error) == (1, 0, 0, "")
         newer = client.selected([divided_map.id("0_0.pcd")], wait=30.0)[0]
@@ -55,16 +54,16 @@ def test_a_map_that_is_away_for_a_while(daemon: DaemonFactory, divided_map: Divi
         told = next_reload(stream)
         assert (told.error, told.removed) == ("", 32)
         next_map.root = divided_map.root
-        change(next_map, "0_0.pcd", 7)
+        next_map.change("0_0.pcd", 7)
         assert next_reload(stream).changed == 1
-        change(divided_map, "0_0.pcd", 8)
+        divided_map.change("0_0.pcd", 8)
         assert next_reload(stream).changed == 1
 
 
 def test_without_the_setting_nothing_is_watched(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
-        change(divided_map, "0_0.pcd", 5)
+        divided_map.change("0_0.pcd", 5)
         client.reload()
         assert next_reload(stream).changed == 1
         assert client.stats().counters["reloads"] == 1

@@ -15,8 +15,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+
+from tests.support.patience import Patience
 
 ROOT = Path(__file__).resolve().parents[2]
 READY_S = 60.0
@@ -236,10 +238,26 @@ class DaemonProcess:
         own = self.process.pid if self.process is not None else 0
         return sorted(pid for pid in processes_marked(self._mark) if pid != own)
 
+    def stop_loaders(self) -> list[int]:
+        """SIGSTOP every loader there is, wait until they stand still; returns their ids."""
+        loaders = self.children()
+        for pid in loaders:
+            os.kill(pid, signal.SIGSTOP)
+            waiting = Patience()
+            while waiting(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T"):
+                os.sched_yield()
+        return loaders
+
     def segments(self) -> list[str]:
         """Published and retired segments, sorted; statistics and lock are not among them."""
         own = re.compile(rf"shmmap\.{self.instance}\.[0-9a-f]{{16}}(\.zombie)?")
         return sorted(name for name in os.listdir(self.shm_dir) if own.fullmatch(name))
+
+    def until_segments(self, at_most: int, ask: Callable[[], object]) -> None:
+        """Ask until no more are left (the daemon looks at retired ones by itself)."""
+        waiting = Patience()
+        while waiting(len(self.segments()) > at_most):
+            ask()
 
     def segment_bytes(self) -> int:
         """Memory the instance's segments occupy by their blocks (the statistics not counted)."""

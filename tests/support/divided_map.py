@@ -48,6 +48,11 @@ class DividedMap:
         write_pcd(interim, columns)
         interim.rename(self.pcd_dir / name)
 
+    def change(self, name: str, seed: int, count: int = 700) -> None:
+        """Give a cell other points."""
+        corner = self.corners[name]
+        self.write_cell(name, corner, random_points(np.random.default_rng(seed), corner, count, self.size))
+
     def remove_cell(self, name: str) -> None:
         """Delete a cell's file and entry."""
         del self.corners[name]

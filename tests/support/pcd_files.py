@@ -55,3 +55,10 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
     )
     record = np.frombuffer(data, dtype, int(keys["POINTS"][0]), end)
     return {name: np.ascontiguousarray(record[name]) for name in keys["FIELDS"]}
+
+
+def write_ascii(path: Path, points: int) -> Path:
+    """Write a file that needs more memory than it is long: "1 2 3" is 6 bytes, three floats are 12."""
+    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
+    path.write_text(f"{head}POINTS {points}\nDATA ascii\n" + "1 2 3\n" * points)
+    return path

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
@@ -12,15 +11,12 @@ import numpy as np
 
 from shmmap.client.attaching import Mapping
 from shmmap.client.cell import Cell
+from tests.support.process_costs import mappings_under
 
 if TYPE_CHECKING:
     from tests.unit.client.conftest import Segments
 
 XYZ = {"xyz": np.ones((5, 3), np.float32)}
-
-
-def mapped(path: str) -> int:
-    return sum(path in line for line in Path("/proc/self/maps").read_text().splitlines())
 
 
 def test_the_same_version_and_layer_is_mapped_once(segments: Segments) -> None:
@@ -29,7 +25,7 @@ def test_the_same_version_and_layer_is_mapped_once(segments: Segments) -> None:
     assert segments.attach(name, handle) is first
     other, handle_of_other = segments.publish("/a", XYZ, version=5, layer="voxel")
     assert segments.attach(other, handle_of_other) is not first
-    assert mapped(segments.path) == 1
+    assert mappings_under(segments.path) == 1
 
 
 def test_staleness_follows_the_last_reply(segments: Segments) -> None:
@@ -66,14 +62,14 @@ def test_deferred_mappings_stay_until_their_thread_unmaps_them(segments: Segment
     cell = segments.cell("/a", XYZ, version=5)
     address = cell.xyz.ctypes.data
     del cell
-    assert mapped(segments.path) == 1
+    assert mappings_under(segments.path) == 1
     assert segments.attacher.take_unmapped() == []
     mapping = queue.get_nowait()
     assert mapping is not None
     assert mapping[0] == 5
     assert mapping[1] <= address < mapping[1] + mapping[2]
     unmapper.finish(mapping)
-    assert mapped(segments.path) == 0
+    assert mappings_under(segments.path) == 0
     assert segments.attacher.take_unmapped() == [5]
     unmapper.stop_deferring(queue)
 
@@ -87,13 +83,13 @@ def test_what_is_queued_when_the_thread_ends_is_unmapped_too(segments: Segments)
     cells = [segments.cell(f"/{i}", XYZ, version=i) for i in range(1, 4)]
     cells.pop()
     unmapper.stop_deferring(first)
-    assert mapped(segments.path) == 2
+    assert mappings_under(segments.path) == 2
     cells.pop()
     assert second.qsize() == 1, "the other thread takes over"
     unmapper.stop_deferring(second)
-    assert mapped(segments.path) == 1
+    assert mappings_under(segments.path) == 1
     cells.pop()
-    assert mapped(segments.path) == 0
+    assert mappings_under(segments.path) == 0
 
 
 def drop_when_all_are_there(cells: list[Cell], barrier: threading.Barrier) -> None:
@@ -118,4 +114,4 @@ def test_dropping_cells_in_many_threads_while_the_thread_ends_loses_none(segment
             thread.join()
         threads.clear()
         del thread
-        assert mapped(segments.path) == 0
+        assert mappings_under(segments.path) == 0

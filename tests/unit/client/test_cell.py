@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt, StaleHandle
+from tests.support.process_costs import mappings_under
 
 if TYPE_CHECKING:
     from tests.unit.client.conftest import Segments
@@ -26,11 +27,6 @@ COLUMNS: dict[str, NDArray[Any]] = {
     "ring": np.arange(10, dtype=np.uint16),
     "rgb": np.arange(30, dtype=np.uint8).reshape(10, 3),
 }
-
-
-def mapped(path: str) -> int:
-    """How many mappings of files below ``path`` this process has."""
-    return sum(path in line for line in Path("/proc/self/maps").read_text().splitlines())
 
 
 def test_columns_keep_names_order_dtypes_and_bits(segments: Segments) -> None:
@@ -84,10 +80,10 @@ def test_a_view_of_a_view_keeps_the_bytes_and_the_last_one_unmaps(segments: Segm
     del cell
     assert gone() is None
     segments.directory.unlink(name)
-    assert mapped(segments.path) == 1
+    assert mappings_under(segments.path) == 1
     np.testing.assert_array_equal(view, expected)
     del view
-    assert mapped(segments.path) == 0
+    assert mappings_under(segments.path) == 0
 
 
 def test_nothing_of_a_cell_needs_the_garbage_collector(segments: Segments) -> None:
@@ -96,9 +92,9 @@ def test_nothing_of_a_cell_needs_the_garbage_collector(segments: Segments) -> No
         cell = segments.cell("/map/a.pcd", COLUMNS)
         assert len(cell.columns) == 4
         assert cell.header.rows == 10
-        assert mapped(segments.path) == 1
+        assert mappings_under(segments.path) == 1
         del cell
-        assert mapped(segments.path) == 0
+        assert mappings_under(segments.path) == 0
     finally:
         gc.enable()
 
@@ -155,7 +151,7 @@ def test_open3d_over_the_same_memory(segments: Segments) -> None:
     assert np.shares_memory(cloud.point["ring"].numpy(), cell["ring"])
     assert cloud.get_max_bound().numpy().tolist() == XYZ.max(axis=0).tolist()
     del cell, positions
-    assert mapped(segments.path) == 1, "the tensors keep the mapping"
+    assert mappings_under(segments.path) == 1, "the tensors keep the mapping"
     np.testing.assert_array_equal(cloud.point["positions"].numpy(), XYZ)
 
 

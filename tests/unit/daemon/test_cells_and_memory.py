@@ -12,6 +12,7 @@ from shmmap.protocol.messages import (
     Selected,
 )
 from tests.support.divided_map import DividedMap
+from tests.support.pcd_files import write_ascii
 from tests.unit.daemon.inner_daemon import Inner, names
 
 
@@ -92,17 +93,10 @@ def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
     assert names(one.cells_of(3)) == ["20_20.pcd"]
 
 
-def ascii_cell(made: DividedMap, name: str, points: int) -> None:
-    """Write a file that needs more memory than it is long."""
-    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
-    path = made.pcd_dir / name
-    path.write_text(f"{head}POINTS {points}\nDATA ascii\n" + "1 2 3\n" * points)
-
-
 def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: DividedMap) -> None:
     """One is refused, and its room given to the other: no deadlock, no deadline."""
     for name in ("0_0.pcd", "20_20.pcd"):
-        ascii_cell(small_map, name, 50_000)
+        write_ascii(small_map.pcd_dir / name, 50_000)
     one = inner(small_map.root, workers=2)
     half = one.store.estimate(one.store.index_of("0_0.pcd") or 0, "points")
     one.books.budget_bytes = one.books.overhead_bytes + 2 * half + 100_000
@@ -115,7 +109,7 @@ def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: Di
 
 
 def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
-    ascii_cell(small_map, "20_20.pcd", 50_000)
+    write_ascii(small_map.pcd_dir / "20_20.pcd", 50_000)
     each = sizes(small_map, inner)
     one = inner(small_map.root)
     one.books.budget_bytes = one.books.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
@@ -137,7 +131,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
 
 
 def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
-    ascii_cell(small_map, "20_20.pcd", 50_000)
+    write_ascii(small_map.pcd_dir / "20_20.pcd", 50_000)
     each = sizes(small_map, inner)
     one = inner(small_map.root, load_timeout_s=0.5)
     one.books.budget_bytes = one.books.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each

@@ -4,69 +4,15 @@
 from __future__ import annotations
 
 import os
-import select
 import socket
-import tempfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zmq
 
-from shmmap.daemon.connections import Census, end_connection, unread_bytes
+from shmmap.daemon.connections import end_connection, unread_bytes
 from shmmap.daemon.listen_gate import ListenGate
-from shmmap.daemon.own_sockets import looked_at, open_descriptors
-
-WAIT_MS = 30_000
-
-
-class Router:
-    """A ROUTER, a loop that a gate can use, and one client."""
-
-    def __init__(self, directory: str) -> None:
-        self.path = f"{directory}/s.sock"
-        self.context: zmq.Context[Any] = zmq.Context()
-        self.socket = self.context.socket(zmq.ROUTER)
-        self.socket.bind(f"ipc://{self.path}")
-        self.clients: list[Any] = []
-        self.epoll = select.epoll()
-        self.callbacks: dict[int, Callable[[], None]] = {}
-
-    def watch(self, fd: int, callback: Callable[[], None]) -> None:
-        self.callbacks[fd] = callback
-        self.epoll.register(fd, select.EPOLLIN)
-
-    def unwatch(self, fd: int) -> None:
-        del self.callbacks[fd]
-        self.epoll.unregister(fd)
-
-    def connect(self) -> None:
-        client = self.context.socket(zmq.DEALER)
-        client.linger = 0
-        client.connect(f"ipc://{self.path}")
-        client.send(b"x")
-        self.clients.append(client)
-
-    def hear(self) -> int:
-        """Wait for a message; returns the descriptor it came on."""
-        assert self.socket.poll(WAIT_MS)
-        self.socket.recv()
-        return int(self.socket.recv(copy=False).get(2))
-
-    def close(self) -> None:
-        for one in (*self.clients, self.socket):
-            one.close(linger=0)
-        self.context.term()
-        self.epoll.close()
-
-
-@pytest.fixture
-def router() -> Iterator[Router]:
-    with tempfile.TemporaryDirectory(dir="/tmp") as directory:
-        one = Router(directory)
-        yield one
-        one.close()
+from shmmap.daemon.own_sockets import listens, looked_at, open_descriptors
+from tests.unit.daemon.router import WAIT_MS, Router, census
 
 
 def test_a_look_leaves_no_descriptor_behind() -> None:
@@ -89,7 +35,7 @@ def test_whose_connection_and_the_end_of_it(router: Router) -> None:
     assert unread_bytes(fd, me + 1, [router.path]) is None  # another process's
     assert unread_bytes(fd, me, ["/elsewhere"]) is None
     assert not end_connection(fd, me + 1, [router.path])
-    listening = [n for n in open_descriptors() if _listens(n)]
+    listening = [n for n in open_descriptors() if listens(n)]
     assert all(not end_connection(n, me, [router.path]) for n in listening)
     assert not end_connection(10**6, me, [router.path])
     with socket.socket(socket.AF_UNIX) as stranger:
@@ -101,25 +47,6 @@ def test_whose_connection_and_the_end_of_it(router: Router) -> None:
         while stranger.recv(4096):
             pass
     assert unread_bytes(fd, me, [router.path]) == 0  # that one lives
-
-
-def census(router: Router) -> dict[int, list[int]]:
-    """Descriptors of all connections, by process."""
-    counting = Census([router.path])
-    while not counting.step():
-        pass
-    assert not counting.arriving.total()
-    return counting.connections
-
-
-def _listens(fd: int) -> bool:
-    try:
-        with looked_at(fd) as view:
-            return view.family == socket.AF_UNIX and bool(
-                view.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-            )
-    except OSError:
-        return False
 
 
 def test_a_census(router: Router) -> None:

@@ -14,9 +14,7 @@ from shmmap.daemon import crowd_control
 from shmmap.daemon.crowd_control import LEAST_SHARE, MEMORY_ALLOWANCE_BYTES, CrowdControl
 from shmmap.daemon.listen_gate import ListenGate
 from shmmap.daemon.own_sockets import open_descriptors
-from tests.unit.daemon.test_connections import Router, census, router
-
-__all__ = ["router"]  # the fixture
+from tests.unit.daemon.router import Router, census
 
 MINE, OTHERS = 12, 3
 _OTHER = """

@@ -22,7 +22,7 @@ from shmmap.segment.layout import PublishBlock
 from shmmap.segment.pins import is_pinned, prepare_process
 from tests.support.daemon_process import wait_ended, wait_readable
 from tests.support.divided_map import random_points
-from tests.support.pcd_files import write_pcd
+from tests.support.pcd_files import write_ascii, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
 PATIENCE_S = 60.0
@@ -109,13 +109,6 @@ def cell(path: Path, points: int) -> Path:
     return path
 
 
-def ascii_cell(path: Path, points: int) -> Path:
-    """Write a file that needs more memory than it is long: "1 2 3" is 6 bytes, three floats are 12."""
-    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
-    path.write_text(f"{head}POINTS {points}\nDATA ascii\n" + "1 2 3\n" * points)
-    return path
-
-
 def test_a_good_file(loader: Loader, tmp_path: Path) -> None:
     path = cell(tmp_path / "a.pcd", 1000)
     loader.load(5, path)
@@ -161,7 +154,7 @@ def test_more_bytes_than_granted(
     loader: Loader, tmp_path: Path, answer: type[jobs.Grant] | type[jobs.Refuse]
 ) -> None:
     """It asks, and waits for the answer though other jobs come first; those are done afterwards, in order."""
-    loader.load(1, ascii_cell(tmp_path / "a.pcd", 5000), 8192)
+    loader.load(1, write_ascii(tmp_path / "a.pcd", 5000), 8192)
     need, _ = loader.receive()
     assert isinstance(need, jobs.Need)
     assert need.number == 1
@@ -187,7 +180,7 @@ def test_more_bytes_than_granted(
 
 
 def test_the_channel_closes_while_it_waits_for_room(loader: Loader, tmp_path: Path) -> None:
-    loader.load(1, ascii_cell(tmp_path / "a.pcd", 5000), 8192)
+    loader.load(1, write_ascii(tmp_path / "a.pcd", 5000), 8192)
     assert isinstance(loader.receive()[0], jobs.Need)
     assert loader.end() == 0
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from fractions import Fraction
 
 import numpy as np
@@ -14,8 +13,8 @@ from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest
 from shmmap.geometry import AutowareSquare, Box, Circle, ZRange, distance_to_boxes
+from tests.support.autoware_areas import Rectangle, cylinder_and_box_overlap_exists, f32
 
-Rectangle = tuple[float, float, float, float]
 whole = st.integers(-1_000_000, 1_000_000).map(float)
 anywhere = st.floats(-1e6, 1e6)
 coordinates = whole | anywhere
@@ -36,26 +35,11 @@ def near(point: tuple[float, float]) -> st.SearchStrategy[Rectangle]:
 cases = st.tuples(whole, whole).flatmap(lambda p: st.tuples(st.just(p), boxes | near(p)))
 
 
-def f32(value: float) -> float:
-    """Round to float32 without numpy."""
-    rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
-    return rounded
-
-
-def cylinder_and_box_overlap_exists(x: float, y: float, radius: float, box: Rectangle) -> bool:
-    """Port of autoware_map_loader utils.cpp, both clauses (float32 messages, double arithmetic)."""
-    min_x, min_y, max_x, max_y = box
-    if min_x - radius <= x <= max_x + radius and min_y - radius <= y <= max_y + radius:
-        return True
-    corners = ((min_x, min_y), (min_x, max_y), (max_x, min_y), (max_x, max_y))
-    return any(math.hypot(x - cx, y - cy) <= radius for cx, cy in corners)
-
-
 @given(cases, sizes | st.sampled_from([0.0, 5.0, 12.5]))
 @example(((16777217.0, 0.0), (0.0, 0.0, 16777216.0, 20.0)), 0.0)
 def test_autoware_s_square(case: tuple[tuple[float, float], Rectangle], radius: float) -> None:
     (x, y), box = case
-    expected = cylinder_and_box_overlap_exists(f32(x), f32(y), f32(radius), tuple(map(f32, box)))  # type: ignore[arg-type]
+    expected = cylinder_and_box_overlap_exists(x, y, radius, box)
     square = AutowareSquare(x, y, radius)
     assert bool(square.overlaps(np.array([box]))[0]) == expected
 

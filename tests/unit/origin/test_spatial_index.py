@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import math
-import struct
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,13 +11,7 @@ from numpy.typing import NDArray
 
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.spatial_index import SpatialIndex
-
-Rectangle = tuple[float, float, float, float]
-
-
-def f32(value: float) -> float:
-    """Round to float32 and back, as storing in a C++ float does."""
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+from tests.support.autoware_areas import Rectangle, cylinder_and_box_overlap_exists
 
 
 def circle_touches(x: float, y: float, radius: float, box: Rectangle) -> bool:
@@ -32,22 +23,12 @@ def rectangle_touches(area: Rectangle, box: Rectangle) -> bool:
     return area[0] <= box[2] and box[0] <= area[2] and area[1] <= box[3] and box[1] <= area[3]
 
 
-def autoware_overlap(x: float, y: float, radius: float, box: Rectangle) -> bool:
-    """Autoware's cylinder_and_box_overlap_exists, ported line by line; messages carry float32."""
-    center_x, center_y, radius = f32(x), f32(y), f32(radius)
-    min_x, min_y, max_x, max_y = (f32(value) for value in box)
-    if min_x - radius <= center_x <= max_x + radius and min_y - radius <= center_y <= max_y + radius:
-        return True
-    corners = ((min_x, min_y), (min_x, max_y), (max_x, max_y), (max_x, min_y))
-    return any(math.hypot(center_x - a, center_y - b) <= radius for a, b in corners)
-
-
 def brute_force(area: Area, boxes: NDArray[np.float64]) -> list[int]:
     def touches(box: Rectangle) -> bool:
         if isinstance(area, Circle):
             return circle_touches(area.x, area.y, area.radius, box)
         if isinstance(area, AutowareSquare):
-            return autoware_overlap(area.x, area.y, area.radius, box)
+            return cylinder_and_box_overlap_exists(area.x, area.y, area.radius, box)
         return rectangle_touches((area.min_x, area.min_y, area.max_x, area.max_y), box)
 
     return [i for i, (a, b, c, d) in enumerate(boxes.tolist()) if touches((a, b, c, d))]
