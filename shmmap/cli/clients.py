@@ -26,15 +26,15 @@ The list includes this program itself."""
 _COLUMNS = (
     Column("CLIENT"),
     Column("PID", "right"),
-    Column("USER"),
+    Column("USER", spare=2),
     Column("CELLS", "right"),
     Column("HANDED", "right"),
     Column("MAPS", "right"),
-    Column("OLD", "right"),
-    Column("REQUESTS", "right"),
-    Column("IDLE", "right"),
-    Column("AT"),
-    Column("COMMAND"),
+    Column("OLD", "right", spare=1),
+    Column("REQUESTS", "right", spare=4),
+    Column("IDLE", "right", spare=5),
+    Column("AT", spare=3),
+    Column("COMMAND", spare=6),
 )
 
 

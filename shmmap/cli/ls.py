@@ -24,16 +24,16 @@ Exit code: 0, or 69 when the daemon is dead or was never started."""
 
 _COLUMNS = (
     Column("CELL"),
-    Column("X", "right"),
-    Column("Y", "right"),
-    Column("SIZE", "right"),
-    Column("STATE"),
-    Column("LAYER"),
+    Column("X", "right", spare=2),
+    Column("Y", "right", spare=2),
+    Column("SIZE", "right", spare=6),
+    Column("STATE", spare=4),
+    Column("LAYER", spare=3),
     Column("POINTS", "right"),
     Column("MEMORY", "right"),
-    Column("HITS", "right"),
-    Column("USED", "right"),
-    Column("LOAD", "right"),
+    Column("HITS", "right", spare=5),
+    Column("USED", "right", spare=1),
+    Column("LOAD", "right", spare=7),
 )
 
 

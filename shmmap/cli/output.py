@@ -6,13 +6,16 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 __all__ = [
     "Column",
+    "columns_that_fit",
     "format_bytes",
     "format_duration",
     "print_json",
@@ -21,13 +24,19 @@ __all__ = [
     "wants_style",
 ]
 
+_NARROWEST: Final = 20  # columns that text needs to be worth breaking
+
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column of a table; numbers are aligned right."""
+    """One column of a table; numbers are aligned right.
+
+    A terminal too narrow for the table goes without the columns that are ``spare``, highest first.
+    """
 
     name: str
     align: Literal["left", "right"] = "left"
+    spare: int = 0
 
 
 def print_json(value: object) -> None:
@@ -63,19 +72,43 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     from rich.table import Table
     from rich.text import Text
 
+    console = Console(highlight=False)
+    shown = columns_that_fit(columns, rows, console.width)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-    for column in columns:
-        table.add_column(column.name, justify=column.align, overflow="fold")
+    for index in shown:
+        # only the first column, a name, may be folded: numbers in pieces tell nothing
+        column = columns[index]
+        table.add_column(column.name, justify=column.align, overflow="fold", no_wrap=index > 0)
     for row in rows:
-        table.add_row(*(Text(text) for text in row))
-    Console(highlight=False).print(table)
+        table.add_row(*(Text(row[index]) for index in shown))
+    console.print(table)
+    if missing := [column.name for index, column in enumerate(columns) if index not in shown]:
+        console.print(Text(f"no room for {', '.join(missing)}", style="bright_black"))
+
+
+def columns_that_fit(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int, *, gap: int = 3
+) -> list[int]:
+    """Return the indices of all columns, without the most spare ones as far as ``width`` demands it."""
+    widths = [max(map(len, texts)) for texts in zip([column.name for column in columns], *rows, strict=True)]
+    shown = list(range(len(columns)))
+    for level in sorted({column.spare for column in columns} - {0}, reverse=True):
+        if sum(widths[index] + gap for index in shown) - gap <= width:
+            break
+        shown = [index for index in shown if columns[index].spare != level]
+    return shown
 
 
 def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
-    """Print ``name  value`` lines with the values aligned."""
+    """Print ``name  value`` lines with the values aligned; on a terminal long ones go on below themselves."""
     width = max((len(name) for name, _ in pairs), default=0)
+    room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
     for name, value in pairs:
-        print(f"{name.ljust(width)}  {value}".rstrip())
+        lines = [value]
+        if len(value) > room >= _NARROWEST:
+            lines = textwrap.wrap(value, room, break_long_words=False, break_on_hyphens=False)
+        for number, line in enumerate(lines):
+            print(f"{'' if number else name:{width}}  {line}".rstrip())
 
 
 def format_bytes(count: float) -> str:

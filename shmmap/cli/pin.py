@@ -20,7 +20,7 @@ PINS_JSON = """\
    "unknown": [ids the map does not have]}
 Exit code: 0, or 1 when an id is unknown or this user may not do it."""
 
-_COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("BYTES", "right"))
+_COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("MEMORY", "right"))
 
 
 def add_parser(subparsers: Subparsers) -> None:

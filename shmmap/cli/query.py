@@ -35,13 +35,13 @@ Exit code: 0 when complete, 1 when anything asked for is pending, failed or unkn
 
 _COLUMNS = (
     Column("CELL"),
-    Column("X", "right"),
-    Column("Y", "right"),
-    Column("LAYER"),
+    Column("X", "right", spare=2),
+    Column("Y", "right", spare=2),
+    Column("LAYER", spare=3),
     Column("POINTS", "right"),
     Column("MEMORY", "right"),
-    Column("VERSION"),
-    Column("SEGMENT"),
+    Column("VERSION", spare=4),
+    Column("SEGMENT", spare=5),
 )
 
 

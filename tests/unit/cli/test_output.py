@@ -8,7 +8,15 @@ import json
 
 import pytest
 
-from shmmap.cli.output import Column, format_bytes, format_duration, print_json, print_pairs, print_table
+from shmmap.cli.output import (
+    Column,
+    columns_that_fit,
+    format_bytes,
+    format_duration,
+    print_json,
+    print_pairs,
+    print_table,
+)
 
 
 class Terminal(io.StringIO):
@@ -42,6 +50,40 @@ def test_table_on_a_terminal_is_styled_unless_told_otherwise(monkeypatch: pytest
             changed.setattr("sys.stdout", terminal := Terminal())
             print_table(COLUMNS, ROWS)
             assert "\x1b" not in terminal.getvalue()
+
+
+WIDE = (Column("CELL"), Column("X", "right", spare=1), Column("Y", "right", spare=1), Column("ID", spare=2))
+WIDE_ROWS = [["town_0_0.pcd", "100", "200", "0123456789abcdef"]]
+
+
+@pytest.mark.parametrize(
+    ("columns", "names"),
+    [(43, ["CELL", "X", "Y", "ID"]), (42, ["CELL", "X", "Y"]), (24, ["CELL", "X", "Y"]), (23, ["CELL"])],
+)
+def test_a_narrow_terminal_goes_without_spare_columns(columns: int, names: list[str]) -> None:
+    assert [WIDE[index].name for index in columns_that_fit(WIDE, WIDE_ROWS, columns)] == names
+
+
+def test_a_narrow_terminal_is_told_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("COLUMNS", "23")
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    print_table(WIDE, WIDE_ROWS)
+    assert "town_0_0.pcd" in terminal.getvalue()
+    assert "no room for X, Y, ID" in terminal.getvalue()
+    assert "100" not in terminal.getvalue()
+
+
+def test_long_pairs_go_on_below_themselves_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    print_pairs([("loads", "16 done, 0 queued, 0 failed"), ("map", "/a/path/longer/than/the/line")])
+    assert terminal.getvalue() == (
+        "loads  16 done, 0 queued, 0\n"
+        "       failed\n"
+        "map    /a/path/longer/than/the/line\n"
+    )  # fmt: skip
 
 
 def test_pairs(capsys: pytest.CaptureFixture[str]) -> None:
