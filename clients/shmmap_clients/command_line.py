@@ -9,9 +9,10 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from shmmap import InternalError, ShmmapError
+from shmmap.cli.parser import Parser
 
 if TYPE_CHECKING:
     from shmmap import Client
@@ -38,17 +39,6 @@ class Verb(Protocol):
 
     def add_parser(self, subparsers: Any) -> None:
         """Add the verb's parser, with ``run`` as a default."""
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser that complains as the rest of the program does: what is wrong, then a hint."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings, allow_abbrev=False)
-
-    def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message}\nhint: {self.prog} --help", file=sys.stderr)
-        sys.exit(2)
 
 
 def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
@@ -113,8 +103,8 @@ def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequenc
     argv
         Words after the program's name; those of this process by default.
     """
-    parser = _Parser(prog=name, description=description)
-    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_Parser)
+    parser = Parser(prog=name, description=description)
+    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
     for verb in verbs:
         verb.add_parser(subparsers)
     return _guarded(name, parser, argv)
@@ -142,7 +132,7 @@ def run_command(
     argv
         Words after the program's name; those of this process by default.
     """
-    parser = _Parser(prog=name, description=description, epilog=epilog)
+    parser = Parser(prog=name, description=description, epilog=epilog)
     add_options(parser)
     parser.set_defaults(run=run)
     return _guarded(name, parser, argv)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from threading import TIMEOUT_MAX
 from typing import TYPE_CHECKING, TypeAlias
 
 from shmmap.errors import BadRequest, ConfigError
@@ -46,12 +47,12 @@ def numbers(text: str, names: str) -> list[float]:
 
 
 def seconds(text: str) -> float:
-    """Read a duration in seconds, not negative and finite."""
+    """Read a duration in seconds, not negative and no longer than threads can wait."""
     try:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not (0.0 <= value < math.inf):
+    if not (0.0 <= value <= TIMEOUT_MAX):
         raise argparse.ArgumentTypeError(f"expected seconds, not {text!r}")
     return value
 
@@ -64,6 +65,15 @@ def size_bytes(text: str) -> int:
         return parse_bytes(text)
     except ConfigError as error:
         raise argparse.ArgumentTypeError(f"{error.message}; {error.hint}") from None
+
+
+class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Leaves texts of several lines as they are written, and fills the others."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if "\n" in text:
+            return super()._fill_text(text, width, indent)
+        return argparse.HelpFormatter._fill_text(self, text, width, indent)
 
 
 def add_verb(
@@ -84,7 +94,7 @@ def add_verb(
         help=help,
         description=description,
         epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_HelpFormatter,
     )
     parser.set_defaults(run=run)
     return parser

@@ -7,12 +7,12 @@ import argparse
 import importlib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, NoReturn
 
 from shmmap.cli.version import installed_version
 
-__all__ = ["VERBS", "build_parser", "join_negative_values", "verb_first"]
+__all__ = ["VERBS", "Parser", "build_parser", "join_negative_values", "verb_first"]
 
 VERBS: Final = {
     "demo": "demo",
@@ -50,12 +50,32 @@ _NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z", "--o
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
     """A parser that complains as the rest of the program does: what is wrong, then a hint."""
 
     def __init__(self, **settings: Any) -> None:
         # an abbreviation that works today would break with tomorrow's options
         super().__init__(**settings, allow_abbrev=False)
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse, and let each verb refuse what it does not know itself: so the hint names its help."""
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self._refuse(f"unrecognized arguments: {' '.join(unknown)}", unknown[0].split("=")[0])
+        return namespace, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            self._refuse(f"there is no {str(action.metavar).lower()} {value!r}", str(value), action.choices)
+        super()._check_value(action, value)
+
+    def _refuse(self, message: str, word: str, known: Iterable[str] | None = None) -> NoReturn:
+        import difflib  # 6 ms, for mistakes alone
+
+        near = difflib.get_close_matches(word, known or self._option_string_actions, n=1)
+        self.error(f"{message}; did you mean {near[0]}?" if near else message)
 
     def error(self, message: str) -> NoReturn:
         print(f"{self.prog}: {message}\nhint: {self.prog} --help", file=sys.stderr)
@@ -92,14 +112,14 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
 
     Given the words to parse, it knows only the verb they begin with, if there is such a verb.
     """
-    parser = _Parser(
+    parser = Parser(
         prog="shmmap",
         description="Serve a vehicle's point-cloud map to every process of the machine from one copy in "
         "shared memory.",
         epilog="Try `shmmap demo`: it needs no map.  `shmmap VERB --help` explains a verb and its JSON.",
     )
     parser.add_argument("--version", action="version", version=f"shmmap {installed_version()}")
-    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_Parser)
+    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
     wanted = words[:1] if words and words[0] in VERBS else tuple(VERBS)
     for verb in wanted:
         importlib.import_module(f"shmmap.cli.{VERBS[verb]}").add_parser(subparsers)

@@ -94,6 +94,44 @@ def test_wrong_usage_exits_2_and_hints_at_help(words: list[str], capsys: pytest.
     assert hint.endswith("--help")
 
 
+@pytest.mark.parametrize(
+    ("words", "complaint", "hint"),
+    [
+        (["statuss"], "shmmap: there is no verb 'statuss'; did you mean status?", "shmmap --help"),
+        (
+            ["config", "chekc"],
+            "shmmap config: there is no action 'chekc'; did you mean check?",
+            "shmmap config --help",
+        ),
+        (
+            ["status", "--jsno"],
+            "shmmap status: unrecognized arguments: --jsno; did you mean --json?",
+            "shmmap status --help",
+        ),
+        (["status", "extra"], "shmmap status: unrecognized arguments: extra", "shmmap status --help"),
+    ],
+)
+def test_what_is_misspelt_is_refused_by_its_verb_with_a_suggestion(
+    words: list[str], complaint: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"{complaint}\nhint: {hint}\n"
+
+
+def test_descriptions_are_filled_and_tables_in_them_are_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    for verb in ("top", "ls"):
+        with pytest.raises(SystemExit):
+            main([verb, "--help"])
+        text = capsys.readouterr().out
+        assert max(map(len, text.split("JSON (fields")[0].splitlines())) < 60
+        assert "\n  {" in text, "its JSON stands as it was written"
+
+
 def test_area_from_options() -> None:
     assert area_from(parse("query", "--circle", "1,2,3")) == Circle(1, 2, 3)
     assert area_from(parse("query", "--square", "1,2,3", "--z", "-4,5")) == AutowareSquare(
@@ -114,7 +152,7 @@ def test_impossible_areas_exit_2(words: list[str], capsys: pytest.CaptureFixture
 def test_numbers_and_seconds() -> None:
     assert numbers("-1,2e3", "A,B") == [-1.0, 2000.0]
     assert seconds("0.5") == 0.5
-    for text in ("-1", "inf", "nan", "x", ""):
+    for text in ("-1", "inf", "nan", "1e300", "x", ""):
         with pytest.raises(argparse.ArgumentTypeError):
             seconds(text)
 
