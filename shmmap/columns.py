@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["ColumnSpec"]
+__all__ = ["ColumnSpec", "column_names"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,3 +27,22 @@ class ColumnSpec:
     def row_bytes(self) -> int:
         """Bytes of one row."""
         return self.dtype.itemsize * self.components
+
+
+def column_names(names: Iterable[str]) -> tuple[str, ...]:
+    """Names for columns beside ``xyz``: each one printable word, none twice, none that PCD takes for another.
+
+    Other formats know no such rules.  White space and what cannot be printed become underscores, a name in use
+    gets a number.
+    """
+    taken = {"xyz", "x", "y", "z", "_"}  # a field called _ is padding
+    found: list[str] = []
+    for name in names:
+        word = "".join(char if char.isprintable() and not char.isspace() else "_" for char in name)
+        new, number = word or "_unnamed", 1
+        while new in taken:
+            number += 1
+            new = f"{word}_{number}"
+        taken.add(new)
+        found.append(new)
+    return tuple(found)

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.columns import ColumnSpec
+from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats.causes import refusal
 from shmmap.formats.source_file import open_regular
@@ -73,7 +73,7 @@ class LasReader:
         self.bounds = (np.array(header.mins, np.float64), np.array(header.maxs, np.float64))
         self._names = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
         empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
-        self._columns = tuple(_column_name(name) for name in self._names)
+        self._columns = column_names(self._names)
         self.columns: tuple[ColumnSpec, ...] = (
             ColumnSpec("xyz", np.dtype("<f8"), 3, "m"),
             *(
@@ -171,11 +171,6 @@ def _laspy(path: str) -> Any:
 
 def _spec(name: str, values: NDArray[Any]) -> ColumnSpec:
     return ColumnSpec(name, values.dtype, 1 if values.ndim == 1 else values.shape[1])
-
-
-def _column_name(name: str) -> str:
-    """Name of an extra dimension as one printable word; PCD has no others."""
-    return "".join(char if char.isprintable() and not char.isspace() else "_" for char in name) or "_unnamed"
 
 
 def _first_line(error: BaseException) -> str:

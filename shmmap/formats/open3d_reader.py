@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.columns import column_names
 from shmmap.errors import ShmmapError
 from shmmap.formats.causes import refusal
 from shmmap.formats.source_file import open_regular
@@ -32,7 +33,8 @@ _PLY_BYTES: Final = {
     **dict.fromkeys((b"int", b"uint", b"int32", b"uint32", b"float", b"float32"), 4),
     **dict.fromkeys((b"double", b"float64"), 8),
 }
-_NAMES: Final = {"positions": "xyz", "intensities": "intensity"}
+_POSITIONS: Final = "positions"
+_NAMES: Final = {"intensities": "intensity"}
 
 
 def read_with_open3d(path: str, suffix: str) -> tuple[dict[str, NDArray[Any]], tuple[str, ...]]:
@@ -79,9 +81,13 @@ def _load(path: str, suffix: str) -> dict[str, NDArray[Any]]:
     try:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             tensors = o3d.t.io.read_point_cloud(Path(path)).point
-            columns = {_NAMES.get(name, name): np.array(tensors[name].numpy()) for name in sorted(tensors)}
+            given = sorted(set(tensors) - {_POSITIONS})
+            names = column_names(_NAMES.get(name, name) for name in given)
+            columns = {name: np.array(tensors[one].numpy()) for name, one in zip(names, given, strict=True)}
             if suffix != ".ply":  # the tensor reader rounds text to float32
                 columns["xyz"] = np.array(o3d.io.read_point_cloud(Path(path)).points)
+            elif _POSITIONS in tensors:
+                columns["xyz"] = np.array(tensors[_POSITIONS].numpy())
     except RuntimeError as error:
         raise refusal(
             "bad_cloud", f"Open3D refuses it: {str(error).splitlines()[0][:200]}", path=path

@@ -64,6 +64,40 @@ def test_las_in_blocks_from_anywhere(tmp_path: Path) -> None:
             assert np.concatenate([*stamps, []]).tolist() == list(range(start, 1000))
 
 
+def test_names_of_dimensions_that_pcd_does_not_have(tmp_path: Path) -> None:
+    given = ["a b", "a_b", "xyz", "_", "_2", "caf\u00e9"]
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    for name in given:
+        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=np.uint16))
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(20.0)
+    for number, name in enumerate(given):
+        las[name] = np.arange(20) + 100 * number
+    las.write(str(tmp_path / "in.las"))
+    run(tmp_path / "in.las", tmp_path / "map", cell_size=100.0)
+    columns = read_cloud(next((tmp_path / "map" / "pointcloud_map.pcd").iterdir())).columns
+    assert list(columns)[-6:] == ["a_b", "a_b_2", "xyz_2", "__2", "_2", "caf\u00e9"]
+    for number, name in enumerate(list(columns)[-6:]):
+        assert columns[name].tolist() == list(range(100 * number, 100 * number + 20))
+
+
+def test_names_of_ply_properties(tmp_path: Path) -> None:
+    properties = ["x", "y", "z", "intensity", "xyz", "_"]
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 3",
+        *(f"property float {name}" for name in properties),
+    ]
+    rows = [" ".join(str(10 * row + k) for k in range(len(properties))) for row in range(3)]
+    (tmp_path / "in.ply").write_text("\n".join([*lines, "end_header", *rows, ""]))
+    columns = read_cloud(tmp_path / "in.ply").columns
+    assert columns["xyz"].tolist() == [[0, 1, 2], [10, 11, 12], [20, 21, 22]]
+    assert {name: values.tolist() for name, values in columns.items() if name != "xyz"} == {
+        "intensity": [3, 13, 23], "xyz_2": [4, 14, 24], "__2": [5, 15, 25],
+    }  # fmt: skip
+
+
 def test_a_las_cloud_in_memory(tmp_path: Path) -> None:
     columns = xyzircaedt(300)
     write_las(tmp_path / "in.las", columns)
