@@ -32,8 +32,7 @@ class ColumnSpec:
 def column_names(names: Iterable[str]) -> tuple[str, ...]:
     """Names for columns beside ``xyz``: each one printable word, none twice, none that PCD takes for another.
 
-    Other formats know no such rules.  White space and what cannot be printed become underscores, a name in use
-    gets a number.
+    White space and what cannot be printed become underscores, a name in use gets a number.
     """
     taken = {"xyz", "x", "y", "z", "_"}  # a field called _ is padding
     found: list[str] = []

@@ -21,6 +21,7 @@ from shmmap.dividing.inputs import (
     InputFile,
     check_output_directory,
     check_output_place,
+    check_unchanged,
     find_inputs,
 )
 from shmmap.dividing.lattice import CellLattice
@@ -140,6 +141,7 @@ class _Run:
             self._buckets = self._lattice
             stage = CellFiles(final, self._row, self._name)
         stream = self._read_into(stage)
+        check_unchanged(self._files)
         self._frame.check(stream.extremes)
         if not stream.kept:
             raise MapDataError(

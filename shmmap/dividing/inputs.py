@@ -10,10 +10,11 @@ from typing import NoReturn
 
 from shmmap.dividing.report import REPORT_NAME
 from shmmap.errors import BadRequest, MapMissing
+from shmmap.formats.causes import refusal
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.origin.metadata_text import METADATA_NAME
 
-__all__ = ["InputFile", "check_output_directory", "check_output_place", "find_inputs"]
+__all__ = ["InputFile", "check_output_directory", "check_output_place", "check_unchanged", "find_inputs"]
 
 _MAP_PARTS = frozenset({"pointcloud_map.pcd", METADATA_NAME, REPORT_NAME})
 
@@ -26,6 +27,15 @@ class InputFile:
     size: int
     mtime_ns: int
     ctime_ns: int
+
+    @classmethod
+    def of(cls, path: str) -> InputFile:
+        """The file as it is now."""
+        try:
+            status = os.stat(path)
+        except OSError as error:
+            _refuse(error)
+        return cls(path, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 
 def find_inputs(paths: Sequence[str]) -> list[InputFile]:
@@ -52,12 +62,21 @@ def find_inputs(paths: Sequence[str]) -> list[InputFile]:
         else:
             names = [path]
         for name in sorted(names):
-            try:
-                status = os.stat(name)
-            except OSError as error:
-                _refuse(error)
-            found.setdefault(name, InputFile(name, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+            found.setdefault(name, InputFile.of(name))
     return list(found.values())
+
+
+def check_unchanged(files: Sequence[InputFile]) -> None:
+    """Check, after reading, that the inputs are still what was found.
+
+    Raises
+    ------
+    MapDataError
+        One was written to meanwhile (cause ``changed``): what was read may be of two states.
+    """
+    for file in files:
+        if InputFile.of(file.path) != file:
+            raise refusal("changed", "the file changed while it was being read", path=file.path)
 
 
 def _refuse(error: OSError) -> NoReturn:

@@ -11,7 +11,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from shmmap.dividing.inputs import check_output_place, find_inputs
+from shmmap.dividing.inputs import InputFile, check_output_place, check_unchanged, find_inputs
 from shmmap.dividing.memory import memory_left
 from shmmap.dividing.progress import NoProgress, Progress
 from shmmap.dividing.report import read_report
@@ -98,6 +98,7 @@ def merge(
         raise BadRequest(f"{out} exists already", hint="--force replaces a file")
     with contextlib.ExitStack() as stack:
         sources: list[Source] = []
+        read: list[InputFile] = []
         moves: list[_Move] = []
         origins: dict[str, list[float]] = {}
         for path in [os.fspath(path) for path in inputs]:
@@ -107,6 +108,7 @@ def merge(
             if (x, y, z) != NO_MOVE:
                 origins[os.path.abspath(path)] = [x, y, z]
             check_output_place([path], files, out)
+            read += files
             for file in files:
                 source = open_source(
                     file.path, memory_bytes=memory_left(memory_bytes) // 2, scratch_dir=os.path.dirname(out)
@@ -132,6 +134,7 @@ def merge(
             target.write(header)
             for source, move in zip(sources, moves, strict=True):
                 _append(target, source, RowLayout(row, move), encoding, progress)
+            check_unchanged(read)
         progress.done(points)
     return MergedCloud(
         path=out,

@@ -9,6 +9,9 @@ from typing import Any
 
 import pytest
 
+from shmmap.dividing.divide import divide
+from shmmap.dividing.merge import merge
+from shmmap.dividing.progress import NoProgress
 from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
 from tests.support.clouds import cloud_file, divide_quickly, expected_rows, map_rows, rows_of, xyzircaedt
 
@@ -54,6 +57,29 @@ def test_bad_inputs_leave_nothing(
         divide_quickly([good, path], tmp_path / "map")
     assert getattr(caught.value, "cause", cause) == cause or not cause
     assert sorted(os.listdir(tmp_path)) == before
+
+
+class RewrittenMeanwhile(NoProgress):
+    """Replaces a file by one of as many points when a stage begins."""
+
+    def __init__(self, file: Path, stage: str) -> None:
+        self._file, self._stage = file, stage
+
+    def stage(self, name: str, total: int) -> None:
+        del total
+        if name == self._stage:
+            cloud_file(self._file, {key: column[::-1] for key, column in xyzircaedt(500).items()})
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_an_input_that_changes_while_it_is_read_is_refused(tmp_path: Path, number: int) -> None:
+    files = [cloud_file(tmp_path / f"{n}.pcd", xyzircaedt(500)) for n in range(2)]
+    there = sorted(os.listdir(tmp_path))
+    with pytest.raises(MapDataError, match=f"{number}.pcd: the file changed"):
+        divide(files, tmp_path / "map", progress=RewrittenMeanwhile(files[number], "dividing"))
+    with pytest.raises(MapDataError, match=f"{number}.pcd: the file changed"):
+        merge(files, tmp_path / "out.pcd", progress=RewrittenMeanwhile(files[number], "merging"))
+    assert sorted(os.listdir(tmp_path)) == there
 
 
 def test_a_directory_that_cannot_be_listed_is_not_left_out(
