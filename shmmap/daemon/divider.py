@@ -8,7 +8,6 @@ goes on where it stopped.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import signal
@@ -19,10 +18,10 @@ from typing import Any, Final
 from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import ShmmapError
+from shmmap.segment.parent import die_with
 
 __all__ = ["main"]
 
-_PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _NICENESS: Final = 10  # whoever is being served goes first
 _TELL_EVERY_S: Final = 1.0
 
@@ -60,9 +59,7 @@ def _say(line: dict[str, Any]) -> None:
 def main(arguments: list[str]) -> int:
     """Run with ``CLOUD OUT PARENT_PID``; returns the error's exit code."""
     cloud, out, parent = arguments[0], arguments[1], int(arguments[2])
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:
-        return 0  # the daemon was gone before the kernel knew that we care
+    die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     os.nice(_NICENESS)
     # clients ask in the cloud's own coordinates, so it keeps its frame

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A worker process that lives no longer than the process it works for."""
+"""A process that lives no longer than the one it works for."""
 
 from __future__ import annotations
 
