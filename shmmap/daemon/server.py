@@ -26,15 +26,16 @@ from shmmap.daemon.listen_gate import ListenGate
 from shmmap.daemon.map_events import tell_reload, tell_reload_failed
 from shmmap.daemon.pin_survey import Pinned, PinSurvey
 from shmmap.daemon.privileges import Privileges
+from shmmap.daemon.reception import Reception
 from shmmap.daemon.reloading import Reloader
 from shmmap.daemon.replies import Replies
 from shmmap.daemon.request_limits import bounded_intent
 from shmmap.daemon.residency import Resident
 from shmmap.daemon.sessions import Session, Sessions
 from shmmap.daemon.store import Store
-from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ProtocolMismatch, ShmmapError
+from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
 from shmmap.origin.catalogue import Catalogue, compare
-from shmmap.protocol import events, messages
+from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -49,7 +50,6 @@ FAREWELL_S: Final = 1.0
 connection ends (ZMQ_IMMEDIATE)."""
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 """A longer request that is refused unread is dropped: finding its number takes too long."""
-_SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 _PRIVILEGED: Final = (
     messages.Reload,
     messages.Evict,
@@ -103,6 +103,15 @@ class Server:
         self._answer_at_end = True
         self.cells = CellRequests(
             store, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
+        )
+        self._reception = Reception(
+            sessions,
+            self.cells,
+            statistics,
+            event_log,
+            watch=self.watch,
+            unwatch=self.unwatch,
+            on_left=self._left,
         )
         self._heartbeat = Heartbeat(
             store, statistics, event_log, sessions=sessions, waiting=self.cells, on_beat=on_beat
@@ -255,10 +264,11 @@ class Server:
 
     def _dispatch(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
         now_s = time.monotonic()
-        session = self._sessions.get(identity)
         if isinstance(message, messages.Hello):
-            self._hello(identity, frame, message, session, now_s)
+            entered = self._reception.enter(identity, frame, message, now_s)
+            self._send(entered, encode(self._admin.welcome(entered, message)))
             return
+        session = self._sessions.get(identity)
         if session is None:
             raise NoSession("this daemon does not know the session", hint="send hello first")
         session.requests += 1
@@ -276,7 +286,7 @@ class Server:
             self.cells.let_go(self._released(session, message))
             self._send(session, encode(messages.Released(message.request)))
         elif isinstance(message, messages.Bye):
-            self.end_session(session)
+            self._reception.leave(session)
         else:
             if isinstance(message, _PRIVILEGED):
                 self._privileges.require(peer_of(frame), now_s)
@@ -295,50 +305,12 @@ class Server:
         self._heartbeat.measure()
         self._send(session, encode(self._admin.stats(message, pinned, time.monotonic())))
 
-    def _hello(
-        self, identity: bytes, frame: zmq.Frame, message: messages.Hello, old: Session | None, now_s: float
-    ) -> None:
-        if message.major != messages.PROTOCOL_VERSION[0]:
-            raise ProtocolMismatch(
-                f"client speaks protocol {message.major}.{message.minor},"
-                f" daemon {messages.PROTOCOL_VERSION[0]}.{messages.PROTOCOL_VERSION[1]}",
-                hint="update the older of the two",
-            )
-        peer = peer_of(frame)
-        if old is not None and old.peer == peer:
-            session = old  # a repeated hello: its answer was late or lost
-        else:
-            if old is not None:
-                self.end_session(old)
-            spare = self._sessions.spare() if self._sessions.full else None
-            if spare is not None:
-                self.end_session(spare)
-            if self._sessions.full:
-                raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
-            session = self._sessions.open(identity, peer, message.client, now_s, slot=message.session)
-            session.fd = _descriptor(frame)
-            self._statistics.add("sessions_opened")
-            self._event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
-            if session.pidfd >= 0:
-                self.watch(session.pidfd, lambda: self.end_session(session))
-        self._send(session, encode(self._admin.welcome(session, message)))
-
     def _released(self, session: Session, message: messages.Release) -> list[Resident]:
         if message.packed is None:
             return session.drop(list(session.held))
         return session.drop(unpack_versions(message.packed))
 
-    def end_session(self, session: Session) -> None:
-        """A client's process ended, or it said goodbye: what it held may be free now."""
-        held = session.residents()
-        self._event_log.publish(
-            events.Left, session.slot, session.peer.pid, session.client, session.held_bytes
-        )
-        self.cells.forget(session)
-        if session.pidfd >= 0:
-            self.unwatch(session.pidfd)
-        self._sessions.close(session)
-        self.cells.let_go(held)
+    def _left(self, session: Session) -> None:
         if session is self._asked_to_stop:
             self.stop()
 
@@ -390,11 +362,3 @@ class Server:
 
     def _refuse(self, identity: bytes, request: int, error: ShmmapError) -> None:
         self._replies.refuse(identity, request, error)
-
-
-def _descriptor(frame: zmq.Frame) -> int:
-    """Descriptor of the connection that a message came on; -1 where libzmq does not tell."""
-    try:
-        return int(frame.get(_SOURCE))
-    except zmq.ZMQError:
-        return -1
