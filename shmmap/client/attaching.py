@@ -94,9 +94,19 @@ class Attacher:
         self._mapped: dict[int, int] = {}
 
     def attach(
-        self, handle: Handle, cell_id: str, segment: str, *, shm_dir: str, slot: int, populate: bool
+        self,
+        handle: Handle,
+        cell_id: str,
+        segment: str,
+        *,
+        shm_dir: str,
+        slot: int,
+        owner: int | None = None,
+        populate: bool = False,
     ) -> Cell:
         """Return the cell of a handle; one that is attached already is shared.
+
+        Parameters are those of `shmmap.segment.attach.attach`.
 
         Raises
         ------
@@ -114,6 +124,7 @@ class Attacher:
             nbytes=handle.bytes,
             shm_dir=shm_dir,
             slot=slot,
+            owner=owner,
             populate=populate,
             on_unmap=partial(self.unmapper, handle.version),
         )

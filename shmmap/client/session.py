@@ -19,7 +19,7 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
-from shmmap.client.visible import check_visible
+from shmmap.client.visible import check_visible, owner_of_segments
 from shmmap.errors import BadRequest, NoAnswer
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
@@ -70,6 +70,8 @@ class Session:
         self._shm_dir = shm_dir
         self._lock = threading.Lock()
         self._closed = False
+        self._owner_epoch = 0
+        self._owner: int | None = None
         self._inherited: list[Connection] = []
         self._connection: Connection | None = None
         self.path = ""
@@ -187,12 +189,16 @@ class Session:
 
     def _attach(self, handle: Handle, connection: Connection, populate: bool) -> Cell:
         welcome = connection.welcome
+        if welcome.epoch != self._owner_epoch:
+            self._owner_epoch = welcome.epoch
+            self._owner = owner_of_segments(self._shm_dir or welcome.shm_dir, welcome.segment_prefix)
         return self.attacher.attach(
             handle,
             handle.id if handle.id.startswith("/") else welcome.id_prefix + handle.id,
             welcome.segment_prefix + handle.segment,
             shm_dir=self._shm_dir or welcome.shm_dir,
             slot=welcome.session,
+            owner=self._owner,
             populate=populate,
         )
 

@@ -27,7 +27,7 @@ from shmmap.layers.spec import layer_spec
 from shmmap.segment.crash_steps import step
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import PublishBlock, SegmentHeader
-from shmmap.segment.names import is_zombie, segment_prefix, statistics_name, zombie_name
+from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
 from shmmap.segment.verify import read_header
 
 __all__ = ["Leftovers", "TakenOver"]
@@ -175,7 +175,13 @@ class Leftovers:
             self._remove(name, found.why_not)
             return False
         if not is_zombie(name):
-            self._directory.rename(name, zombie_name(name))
+            hidden = zombie_name(name)
+            try:
+                self._directory.rename(name, hidden)
+            except OSError:  # somebody else has taken that name
+                hidden = zombie_name(another_name(name))
+                self._directory.rename(name, hidden)
+            name = hidden
         self._reclaimer.adopt(self._resident(fd, name, found, now_s), now_s)
         return True
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
@@ -22,10 +23,12 @@ from shmmap.daemon.residency import Key, Residency, Resident, Zombie
 from shmmap.daemon.sessions import Sessions
 from shmmap.protocol.messages import Holder
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.names import zombie_name
+from shmmap.segment.names import another_name, zombie_name
 from shmmap.segment.pins import LOADER_SLOT, holders
 
 __all__ = ["UNKNOWN_SLOT", "Outcome", "Reclaimer"]
+
+_log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
@@ -59,6 +62,10 @@ def _nothing(resident: Resident) -> None:
     del resident
 
 
+def _nothing_of_names(name: str) -> None:
+    del name
+
+
 def _nothing_more(resident: Resident, why: str) -> None:
     del resident, why
 
@@ -78,6 +85,8 @@ class Reclaimer:
     on_retired, on_freed
         Called with a segment that left service and why (``room``, ``request``, ``map``,
         ``superseded``), and with one whose memory went back.
+    on_renamed
+        Called with a name that a segment does not have any more; it has another.
     wake_s
         When `free` is worth calling again although nothing changed (hand-out grace ends).
     """
@@ -99,6 +108,7 @@ class Reclaimer:
         self._by_key: dict[Key, Zombie] = {}
         self.on_retired: Callable[[Resident, str], None] = _nothing_more
         self.on_freed: Callable[[Resident], None] = _nothing
+        self.on_renamed: Callable[[str], None] = _nothing_of_names
         self.evicted_count = 0
         self.wake_s = float("inf")
 
@@ -115,7 +125,7 @@ class Reclaimer:
 
     def retire(self, resident: Resident, now_s: float, why: str = "request") -> bool:
         """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
-        found = self._directory.rename(resident.name, zombie_name(resident.name))
+        found = self._hide(resident)
         zombie = self._books.retire(resident)
         self.on_retired(resident, why)
         if not found:
@@ -125,13 +135,28 @@ class Reclaimer:
 
     def superseded(self, old: Resident, now_s: float) -> None:
         """The books moved an old version to the zombies; do the same with its name."""
-        found = self._directory.rename(old.name, zombie_name(old.name))
+        found = self._hide(old)
         zombie = self._books.zombies[old.name]
         self.on_retired(old, "superseded")
         if found:
             self._watch(zombie, now_s)
         else:
             self._forget(zombie)
+
+    def _hide(self, resident: Resident) -> bool:
+        """Give a segment the name of a retired one; False if it is gone.
+
+        Where everybody may make files somebody may have taken that name: then it is a name nobody knows.
+        """
+        try:
+            return self._directory.rename(resident.name, zombie_name(resident.name))
+        except OSError as error:
+            old, new = resident.name, another_name(resident.name)
+            _log.warning("%s is not to be had (%s)", zombie_name(old), error.strerror)
+            found = self._directory.rename(old, zombie_name(new))
+            self._books.rename(resident, new)
+            self.on_renamed(old)
+            return found
 
     def _watch(self, zombie: Zombie, now_s: float) -> bool:
         if zombie.resident.checked:
@@ -152,7 +177,13 @@ class Reclaimer:
         zombie = self._by_key.get(key)
         if zombie is None or zombie.resident.version != version:
             return None
-        if not self._directory.rename(zombie_name(zombie.resident.name), zombie.resident.name):
+        try:
+            found = self._directory.rename(zombie_name(zombie.resident.name), zombie.resident.name)
+        except OSError as error:  # somebody else has taken its name: the cell is loaded anew
+            _log.warning("%s is not to be had (%s)", zombie.resident.name, error.strerror)
+            self.never_revive(key)
+            return None
+        if not found:
             self._forget(zombie)
             return None
         self.pins.release(zombie_name(zombie.resident.name))

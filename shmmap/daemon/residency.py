@@ -330,6 +330,14 @@ class Residency:
         zombie = self.zombies[resident.name] = Zombie(resident)
         return zombie
 
+    def rename(self, resident: Resident, name: str) -> None:
+        """A segment has another name from now on."""
+        if resident.name in self._by_name:
+            self._by_name[name] = self._by_name.pop(resident.name)
+        else:
+            self.zombies[name] = self.zombies.pop(resident.name)
+        resident.name = name
+
     def retire(self, resident: Resident) -> Zombie:
         """Nobody gets this segment any more; its bytes count until `freed`."""
         slot = self.slots[resident.key]

@@ -117,6 +117,7 @@ class Store:
         self.history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=64)
         reclaimer.on_retired = self._leave
         reclaimer.on_freed = lambda resident: statistics.cell_removed(resident.name)
+        reclaimer.on_renamed = statistics.cell_removed
 
     # --- names --------------------------------------------------------------------------------
 

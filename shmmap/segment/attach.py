@@ -153,7 +153,9 @@ def _open(name: str, shm_dir: str) -> int:
     if shm_dir == DEFAULT_SHM_DIR:
         # no size=: passing one would resize the segment under everybody's feet
         return int(posix_ipc.SharedMemory(name, read_only=True).fd)
-    return os.open(f"{shm_dir}/{name.lstrip('/')}", os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    # as shm_open does it; a pipe of that name would keep the opener waiting
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    return os.open(f"{shm_dir}/{name.lstrip('/')}", flags)
 
 
 def attach(
@@ -163,6 +165,7 @@ def attach(
     nbytes: int = 0,
     shm_dir: str = DEFAULT_SHM_DIR,
     slot: int | None = None,
+    owner: int | None = None,
     populate: bool = False,
     on_unmap: Unmap = unmap,
 ) -> AttachedSegment:
@@ -178,6 +181,9 @@ def attach(
         Directory of the segments, as the daemon's ``hello`` names it.
     slot
         The session's slot: tells the daemon who uses the segment.
+    owner
+        User that the segment must belong to: where everybody may make files, a name that the daemon
+        gave up may be anybody's by now.
     populate
         Let the kernel map every page now (``MAP_POPULATE``) instead of at first touch.
     on_unmap
@@ -187,7 +193,7 @@ def attach(
     Raises
     ------
     StaleHandle
-        The segment is gone.
+        The segment is gone, or what has its name is somebody else's.
     SegmentCorrupt
         Its bytes are not a segment of a layout this program reads.
     SegmentError
@@ -206,10 +212,16 @@ def attach(
         raise SegmentError(f"segment {name}: {error.strerror}") from error
     try:
         step("client.open")
+        status = os.fstat(fd)
+        if owner is not None and status.st_uid != owner:
+            raise StaleHandle(
+                f"segment {name} is gone: its name is that of a file of user {status.st_uid} now",
+                hint="ask the daemon again",
+            )
         if slot is not None:
             lock_slot(fd, slot)
         step("client.lock")
-        available = os.fstat(fd).st_size
+        available = status.st_size
         end = offset + nbytes if nbytes else available
         if end > available or end == 0:
             raise SegmentCorrupt(f"segment {name} has {available} bytes, the handle needs {end}")

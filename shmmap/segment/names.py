@@ -16,6 +16,7 @@ from typing import Final
 from shmmap.errors import ConfigError
 
 __all__ = [
+    "another_name",
     "check_instance",
     "is_zombie",
     "new_segment_name",
@@ -52,6 +53,11 @@ def statistics_name(instance: str) -> str:
 def new_segment_name(instance: str) -> str:
     """Return a name that was never used before."""
     return f"/shmmap.{instance}.{os.urandom(8).hex()}"
+
+
+def another_name(name: str) -> str:
+    """Return a name of the same instance as ``name`` that was never used before."""
+    return f"{name.rpartition('.')[0]}.{os.urandom(8).hex()}"
 
 
 def zombie_name(name: str) -> str:

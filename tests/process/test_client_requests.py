@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import subprocess
 import sys
@@ -231,6 +232,42 @@ def test_a_handle_that_went_stale_is_asked_for_again(
         assert answer.complete
         for cell in answer:
             assert_bits(cell, divided_map)
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("kind", ["file", "pipe", "directory"])
+def test_a_name_that_somebody_else_took_meanwhile(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """In /dev/shm everybody may make files: only what belongs to the daemon's user is its segment."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
+        other.selected(["0_0.pcd", "20_20.pcd"])
+        taken: list[Path] = []
+
+        def attach_late(name: str, **options: Any) -> Any:
+            if not taken:
+                place = Path(f"{one.shm_dir}{name}")
+                forged = place.read_bytes()
+                other.evict()
+                taken.append(place)
+                if kind == "pipe":
+                    os.mkfifo(place)
+                elif kind == "directory":
+                    place.mkdir()
+                else:
+                    place.write_bytes(forged[:4096] + bytes(len(forged) - 4096))
+                place.chmod(0o755)
+                os.chown(place, 12345, 12345)
+            return attach(name, **options)
+
+        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+        answer = client.selected(["0_0.pcd", "20_20.pcd"])
+        assert taken
+        assert answer.complete
+        for cell in answer:
+            assert_bits(cell, divided_map)
+        taken[0].rmdir() if kind == "directory" else taken[0].unlink()
 
 
 def test_handles_that_stay_stale_end_as_pending(

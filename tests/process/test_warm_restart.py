@@ -301,3 +301,26 @@ def test_who_holds_what_is_known_across_a_restart(daemon: DaemonFactory, divided
         assert stats.unknown_holders == 0
         with pytest.raises(shmmap.UnknownCell):
             client.show("nowhere.pcd")
+
+
+def test_a_name_that_somebody_else_took(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """What has to retire does so under another name; its reader and the next life are not disturbed."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    (handle,) = client.selected(["0_0.pcd"]).cells
+    place = Path(f"{one.shm_dir}{handle.segment}.zombie")
+    place.mkdir()  # as a stranger's file in a sticky directory, it cannot be replaced
+    with MappingProcess([f"{one.shm_dir}{handle.segment}"]) as reader:
+        (checksum,) = reader.checksums()
+        one.kill()
+        corner = divided_map.corners["0_0.pcd"]
+        divided_map.write_cell("0_0.pcd", corner, random_points(np.random.default_rng(9), corner, 50))
+        one.start()
+        client.hello()
+        again = client.selected(["0_0.pcd"])
+        assert_right(client, again, divided_map)
+        assert client.ask("stats")[4]["zombies"] == 1
+        assert reader.checksums() == [checksum]
+    place.rmdir()
