@@ -16,7 +16,7 @@ from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
     from shmmap.testing.demo import DemoResult, DriveResult
-    from shmmap.testing.demo_town import DemoSettings, Progress
+    from shmmap.testing.full_demo import FullDemoResult
 
 __all__ = ["add_parser", "run"]
 
@@ -63,7 +63,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--full",
         action="store_true",
         help="drive with the real programs instead: localization, compare filter and elevation map"
-        " beside one another, on simulated scans among moving cars (some minutes)",
+        " beside one another, on simulated scans among moving cars (a minute or two)",
     )
     add_json_option(parser)
 
@@ -85,39 +85,37 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.demo_progress import progress_for
     from shmmap.testing.demo import run_demo
     from shmmap.testing.demo_town import DemoSettings
+    from shmmap.testing.full_demo import FullDemoResult, run_full_demo
     from shmmap.testing.interrupts import signals_interrupt
 
     picture = _picture_path(args.svg)
     started_s = time.monotonic()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
         settings = DemoSettings() if args.density is None else DemoSettings(density=args.density)
-        if args.full:
-            return _run_full(settings, progress, picture, as_json=args.json)
-        result = run_demo(settings, progress, map_dir=args.keep_map)
-    picture.write_text(_draw(result), encoding="utf-8")
+        result: DemoResult | FullDemoResult
+        result = (run_full_demo if args.full else run_demo)(settings, progress, map_dir=args.keep_map)
     duration_s = time.monotonic() - started_s
+    if isinstance(result, FullDemoResult):
+        return _report_full(result, picture, duration_s, args)
+    picture.write_text(_draw(result), encoding="utf-8")
     if args.json:
         print_json(_as_json(result, str(picture), duration_s))
     else:
         _print_text(result)
         print(f"{format_duration(duration_s)} in all.  Picture of town, route and resident cells: {picture}")
-        if args.keep_map:
-            print(f"Serve the town yourself: shmmap serve {args.keep_map}")
+        _tell_kept_map(args)
     return 0
 
 
-def _run_full(settings: DemoSettings, progress: Progress, picture: Path, *, as_json: bool) -> int:
-    """Drive with the three programs; exit code 1 where a scan was lost or could not be trusted."""
-    from shmmap.testing.full_demo import run_full_demo
+def _report_full(result: FullDemoResult, picture: Path, duration_s: float, args: argparse.Namespace) -> int:
+    """Print what the three programs did; exit code 1 where a scan was lost or could not be trusted."""
     from shmmap.testing.three_programs import table
 
-    result = run_full_demo(settings, progress)
     picture.write_text(result.picture_svg, encoding="utf-8")
     runs = result.programs.programs
     documents = {name: run.document for name, run in runs.items()}
     scans = result.programs.scans
-    good = documents["ndt"]["trustworthy"] == documents["compare"]["scans"] == scans
-    if as_json:
+    if args.json:
         memory = {
             name: {
                 "own_bytes": max(run.own_bytes, default=0),
@@ -140,8 +138,17 @@ def _run_full(settings: DemoSettings, progress: Progress, picture: Path, *, as_j
     else:
         print()
         print("\n".join(table(result.programs)))
-        print(f"Picture of what the compare filter kept (red) and removed: {picture}")
+        print(
+            f"{format_duration(duration_s)} in all.  Kept by the compare filter (red) and removed: {picture}"
+        )
+        _tell_kept_map(args)
+    good = documents["ndt"]["trustworthy"] == documents["compare"]["scans"] == scans
     return 0 if good and not documents["compare"]["incomplete_scans"] else 1
+
+
+def _tell_kept_map(args: argparse.Namespace) -> None:
+    if args.keep_map:
+        print(f"Serve the town yourself: shmmap serve {args.keep_map}")
 
 
 def _picture_path(named: str | None) -> Path:

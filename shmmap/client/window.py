@@ -200,6 +200,7 @@ class MapWindow:
         if self._closed:
             raise BadRequest("this window is closed")
         follower = self._follower
+        state = None
         if follower is None:
             self._refresh(pose, _BLOCKING_WAIT_S if wait is None else wait)
         else:
@@ -209,8 +210,8 @@ class MapWindow:
                 )
             follower.follow(pose)
             if wait:
-                follower.wait_until_current(wait)
-        state = self._current
+                state = follower.wait_until_current(wait)
+        state = state or self._current
         update = update_between(self._seen, state)
         self._seen = state.versions
         return update
@@ -227,7 +228,7 @@ class MapWindow:
             False if it was not so within ``timeout`` seconds.  In the blocking mode, whether it is so.
         """
         if self._follower is not None:
-            return self._follower.wait_until_current(timeout)
+            return self._follower.wait_until_current(timeout) is not None
         return self._state.settled
 
     def _refresh(self, pose: Intent, wait_s: float) -> None:

@@ -87,10 +87,14 @@ class WindowFollower:
             self._called = True  # once is enough, however often poses come
             self._mailbox.put(None)
 
-    def wait_until_current(self, timeout_s: float) -> bool:
-        """Wait until the state answers the latest pose and nothing is missing; False at the deadline."""
+    def wait_until_current(self, timeout_s: float) -> WindowState | None:
+        """Wait until the state answers the latest pose and nothing is missing; None at the deadline.
+
+        The state is that one, even if a later one has replaced it meanwhile.
+        """
         with self._changed:
-            return self._changed.wait_for(self._is_current, min(timeout_s, threading.TIMEOUT_MAX))
+            current = self._changed.wait_for(self._is_current, min(timeout_s, threading.TIMEOUT_MAX))
+            return self.state if current else None
 
     def _is_current(self) -> bool:
         pose = self._pose

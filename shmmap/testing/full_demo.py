@@ -92,30 +92,46 @@ def _tiles(town: Town, x: float, y: float) -> list[tuple[int, int]]:
 
 
 def run_full_demo(
-    settings: DemoSettings, progress: Progress, *, length: float = _LENGTH_METRES
+    settings: DemoSettings,
+    progress: Progress,
+    *,
+    map_dir: str | None = None,
+    length: float = _LENGTH_METRES,
 ) -> FullDemoResult:
     """Build a town, drive through it with the three programs, measure, clean up.
+
+    Parameters
+    ----------
+    map_dir
+        Where the map is built and stays; by default in a temporary directory that is removed.
+    length
+        Of the drive, metres.
 
     Raises
     ------
     ConfigError
         There is not enough shared memory.
+    BadRequest
+        ``map_dir`` exists and is not empty.
     InternalError
         A program failed.
     """
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
+        map_dir = map_dir or str(scratch / "map")
+        parent = Path(map_dir).absolute().parent
+        parent.mkdir(parents=True, exist_ok=True)
         settings, budget_bytes = fit(
             replace(settings, blocks=_BLOCKS),
             shm_bytes=free_bytes(DEFAULT_SHM_DIR),
-            disk_bytes=free_bytes(str(scratch)),
+            disk_bytes=free_bytes(str(parent)),
         )
-        town_map = build_town(settings, str(scratch / "map"), progress)
+        town_map = build_town(settings, map_dir, progress)
         town = Town(seed=settings.seed, blocks=settings.blocks, density=settings.density)
         # sockets under /tmp whatever TMPDIR says: a socket's path holds 107 bytes
         work = Path(stack.enter_context(scratch_directory("shmmap-demo-", "/tmp")))  # noqa: S108
         options = ["--budget", str(budget_bytes), "--workers", "2", "--cache-dir", str(scratch / "cache")]
-        daemon = stack.enter_context(DaemonProcess(scratch / "map", options=options))
+        daemon = stack.enter_context(DaemonProcess(map_dir, options=options))
         route = town.route(length=length, step=_STEP_METRES)
         progress.stage("Driving: localization, compare filter and elevation map on one copy", len(route))
         tell: Callable[[ThreePrograms], None] = lambda _: progress.step()  # noqa: E731

@@ -70,7 +70,8 @@ class Lidar:
         self, cloud: NDArray[Any], T_map_sensor: NDArray[np.float64], rng: np.random.Generator
     ) -> LidarReturns:
         """Look at a cloud, (N, 3), metres, map frame."""
-        local = (cloud.astype(np.float64) - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]
+        R = np.ascontiguousarray(T_map_sensor[:3, :3])  # else numpy multiplies a hundred times more slowly
+        local = (cloud.astype(np.float64) - T_map_sensor[:3, 3]) @ R
         distance = np.sqrt(np.einsum("ij,ij->i", local, local))
         near = np.flatnonzero((distance > self.nearest) & (distance < self.farthest))
         local, distance = local[near], distance[near]
@@ -82,9 +83,10 @@ class Lidar:
         columns = math.ceil(360.0 / self.azimuth_deg)
         ray = ring * columns + np.minimum((azimuth / self.azimuth_deg).astype(np.int64), columns - 1)
         ray = np.where(seen, ray, self.rings * columns)
-        order = np.lexsort((distance, ray))
-        _, first = np.unique(ray[order], return_index=True)
-        hit = order[first]
+        nearest = np.full(self.rings * columns + 1, np.inf)
+        np.minimum.at(nearest, ray, distance)
+        hit = np.flatnonzero(distance == nearest[ray])
+        hit = hit[np.unique(ray[hit], return_index=True)[1]]  # of equally near ones the first
         hit = hit[seen[hit] & (rng.random(len(hit)) >= self.dropout)]
         scale = 1.0 + self.noise * rng.standard_normal(len(hit)) / distance[hit]
         xyz = (local[hit] * scale[:, None]).astype(np.float32)

@@ -350,8 +350,14 @@ def table(result: ThreePrograms) -> list[str]:
         )
         memory = f"{own:10.0f} MiB{growth:8.1f} MiB{shared:10.0f} MiB"
         lines.append(f"{name:11}{scans or '-':>8}{p50:>11}{p99:>11}{memory}")
-    elevation = result.programs["elevation"]
+    ndt, compare, elevation = (result.programs[name].document for name in ("ndt", "compare", "elevation"))
     lines.append(
-        f"elevation: {elevation.runs} times the whole map of {elevation.document.get('cells', 0)} cells"
+        f"elevation: {result.programs['elevation'].runs} times the whole map of {elevation['cells']} cells"
     )
+    lines.append(
+        f"localized {ndt['frames']} of {result.scans} scans ({ndt['trustworthy']} to be trusted), compared"
+        f" {compare['scans']} ({compare['incomplete_scans']} with cells missing)"
+    )
+    if compare["first_missing"]:
+        lines.append(f"missing: {compare['first_missing']}")
     return lines

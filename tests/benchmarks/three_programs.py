@@ -127,13 +127,10 @@ def main() -> None:
 
 
 def verdict(result: ThreePrograms, budget_bytes: int, segments: int, unknown: int) -> str:
-    """What was lost, in a line."""
-    ndt, compare = result.programs["ndt"].document, result.programs["compare"].document
+    """What was left, in a line."""
     return (
-        f"localized {ndt['frames']} of {result.scans} ({ndt['trustworthy']} to be trusted), compared"
-        f" {compare['scans']} ({compare['incomplete_scans']} with cells missing); budget exceeded:"
-        f" {max(result.segment_bytes) > budget_bytes}; segments that cannot be evicted: {segments},"
-        f" unknown holders: {unknown}"
+        f"budget exceeded: {max(result.segment_bytes) > budget_bytes}; segments that cannot be evicted:"
+        f" {segments}, unknown holders: {unknown}"
     )
 
 

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from shmmap import BadRequest, MapWindow
+from shmmap import BadRequest, MapWindow, ShmmapError, WindowUpdate
 from shmmap_clients.compare_map_filter.filter import CompareMapFilter, Comparison
 from shmmap_clients.scans.scan_sequence import Scan
 
@@ -21,13 +22,13 @@ class ComparedScan:
     ----------
     scan, comparison
         The scan, sensor frame, and which of its points are kept.
-    complete
-        Whether every cell of the window was there when it was compared.
+    missing
+        What of the window was not there when it was compared, in words; empty where it was complete.
     """
 
     scan: Scan
     comparison: Comparison
-    complete: bool
+    missing: str = ""
 
 
 def compare_drive(
@@ -69,6 +70,14 @@ def compare_drive(
             raise error
         patience = wait_s
         comparison = compare.use_cells(cells).apply(scan.xyz, T)
-        complete = update.complete and error is None
+        missing = _missing(update, error)
         del update, cells  # what leaves the window is not held until the next scan has come
-        yield ComparedScan(scan, comparison, complete)
+        yield ComparedScan(scan, comparison, missing)
+
+
+def _missing(update: WindowUpdate, error: ShmmapError | None) -> str:
+    reasons = Counter(failure.code for failure in update.failed)
+    if update.pending:
+        reasons["still loading"] = len(update.pending)
+    words = [f"{count} cells {reason}" for reason, count in reasons.items()]
+    return ", ".join(words if error is None else [*words, str(error)])

@@ -20,6 +20,7 @@ class DriveStatistics:
         self.points = 0
         self.kept = 0
         self.incomplete = 0
+        self._missing = ""
         self._compare_ms: list[float] = []
         self._update_ms: list[float] = []
 
@@ -29,7 +30,9 @@ class DriveStatistics:
         self.scans += 1
         self.points += len(comparison.kept)
         self.kept += int(np.count_nonzero(comparison.kept))
-        self.incomplete += not compared.complete
+        if compared.missing:
+            self.incomplete += 1
+            self._missing = self._missing or f"{compared.scan.name}: {compared.missing}"
         self._compare_ms.append(comparison.compare_s * 1e3)
         if comparison.update_s:
             self._update_ms.append(comparison.update_s * 1e3)
@@ -41,7 +44,7 @@ class DriveStatistics:
         return (
             f"{compared.scan.name}: {points} points, {kept} kept ({100 * kept / max(points, 1):.1f} %),"
             f" {comparison.cells} cells, {comparison.compare_s * 1e3:.1f} ms"
-            + ("" if compared.complete else ", cells missing")
+            + (f", missing: {compared.missing}" if compared.missing else "")
         )
 
     def summary(self) -> dict[str, Any]:
@@ -51,6 +54,7 @@ class DriveStatistics:
             "points": self.points,
             "kept": self.kept,
             "incomplete_scans": self.incomplete,
+            "first_missing": self._missing or None,
             "compare_ms": _spread(self._compare_ms),
             "update_ms": _spread(self._update_ms),
             "updates": len(self._update_ms),

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     comparison = CompareMapFilter(rule, backend=args.backend).use_tables([table]).apply(scan.xyz, T)
     kept = int(comparison.kept.sum())
     if args.out:
-        PcdDirectory(Path(args.out), mask=args.mask).write(ComparedScan(scan, comparison, True))
+        PcdDirectory(Path(args.out), mask=args.mask).write(ComparedScan(scan, comparison))
     if args.picture:
         view = TopView()
         view.add(to_map(scan.xyz, T), comparison.kept, (float(T[0, 3]), float(T[1, 3])))

@@ -13,8 +13,9 @@ from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options,
 __all__ = ["add_parser", "run"]
 
 _JSON = (
-    "JSON: scans, points, kept, incomplete_scans (compared while cells of the window were missing), updates"
-    " (how often the window's cells changed), compare_ms and update_ms (p50, p99, max; null without any)."
+    "JSON: scans, points, kept, incomplete_scans (compared while cells of the window were missing),"
+    " first_missing (the first of them, and what it lacked), updates (how often the window's cells changed),"
+    " compare_ms and update_ms (p50, p99, max; null without any)."
     "  Exit code: 0, or 1 where a scan was compared with cells missing."
 )
 
