@@ -137,6 +137,26 @@ def test_an_interrupted_build_goes_on_and_a_finished_one_is_kept(
             build_elevation_map(client, rule, tmp_path / "third", wait_s=LONG_S, progress=rewrite)
 
 
+def test_two_runs_do_not_write_over_each_other(
+    daemon: Factory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    one = daemon(divided_map.root)
+    rule, cache = ElevationRule("surface", 1.3, tolerance=4.0), tmp_path / "cache"
+    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
+
+        def another_run(progress: BuildProgress) -> None:
+            if progress.done == 5:
+                with pytest.raises(shmmap.InstanceBusy):
+                    build_elevation_map(other, rule, cache, wait_s=LONG_S)
+                build_elevation_map(other, rule, tmp_path / "other", wait_s=LONG_S)
+
+        built = build_elevation_map(client, rule, cache, wait_s=LONG_S, progress=another_run)
+        kept = build_elevation_map(other, rule, cache, wait_s=LONG_S)
+        alone = build_elevation_map(other, rule, tmp_path / "other", wait_s=LONG_S)
+    assert (built.loaded, kept.loaded, alone.loaded) == (36, 0, 0)
+    assert kept.grid.path.read_bytes() == alone.grid.path.read_bytes()
+
+
 def test_heights_follow_a_window(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     rng = np.random.default_rng(8)

@@ -3,17 +3,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from shmmap import Cell, CellError, CellInfo, Client, LoadTimeout, MapMissing, ShmmapError
+from shmmap import (
+    Cell,
+    CellError,
+    CellInfo,
+    Client,
+    InstanceBusy,
+    LoadTimeout,
+    MapListing,
+    MapMissing,
+    ShmmapError,
+)
 from shmmap_clients.elevation_map.cell_columns import columns_of, heights_of
 from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
 from shmmap_clients.elevation_map.grid import ElevationGrid
@@ -109,15 +121,42 @@ def build_elevation_map(
         It changed meanwhile.
     LoadTimeout
         A cell was not there in time.
+    InstanceBusy
+        Another run is making the same elevation in this cache.
     """
     listing = client.metadata()
     if not len(listing):
         raise MapMissing("the map has no cells")
+    with _alone(cache, map_key(listing.map_version, rule)) as directory:
+        return _build(client, listing, rule, directory, wait_s, progress)
+
+
+@contextlib.contextmanager
+def _alone(cache: Path, key: str) -> Iterator[Path]:
+    """Hold a directory of the cache: two runs at a time would write over each other's heights."""
+    cache.mkdir(parents=True, exist_ok=True)
+    with open(cache / f"{key}.lock", "wb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InstanceBusy(
+                f"another run is making this elevation in {cache}", hint="wait for it, or use another cache"
+            ) from None
+        yield cache / key
+
+
+def _build(
+    client: Client,
+    listing: MapListing,
+    rule: ElevationRule,
+    directory: Path,
+    wait_s: float,
+    progress: Callable[[BuildProgress], None] | None,
+) -> BuiltElevation:
     # row after row: only the strip between two rows has to wait
     metres = listing.boxes
     order = np.lexsort((metres[:, 0], metres[:, 1]))
     boxes = column_boxes(metres[order], rule.resolution)
-    directory = cache / map_key(listing.map_version, rule)
     first = (int(boxes[:, 0].min()), int(boxes[:, 1].min()))
     shape = (int(boxes[:, 3].max()) - first[1], int(boxes[:, 2].max()) - first[0])
     grid = ElevationGrid(directory / "heights", rule.resolution, first, shape)

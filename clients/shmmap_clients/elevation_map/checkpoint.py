@@ -28,9 +28,9 @@ class Checkpoint:
 class Journal:
     """Keeps the latest checkpoint of a build in its directory.
 
-    ``seams-N.npz`` is written first, then ``state.json`` with N by rename: whenever a build dies, the state
-    names seams that are there whole.  Columns finished after a checkpoint are made again, with the
-    same heights.
+    Heights and ``seams-N.npz`` are forced to the disk first, then ``state.json`` with N appears by rename:
+    whenever a build or its machine dies, the state speaks of what is there whole.  Columns finished after a
+    checkpoint are made again, with the same heights.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -49,6 +49,8 @@ class Journal:
                         np.lib.format.write_array(member, array, allow_pickle=False)
             file.flush()
             os.fsync(file.fileno())
+        with open(self._directory / "heights", "rb") as heights:
+            os.fsync(heights.fileno())
         interim = self._directory / "state.json.tmp"
         interim.write_text(json.dumps(asdict(state)), encoding="utf-8")
         interim.replace(self._directory / "state.json")

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import itertools
+import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +204,7 @@ def test_blocks_fill_as_the_whole_does(tmp_path: Path) -> None:
     assert FILLED not in kind
 
 
-def test_a_checkpoint_brings_back_what_waits(tmp_path: Path) -> None:
+def test_a_checkpoint_brings_back_what_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     boxes = np.array([(0, 0, 5, 5), (4, 0, 9, 5), (8, 0, 12, 5)])
 
     def rows(*i: int) -> Columns:
@@ -215,7 +217,15 @@ def test_a_checkpoint_brings_back_what_waits(tmp_path: Path) -> None:
     seams.add(0, rows(1, 4))
     journal.write(Checkpoint(1, 2, 0), seams)
     seams.add(1, rows(4, 8))
+    forced = []
+
+    def fsync(fd: int) -> None:
+        assert json.loads((tmp_path / "state.json").read_text())["done"] == 1  # the state comes last
+        forced.append(Path(os.readlink(f"/proc/self/fd/{fd}")).name)
+
+    monkeypatch.setattr(os, "fsync", fsync)
     journal.write(Checkpoint(2, 4, 1), seams)
+    assert sorted(forced) == ["heights", "seams-2.npz"]
     again = Seams(boxes)
     assert journal.read(again) == Checkpoint(2, 4, 1)
     assert sorted(path.name for path in tmp_path.glob("seams-*")) == ["seams-2.npz"]
