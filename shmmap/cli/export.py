@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from shmmap.client.cell import Cell
 
-__all__ = ["add_parser", "merged_columns", "run"]
+__all__ = ["add_parser", "run"]
 
 _FORMATS = ("pcd", "npz")
 
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
                 raise _exists(path)
         written = []
         for path, cells in plan:
-            columns = merged_columns(cells)
+            columns = _merged_columns(cells)
             _write(path, columns, kind, args)
             written.append({"path": str(path), "points": len(columns["xyz"]), "cells": [c.id for c in cells]})
     if args.json:
@@ -111,7 +111,7 @@ def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tu
     return [(Path(args.output_dir, name), [cell]) for name, cell in zip(names, unique, strict=True)]
 
 
-def merged_columns(cells: Sequence[Cell]) -> dict[str, NDArray[Any]]:
+def _merged_columns(cells: Sequence[Cell]) -> dict[str, NDArray[Any]]:
     """Put the points of several cells one after the other.
 
     Raises

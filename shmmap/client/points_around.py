@@ -13,7 +13,7 @@ from shmmap.client.cell import Cell
 from shmmap.errors import BadRequest
 from shmmap.geometry import Circle, distance_to_boxes
 
-__all__ = ["PointsAround", "farthest_in_boxes", "points_around"]
+__all__ = ["PointsAround", "points_around"]
 
 
 class PointsAround:
@@ -104,7 +104,7 @@ class PointsAround:
         return np.concatenate(parts)
 
 
-def farthest_in_boxes(x: float, y: float, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _farthest_in_boxes(x: float, y: float, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance in metres from a point to the farthest point of each box ((N, 4) float64), as (N,)."""
     dx = np.maximum(np.abs(boxes[:, 0] - x), np.abs(boxes[:, 2] - x))
     dy = np.maximum(np.abs(boxes[:, 1] - y), np.abs(boxes[:, 3] - y))
@@ -131,5 +131,5 @@ def points_around(
     """
     Circle(x, y, radius)
     near = np.flatnonzero(distance_to_boxes(x, y, boxes) <= radius)
-    whole = farthest_in_boxes(x, y, boxes[near]) <= radius
+    whole = _farthest_in_boxes(x, y, boxes[near]) <= radius
     return PointsAround(x, y, radius, tuple([cells[i] for i in near.tolist()]), tuple(whole.tolist()))

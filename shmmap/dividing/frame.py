@@ -23,7 +23,7 @@ from shmmap.dividing.sources import Bound3, Source
 from shmmap.errors import MapDataError
 from shmmap.formats.finite import Bounds
 
-__all__ = ["FLOAT32_REACH_M", "Frame", "Translation", "choose_frame", "source_bounds"]
+__all__ = ["FLOAT32_REACH_M", "Frame", "Translation", "choose_frame"]
 
 FLOAT32_REACH_M: Final = 16384.0
 """Below, rounding to float32 moves a coordinate by less than half a millimetre."""
@@ -80,7 +80,7 @@ class Frame:
             )
 
 
-def source_bounds(sources: Sequence[Source]) -> Bound3:
+def _source_bounds(sources: Sequence[Source]) -> Bound3:
     """Bounds of the finite points of all sources: from their headers where they say, else by reading them.
 
     NaN when there is no finite point.
@@ -114,7 +114,7 @@ def choose_frame(
     single, double = np.dtype(np.float32), np.dtype(np.float64)
     if row["x"].itemsize == 4 and not isinstance(translation, tuple):
         return Frame(NO_MOVE, single)
-    low, high = source_bounds(sources)
+    low, high = _source_bounds(sources)
     if not np.isfinite(low).all():
         return Frame(NO_MOVE if isinstance(translation, str) else translation, single)
     if isinstance(translation, tuple):

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bounds", "axis_extremes", "row_extremes"]
+__all__ = ["Bounds", "row_extremes"]
 
 _GROUP: Final = 512  # rows folded into one long row, so that numpy reduces with vector instructions
 
@@ -25,7 +25,7 @@ def row_extremes(rows: NDArray[Any]) -> tuple[list[float], list[float]]:
         return _reduce(np.minimum, rows), _reduce(np.maximum, rows)
 
 
-def axis_extremes(axes: tuple[NDArray[Any], ...]) -> tuple[list[float], list[float]]:
+def _axis_extremes(axes: tuple[NDArray[Any], ...]) -> tuple[list[float], list[float]]:
     """Return minimum and maximum of each contiguous (N,) array, N > 0; NaN wins."""
     with np.errstate(invalid="ignore"):
         return [float(axis.min()) for axis in axes], [float(axis.max()) for axis in axes]
@@ -61,7 +61,7 @@ class Bounds:
         """
         if not len(xyz):
             return None
-        low, high = axis_extremes(axes) if axes else row_extremes(xyz)
+        low, high = _axis_extremes(axes) if axes else row_extremes(xyz)
         if all(map(math.isfinite, low + high)):
             self._take(low, high)
             return None

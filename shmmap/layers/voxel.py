@@ -13,12 +13,12 @@ from shmmap.errors import BadRequest
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
 from shmmap.layers.lattice import Grouping, group_points
 
-__all__ = ["KIND", "build_voxel", "means"]
+__all__ = ["KIND", "build_voxel"]
 
 _EDGES: Final = ("leaf_x", "leaf_y", "leaf_z")
 
 
-def means(column: NDArray[np.generic], grouping: Grouping) -> NDArray[np.float64]:
+def _means(column: NDArray[np.generic], grouping: Grouping) -> NDArray[np.float64]:
     """Return the mean of a column over the points of each row, (V,) or (V, components) float64.
 
     Summed about each voxel's first value, so that large values lose no digits.
@@ -63,7 +63,7 @@ def build_voxel(points: PointTable, parameters: Parameters) -> LayerTable:
     columns: dict[str, NDArray[np.generic]] = {}
     for name, column in points.columns.items():
         if name != "count":
-            columns[name] = means(column, grouping).astype(_kept_dtype(column.dtype))
+            columns[name] = _means(column, grouping).astype(_kept_dtype(column.dtype))
     columns["count"] = grouping.counts.astype(np.uint32)
     return LayerTable(
         columns=columns,

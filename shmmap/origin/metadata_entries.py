@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EntryCollector", "MapMetadata", "read_corner"]
+__all__ = ["EntryCollector", "MapMetadata"]
 
 # yaml-cpp reads integers as C++ streams do: a leading 0x is hexadecimal, a leading 0 octal
 _INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)")
@@ -33,7 +33,7 @@ _FLUSH_ENTRIES = 1 << 14
 _NAMED_IN_PROBLEMS = 3
 
 
-def read_corner(text: str, *, strict: bool) -> float | None:
+def _read_corner(text: str, *, strict: bool) -> float | None:
     """Value of one corner coordinate in metres, or None if these rules do not take it."""
     if _INTEGER.fullmatch(text):
         digits = text.lstrip("+-")
@@ -97,7 +97,7 @@ class EntryCollector:
         """Take ``key: [x, y]``."""
         if key in _RESOLUTIONS:
             return False
-        corner_x, corner_y = read_corner(x, strict=self.strict), read_corner(y, strict=self.strict)
+        corner_x, corner_y = _read_corner(x, strict=self.strict), _read_corner(y, strict=self.strict)
         if corner_x is None or corner_y is None:
             return False
         if not (_INTEGER.fullmatch(x) and _INTEGER.fullmatch(y)):

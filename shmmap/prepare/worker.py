@@ -25,13 +25,13 @@ from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
 from shmmap.segment.parent import die_with
 
-__all__ = ["main", "prepare_cell"]
+__all__ = ["main"]
 
 _NICENESS: Final = 5
 _BLOCK_BYTES: Final = 1 << 20
 
 
-def prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
+def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
     """Have every layer of a cell in the cache; the file is read once for all computed layers."""
     done: dict[str, work.LayerDone] = {}
     missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []
@@ -133,7 +133,7 @@ def main(arguments: list[str]) -> int:
     try:
         channel.send(work.encode(work.Ready()))
         while data := channel.recv(work.MAX_PACKET_BYTES):
-            channel.send(work.encode(prepare_cell(work.decode_work(data), cache)))
+            channel.send(work.encode(_prepare_cell(work.decode_work(data), cache)))
     except (BrokenPipeError, ConnectionResetError):
         pass
     return 0

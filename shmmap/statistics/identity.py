@@ -18,7 +18,6 @@ __all__ = [
     "WriterProcess",
     "judge",
     "pid_namespace",
-    "process_state",
     "start_time_ticks",
 ]
 
@@ -124,7 +123,7 @@ class DaemonIdentity:
             raise SegmentCorrupt(f"the statistics' identity is damaged: {error}") from error
 
 
-def process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", "dead", "unknown"]:
+def _process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", "dead", "unknown"]:
     """Return what the kernel says of the process that had this id and start time.
 
     ``unknown`` where /proc hides other users' processes.
@@ -205,7 +204,7 @@ def judge(identity: DaemonIdentity, beat_age_s: float) -> DaemonState:
     if identity.pid_namespace and identity.pid_namespace != pid_namespace():
         process: str = "unknown"  # its pid means another process here: only the beat tells
     else:
-        process = process_state(identity.pid, identity.start_time_ticks)
+        process = _process_state(identity.pid, identity.start_time_ticks)
     if process == "dead":
         return "dead"
     if process == "stopped":

@@ -30,7 +30,7 @@ from shmmap.testing.town import Town
 from shmmap.testing.town_ground import BLOCK_METRES
 from shmmap.testing.town_traffic import Traffic
 
-__all__ = ["FullDemoResult", "run_full_demo", "simulated_drive"]
+__all__ = ["FullDemoResult", "run_full_demo"]
 
 _STEP_METRES: Final = 2.0
 _SPEED: Final = 10.0  # metres per second
@@ -51,7 +51,7 @@ class FullDemoResult:
     picture_svg: str
 
 
-def simulated_drive(town: Town, *, length: float, seed: int = 0) -> Iterator[Scan]:
+def _simulated_drive(town: Town, *, length: float, seed: int = 0) -> Iterator[Scan]:
     """Scans with poses of a drive through a town, every two metres, among moving cars and people.
 
     Columns: ``xyz``, ``ring`` (uint8), and ``moving`` (uint8), 1 for a point of what moves.
@@ -138,7 +138,7 @@ def run_full_demo(
         window = ["--update-distance", "10"]
         programs = run_three_programs(
             daemon.endpoint, daemon.shm_dir, daemon.instance,
-            simulated_drive(town, length=length), _poses(town, route), work,
+            _simulated_drive(town, length=length), _poses(town, route), work,
             ndt=["--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(_SEEN_METRES), *window],
             compare=["--mode", "distance", "--radius", str(_WINDOW_METRES), *window],
             after_scan=tell,

@@ -32,7 +32,7 @@ from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.rule import ElevationRule
 from shmmap_clients.elevation_map.seams import ColumnBox, Seams, column_boxes
 
-__all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map", "map_key"]
+__all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map"]
 
 FORMAT: Final = 1
 _EVERY: Final = 64  # cells between checkpoints
@@ -82,7 +82,7 @@ class BuiltElevation:
     failed: tuple[CellError, ...]
 
 
-def map_key(map_version: int, rule: ElevationRule) -> str:
+def _map_key(map_version: int, rule: ElevationRule) -> str:
     """Return the name under which a map's elevation is cached, 32 hex digits."""
     text = json.dumps([FORMAT, f"{map_version:016x}", rule.document], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -127,7 +127,7 @@ def build_elevation_map(
     listing = client.metadata()
     if not len(listing):
         raise MapMissing("the map has no cells")
-    with _alone(cache, map_key(listing.map_version, rule)) as directory:
+    with _alone(cache, _map_key(listing.map_version, rule)) as directory:
         return _build(client, listing, rule, directory, wait_s, progress)
 
 
