@@ -75,14 +75,20 @@ def write_hillshade(path: Path, grid: ElevationGrid, fill_radius: float) -> None
 
 
 @contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[IO[bytes]]:
+def _interim(path: Path) -> Iterator[Path]:
+    """A name to write to; what is there in the end takes the place of ``path``."""
     interim = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with open(interim, "xb") as file:
-            yield file
+        yield interim
         interim.replace(path)
     finally:
         interim.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[IO[bytes]]:
+    with _interim(path) as interim, open(interim, "xb") as file:
+        yield file
 
 
 def _npz(file: IO[bytes], grid: ElevationGrid, fill_radius: float, document: dict[str, Any]) -> None:
@@ -122,17 +128,13 @@ def _geotiff(
         (34735, "H", len(keys), tuple(keys), True),
         (42113, "s", 4, "nan", True),
     ]
-    interim = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
+    with _interim(path) as interim:
         tifffile.imwrite(
             interim, _tiles(grid, fill_radius), shape=grid.shape, dtype=np.float32, tile=(_TILE, _TILE),
             photometric="minisblack", compression="zlib", metadata=None,
             description=json.dumps(document), extratags=tags, bigtiff=math.prod(grid.shape) > 1 << 29,
             maxworkers=1,  # several would have a quarter of a gigabyte of tiles waiting for them
         )  # fmt: skip
-        interim.replace(path)
-    finally:
-        interim.unlink(missing_ok=True)
 
 
 def _tiles(grid: ElevationGrid, fill_radius: float) -> Iterator[NDArray[np.float32]]:
