@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import mmap
-import os
 import statistics
 import subprocess
 import sys
@@ -23,12 +22,10 @@ import posix_ipc
 
 from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Cell
-from shmmap.columns import ColumnSpec
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
-from shmmap.segment.layout import PublishBlock, SourceStamp
-from shmmap.segment.names import new_segment_name
-from shmmap.segment.writer import SegmentWriter
+from shmmap.segment.layout import PublishBlock
+from tests.support.segments import publish_segment
 
 __all__ = ["main"]
 
@@ -50,25 +47,10 @@ def publish(directory: ShmDirectory, number: int, points: int) -> tuple[str, Han
     rng = np.random.default_rng(number)
     box = (20.0 * number, 0.0, 20.0 * number + 20, 20.0)
     cell_id = f"/maps/town/pointcloud_map.pcd/{20 * number}_0.pcd"
-    specs = [ColumnSpec("xyz", np.dtype("<f4"), 3, "m"), ColumnSpec("intensity", np.dtype("<f4"))]
-    writer = SegmentWriter(specs, points, cell_id=cell_id, layer="points", box=box)
-    fd = directory.create()
-    writer.start(fd)
-    writer.append(0, rng.random((points, 3), np.float32))
-    writer.append(1, rng.random(points, np.float32))
-    header = writer.finish(
-        z_min=0.0,
-        z_max=1.0,
-        source=SourceStamp(1, 2, 3),
-        source_digest=bytes(16),
-        source_points=points,
-        dropped_points=0,
-        builder_version=1,
+    columns = {"xyz": rng.random((points, 3), np.float32), "intensity": rng.random(points, np.float32)}
+    name, header = publish_segment(
+        directory, columns, block=PublishBlock(1, number), instance="benchmark", cell_id=cell_id, box=box
     )
-    name = new_segment_name("benchmark")
-    block = PublishBlock(1, number)
-    directory.publish(fd, name, block=block, header_bytes=header.header_bytes, mode=0o400, gid=-1)
-    os.close(fd)
     return name, Handle(cell_id, number, "points", name, 0, header.total_bytes, points, *box)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,14 +14,10 @@ from numpy.typing import NDArray
 
 from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Cell
-from shmmap.columns import ColumnSpec
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import PublishBlock, SourceStamp
-from shmmap.segment.names import new_segment_name
-from shmmap.segment.writer import SegmentWriter
-
-Box = tuple[float, float, float, float]
+from tests.support.segments import Box, publish_segment
 
 
 class Segments:
@@ -44,37 +39,12 @@ class Segments:
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> tuple[str, Handle]:
         rows = len(next(iter(columns.values())))
-        specs = [
-            ColumnSpec(
-                name, values.dtype, 1 if values.ndim == 1 else values.shape[1], "m" if name == "xyz" else ""
-            )
-            for name, values in columns.items()
-        ]
-        writer = SegmentWriter(specs, rows, cell_id=cell_id, layer=layer, box=box)
-        fd = self.directory.create()
-        try:
-            writer.start(fd)
-            for index, values in enumerate(columns.values()):
-                writer.append(index, np.ascontiguousarray(values))
-            header = writer.finish(
-                z_min=-1.0,
-                z_max=8.0,
-                source=SourceStamp(11, 22, 33),
-                source_digest=bytes(range(16)),
-                source_points=rows + 2,
-                dropped_points=2,
-                builder_version=1,
-                origin=origin,
-            )
-            name = new_segment_name("unit")
-            block = PublishBlock(epoch=7, version=version)
-            self.directory.publish(
-                fd, name, block=block, header_bytes=header.header_bytes, mode=0o400, gid=-1
-            )
-        finally:
-            os.close(fd)
-        handle = Handle(cell_id, version, layer, name, 0, header.total_bytes, rows, *box)
-        return name, handle
+        name, header = publish_segment(
+            self.directory, columns, block=PublishBlock(epoch=7, version=version), cell_id=cell_id, box=box,
+            layer=layer, origin=origin, z_min=-1.0, z_max=8.0, source=SourceStamp(11, 22, 33),
+            source_digest=bytes(range(16)), source_points=rows + 2, dropped_points=2,
+        )  # fmt: skip
+        return name, Handle(cell_id, version, layer, name, 0, header.total_bytes, rows, *box)
 
     def attach(self, name: str, handle: Handle) -> Cell:
         return self.attacher.attach(handle, handle.id, name, shm_dir=self.path, slot=99, populate=False)

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import os
 import select
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,17 +21,14 @@ NAME = "/shmmap.unit.0011223344556677"
 
 
 @pytest.fixture
-def directory() -> Iterator[ShmDirectory]:
+def directory(shm: ShmDirectory) -> ShmDirectory:
     """Return a private directory with one named file of a page."""
     prepare_process()
-    with tempfile.TemporaryDirectory(prefix="shmmap-unit-", dir="/dev/shm") as path:
-        made = ShmDirectory(path)
-        fd = made.create()
-        os.ftruncate(fd, 4096)
-        made.link(fd, NAME)
-        os.close(fd)
-        yield made
-        made.close()
+    fd = shm.create()
+    os.ftruncate(fd, 4096)
+    shm.link(fd, NAME)
+    os.close(fd)
+    return shm
 
 
 def reported(fd: int, timeout_s: float = 10.0) -> bool:

@@ -17,12 +17,10 @@ from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment.attach import attach, unmap
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import PublishBlock
+from tests.support.process_costs import mappings_under
 from tests.support.segment_reader import read_segment
-from tests.unit.segment.conftest import Publish, write_segment
-
-
-def mapped_times(name: str) -> int:
-    return Path("/proc/self/maps").read_text().count(name.lstrip("/"))
+from tests.support.segments import write_segment
+from tests.unit.segment.conftest import Publish
 
 
 def test_the_same_as_an_independent_reader(shm: ShmDirectory, publish: Publish) -> None:
@@ -76,13 +74,13 @@ def test_the_mapping_lives_as_long_as_any_view(shm: ShmDirectory, publish: Publi
     del segment, xyz
     gc.collect()
     assert calls == []
-    assert mapped_times(name) == 1
+    assert mappings_under(name) == 1
     if kind == "column":
         assert np.array_equal(view, expected)  # type: ignore[arg-type]
     del view
     gc.collect()
     assert len(calls) == 1
-    assert mapped_times(name) == 0
+    assert mappings_under(name) == 0
 
 
 def test_no_descriptor_is_kept(shm: ShmDirectory, publish: Publish) -> None:
@@ -99,7 +97,7 @@ def test_three_thousand_with_few_descriptors(shm: ShmDirectory, publish: Publish
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
     try:
         held = [attach(name, shm_dir=shm.path, slot=i) for i in range(3000)]
-        assert mapped_times(name) > 0
+        assert mappings_under(name) > 0
         assert float(held[0].column(0).sum()) == float(held[-1].column(0).sum())
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
@@ -109,7 +107,7 @@ def test_many_small_layers_may_share_one_object(shm: ShmDirectory) -> None:
     rng = np.random.default_rng(1)
     xyz, intensity = rng.random((10, 3)), np.arange(10, dtype="<u2")
     with open(f"{shm.path}/one", "w+b") as file:
-        write_segment(file.fileno(), xyz, intensity)
+        write_segment(file.fileno(), {"xyz": xyz, "intensity": intensity})
         one = Path(file.name).read_bytes()
     one += bytes(-len(one) % 4096)
     Path(shm.path, "slab").write_bytes(bytes(8192) + one)
@@ -140,7 +138,7 @@ def test_what_is_no_segment(shm: ShmDirectory, publish: Publish) -> None:
         attach("/bad", shm_dir=shm.path, offset=4096)
     os.unlink(f"{shm.path}/bad")
     gc.collect()  # a refusal's traceback may be part of a cycle
-    assert mapped_times(f"{shm.path}/bad") == 0
+    assert mappings_under(f"{shm.path}/bad") == 0
 
 
 def test_other_things_of_that_name(shm: ShmDirectory, publish: Publish) -> None:

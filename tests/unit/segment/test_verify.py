@@ -10,11 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from shmmap.columns import ColumnSpec
 from shmmap.errors import SegmentCorrupt
-from shmmap.segment.layout import PublishBlock, SegmentHeader, SourceStamp, pack_publish_block
+from shmmap.segment.layout import PublishBlock, SegmentHeader, pack_publish_block
 from shmmap.segment.verify import read_header, verify_file
-from shmmap.segment.writer import SegmentWriter
+from tests.support.segments import write_segment
 
 ROWS = 40_000
 BLOCK = PublishBlock(7, 9)
@@ -25,22 +24,9 @@ def segment() -> Iterator[tuple[int, SegmentHeader]]:
     """Return an open, published segment of 1.3 MB: more than is read at once."""
     with tempfile.TemporaryFile(dir="/dev/shm") as file:
         fd = file.fileno()
-        specs = [ColumnSpec("xyz", np.dtype("<f4"), 3, "m"), ColumnSpec("intensity", np.dtype("<u2"))]
-        writer = SegmentWriter(specs, ROWS, cell_id="/m/a.pcd", layer="points", box=(0, 0, 20, 20))
-        writer.start(fd)
         rng = np.random.default_rng(1)
-        for _ in range(4):
-            writer.append(0, rng.random((ROWS // 4, 3), np.float32))
-            writer.append(1, rng.integers(0, 9, ROWS // 4).astype("<u2"))
-        header = writer.finish(
-            z_min=0.0,
-            z_max=1.0,
-            source=SourceStamp(1, 2, 3),
-            source_digest=bytes(16),
-            source_points=ROWS,
-            dropped_points=0,
-            builder_version=1,
-        )
+        xyz, intensity = rng.random((ROWS, 3), np.float32), rng.integers(0, 9, ROWS).astype("<u2")
+        header = write_segment(fd, {"xyz": xyz, "intensity": intensity})
         os.pwrite(fd, pack_publish_block(BLOCK), header.header_bytes - 64)
         yield fd, header
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from collections.abc import Iterator
 
 import pytest
@@ -50,23 +49,20 @@ def parse(text: str) -> tuple[dict[str, str], dict[tuple[str, str], float]]:
 
 
 @pytest.fixture
-def found() -> Iterator[Snapshot]:
-    with tempfile.TemporaryDirectory(prefix="shmmap-unit-", dir="/dev/shm") as path:
-        shm = ShmDirectory(path)
-        identity = DaemonIdentity(
-            pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),
-            epoch=5, instance="unit", endpoint="/run/x.sock", map_path='/maps/"a"\\b\nc', map_version=7,
-            shm_dir=path, id_prefix="/maps/", library_version="1.2.3", started_unix_ns=5 * 10**9,
-        )  # fmt: skip
-        writer = StatisticsWriter(shm, "unit", identity)
-        writer.add("requests", 3)
-        writer.set("last_reload_unix_ns", 1_500_000_000_500_000_000)
-        for duration_ns in (500, 3_000_000, 3_500_000, 10**13):
-            writer.add_duration("load", duration_ns)
-        writer.beat()
-        yield read_statistics("unit", path)
-        writer.close()
-        shm.close()
+def found(shm: ShmDirectory) -> Iterator[Snapshot]:
+    identity = DaemonIdentity(
+        pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),
+        epoch=5, instance="unit", endpoint="/run/x.sock", map_path='/maps/"a"\\b\nc', map_version=7,
+        shm_dir=shm.path, id_prefix="/maps/", library_version="1.2.3", started_unix_ns=5 * 10**9,
+    )  # fmt: skip
+    writer = StatisticsWriter(shm, "unit", identity)
+    writer.add("requests", 3)
+    writer.set("last_reload_unix_ns", 1_500_000_000_500_000_000)
+    for duration_ns in (500, 3_000_000, 3_500_000, 10**13):
+        writer.add_duration("load", duration_ns)
+    writer.beat()
+    yield read_statistics("unit", shm.path)
+    writer.close()
 
 
 def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:

@@ -9,7 +9,6 @@ import resource
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -34,14 +33,6 @@ BOX = (0.0, 0.0, 20.0, 20.0)
 
 def row(number: int, *, nbytes: int = 4096) -> CellRow:
     return CellRow(f"{number:04d}.pcd", "points", number, f"{number:016x}", "resident", nbytes, 10, BOX)
-
-
-@pytest.fixture
-def shm() -> Iterator[ShmDirectory]:
-    with tempfile.TemporaryDirectory(prefix="shmmap-unit-", dir="/dev/shm") as path:
-        directory = ShmDirectory(path)
-        yield directory
-        directory.close()
 
 
 @pytest.fixture
