@@ -363,7 +363,7 @@ def test_poses_as_planners_have_them(daemon: Factory, divided_map: DividedMap, b
             {"wait": np.nan}, {"wait": -1.0},
         ):  # fmt: skip
             with pytest.raises(BadRequest):
-                window.move_to(50, 50, **odd)  # type: ignore[arg-type]
+                window.move_to(50, 50, **odd)
         assert window.move_to(1, 0, route=route, wait=np.inf).complete
         assert window.wait_until_current(np.inf)
         assert window.error is None

@@ -37,7 +37,7 @@ class Played(EventStream):
         """Hear these; returns what `next` would: (epoch, number) of events, and what was missed."""
         for data in heard:
             self._hear(data)
-        told = [h if isinstance(h, Missed) else (h.epoch, h.seq) for h in self._ready]
+        told: list[object] = [h if isinstance(h, Missed) else (h.epoch, h.seq) for h in self._ready]
         self._ready.clear()
         return told
 
