@@ -28,12 +28,12 @@ def _setting(args: argparse.Namespace, name: str) -> str:
 
 def endpoint(args: argparse.Namespace) -> str | None:
     """Return the socket the options name; None means "look in the usual places"."""
-    if named := _setting(args, "endpoint"):
+    if named := _endpoint_setting(args):
         return endpoint_path(named)
     directory, name = _setting(args, "runtime_dir"), _setting(args, "instance")
     if directory:
         return endpoint_path(socket_path(directory, name or DEFAULT_INSTANCE))
-    if name and name != DEFAULT_INSTANCE:
+    if name and (args.instance or name != DEFAULT_INSTANCE):
         places = [socket_path(place, name) for place in runtime_dirs()]
         return next((place for place in places if Path(place).exists()), places[0])
     return None
@@ -41,10 +41,16 @@ def endpoint(args: argparse.Namespace) -> str | None:
 
 def instance(args: argparse.Namespace) -> str:
     """Return the instance's name; where only an endpoint is given, it is the socket's name."""
-    if name := _setting(args, "instance"):
-        return name
-    named = _setting(args, "endpoint")
-    return Path(endpoint_path(named)).name.removesuffix(".sock") if named else DEFAULT_INSTANCE
+    named = _endpoint_setting(args)
+    name = args.instance if args.instance or args.endpoint else _setting(args, "instance")
+    if name or not named:
+        return name or DEFAULT_INSTANCE
+    return Path(endpoint_path(named)).name.removesuffix(".sock")
+
+
+def _endpoint_setting(args: argparse.Namespace) -> str:
+    """The endpoint as given; ``SHMMAP_ENDPOINT`` does not count beside a flag that names another daemon."""
+    return args.endpoint or ("" if args.instance or args.runtime_dir else _setting(args, "endpoint"))
 
 
 def shm_dir(args: argparse.Namespace) -> str:

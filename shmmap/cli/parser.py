@@ -61,10 +61,10 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse, and let each verb refuse what it does not know itself: so the hint names its help."""
-        namespace, unknown = super().parse_known_args(args, namespace)
+        found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self._refuse(f"unrecognized arguments: {' '.join(unknown)}", unknown[0].split("=")[0])
-        return namespace, unknown
+        return found, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:

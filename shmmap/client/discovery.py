@@ -18,7 +18,13 @@ from shmmap.errors import (
     SocketPermission,
     StaleSocket,
 )
-from shmmap.protocol.endpoint import SYSTEM_RUNTIME_DIR, endpoint_path, runtime_dirs, socket_path
+from shmmap.protocol.endpoint import (
+    DEFAULT_INSTANCE,
+    SYSTEM_RUNTIME_DIR,
+    endpoint_path,
+    runtime_dirs,
+    socket_path,
+)
 
 __all__ = ["candidates", "check_socket", "find_socket"]
 
@@ -27,12 +33,14 @@ _START_HINT: Final = "start one with `shmmap serve MAP`, or name its socket with
 
 
 def candidates(endpoint: str | None = None, environ: Mapping[str, str] = os.environ) -> list[str]:
-    """Socket paths to try, in order: the one named, else those of the default instance.
+    """Socket paths to try, in order: the one named, else those of the instance.
 
     Parameters
     ----------
     endpoint
         A socket path or an ``ipc://`` URL; ``SHMMAP_ENDPOINT`` stands in for None.
+    environ
+        Without an endpoint, ``SHMMAP_INSTANCE`` names the instance, ``SHMMAP_RUNTIME_DIR`` its directory.
 
     Raises
     ------
@@ -42,7 +50,10 @@ def candidates(endpoint: str | None = None, environ: Mapping[str, str] = os.envi
     named = endpoint or environ.get("SHMMAP_ENDPOINT", "")
     if named:
         return [endpoint_path(named)]
-    return [socket_path(directory) for directory in runtime_dirs(environ)]
+    directory = environ.get("SHMMAP_RUNTIME_DIR", "")
+    places = [os.path.abspath(directory)] if directory else runtime_dirs(environ)
+    instance = environ.get("SHMMAP_INSTANCE", "") or DEFAULT_INSTANCE
+    return [socket_path(place, instance) for place in places]
 
 
 def find_socket(paths: Sequence[str], deadline_s: float) -> str:
@@ -170,9 +181,11 @@ def _other_instances(path: str) -> str:
     if not (directory.endswith("/shmmap") or directory == SYSTEM_RUNTIME_DIR):
         return ""
     try:
-        others = sorted(f"{directory}/{name}" for name in os.listdir(directory) if _is_request_socket(name))
+        others = sorted(
+            name.removesuffix(".sock") for name in os.listdir(directory) if _is_request_socket(name)
+        )
     except OSError:
         return ""
     if not others:
         return ""
-    return f"other instances are there: {', '.join(others)}; name one with SHMMAP_ENDPOINT"
+    return f"other instances are there: {', '.join(others)}; name one with SHMMAP_INSTANCE"

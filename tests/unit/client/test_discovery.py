@@ -49,6 +49,9 @@ def test_candidates_in_order() -> None:
     assert candidates(None, environ) == ["/run/user/7/shmmap/default.sock", "/run/shmmap/default.sock"]
     assert candidates(None, {}) == ["/run/shmmap/default.sock"]
     assert candidates(None, {**environ, "SHMMAP_ENDPOINT": "ipc:///a/b.sock"}) == ["/a/b.sock"]
+    named = {**environ, "SHMMAP_INSTANCE": "town"}
+    assert candidates(None, named) == ["/run/user/7/shmmap/town.sock", "/run/shmmap/town.sock"]
+    assert candidates(None, {**named, "SHMMAP_RUNTIME_DIR": "/r"}) == ["/r/town.sock"]
     assert candidates("/c.sock", {"SHMMAP_ENDPOINT": "/a/b.sock"}) == ["/c.sock"]
     with pytest.raises(BadRequest, match="tcp"):
         candidates("tcp://host:1", {})
@@ -234,7 +237,7 @@ def test_other_instances_are_named(place: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("shmmap.protocol.endpoint.SYSTEM_RUNTIME_DIR", str(place / "system"))
     with (
         listening(directory / "garage.sock"),
-        pytest.raises(NoSocket, match=r"garage\.sock.*SHMMAP_ENDPOINT"),
+        pytest.raises(NoSocket, match=r"garage; name one with SHMMAP_INSTANCE"),
     ):
         shmmap.connect()
 
