@@ -39,7 +39,6 @@ class PinCensus:
         self._is_pinned = is_pinned
         self._pinned: dict[str, int] = {}
         self._round: list[Resident] = []
-        self._seen: set[str] = set()
         self.pinned_bytes = 0
 
     @property

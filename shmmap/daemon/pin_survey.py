@@ -14,7 +14,7 @@ from typing import Final
 
 from shmmap.daemon.reclaim import UNKNOWN_SLOT, Reclaimer
 from shmmap.daemon.residency import Resident
-from shmmap.daemon.sessions import Session, Sessions
+from shmmap.daemon.sessions import Session
 from shmmap.errors import Busy
 
 __all__ = ["PinSurvey", "Pinned", "Share"]
@@ -61,12 +61,9 @@ Answer = Callable[[Pinned], None]
 class PinSurvey:
     """Looks at all segments, a few per `step`."""
 
-    def __init__(
-        self, reclaimer: Reclaimer, sessions: Sessions, *, in_service: Callable[[Resident], bool]
-    ) -> None:
+    def __init__(self, reclaimer: Reclaimer, *, in_service: Callable[[Resident], bool]) -> None:
         self._reclaimer = reclaimer
         self._in_service = in_service
-        self._sessions = sessions
         self._asked: list[tuple[Session, Answer]] = []
         self._running: list[tuple[Session, Answer]] = []
         self._left: list[Resident] = []

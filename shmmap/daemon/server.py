@@ -119,7 +119,7 @@ class Server:
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
         self._replies = Replies(socket, statistics)
         self._hearing = Hearing(socket, sessions, statistics, self._refuse_unread)
-        self._survey = PinSurvey(store.reclaimer, sessions, in_service=store.is_in_service)
+        self._survey = PinSurvey(store.reclaimer, in_service=store.is_in_service)
         self._gate = ListenGate(self.watch, self.unwatch)
         self._crowd = CrowdControl(
             self._gate,
