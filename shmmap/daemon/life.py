@@ -43,7 +43,7 @@ from shmmap.daemon.signals import KEEP_SIGNAL, RELOAD_SIGNAL, STOP_SIGNALS, Serv
 from shmmap.daemon.store import Store
 from shmmap.daemon.time_slices import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.workers import WorkerPool
-from shmmap.errors import InternalError, ShmmapError
+from shmmap.errors import ConfigError, InternalError, ShmmapError
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
@@ -104,7 +104,16 @@ class Life:
             ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
             limit_bytes=memory_limit_bytes(),
         )
-        self._statistics = StatisticsWriter(directory, config.instance, self._identity, mode=mode, gid=gid)
+        try:
+            self._statistics = StatisticsWriter(
+                directory, config.instance, self._identity, mode=mode, gid=gid
+            )
+        except OSError as error:
+            raise ConfigError(
+                f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}",
+                key="shm_dir",
+                hint="make room, and lift limits on the size of files (ulimit -f, LimitFSIZE=)",
+            ) from error
         self._sessions = Sessions()
         books = Residency(budget)
         books.overhead_bytes = self._statistics.size_bytes

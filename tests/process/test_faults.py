@@ -216,3 +216,12 @@ def test_statistics_that_cannot_be_written_end_nobody(
     while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
         os.sched_yield()
     assert one.log.count(told) == 1
+
+
+def test_a_limit_that_keeps_the_daemon_from_starting_is_named(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, command=["prlimit", "--fsize=16384"], start=False)
+    assert one.run_to_end() == 78
+    assert "File too large" in one.log
+    assert "LimitFSIZE=" in one.log
