@@ -19,7 +19,7 @@ import numpy as np
 
 from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.follower import Frame
-from shmmap_clients.scans.trajectory import Trajectory
+from shmmap_clients.scans.trajectory import Trajectory, pose_of
 from shmmap_clients.streams import Publisher, Subscriber
 
 __all__ = ["OdometryListener", "PoseMessage", "PosePublisher", "decode_pose"]
@@ -59,10 +59,13 @@ def decode_pose(message: bytes) -> PoseMessage:
     """
     try:
         pose = _decoder.decode(message)
-    except msgspec.DecodeError as error:
+        if pose.shmmap_pose != _VERSION:
+            raise BadRequest(f"version {pose.shmmap_pose}, not {_VERSION}")
+        if not math.isfinite(pose.stamp_s):
+            raise BadRequest("a time that is not finite")
+        pose_of(pose.T)
+    except (msgspec.DecodeError, BadRequest) as error:
         raise BadRequest(f"a message that is no pose: {error}") from None
-    if pose.shmmap_pose != _VERSION or len(pose.T) != 16 or not np.isfinite(pose.T).all():
-        raise BadRequest("a message that is no pose: 16 finite numbers are wanted, and version 1")
     return pose
 
 

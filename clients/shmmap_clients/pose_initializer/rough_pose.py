@@ -49,8 +49,10 @@ class RoughPose:
         numbers = (self.x, self.y, self.z, self.roll, self.pitch, self.yaw)
         if not all(map(math.isfinite, numbers)):
             raise BadRequest(f"a rough pose has finite numbers, not {numbers}")
-        if not (self.sigma_m > 0 and self.sigma_yaw > 0):
-            raise BadRequest("the standard deviations of a rough pose must be positive")
+        if not (0 < self.sigma_m < math.inf and self.sigma_yaw > 0):
+            raise BadRequest(
+                "the standard deviations of a rough pose must be positive, that of its place finite"
+            )
         if self.covariance is not None:
             matrix = np.array(self.covariance, np.float64)
             if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (matrix != matrix.T).any():

@@ -10,6 +10,7 @@ and again until its reader unsubscribes.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import msgspec
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest
 from shmmap_clients.scans.scan_sequence import Scan
+from shmmap_clients.scans.trajectory import pose_of
 from shmmap_clients.streams import Publisher, Subscriber
 
 __all__ = ["ScanPublisher", "ScanSubscriber", "decode_scan", "encode_scan"]
@@ -78,12 +80,10 @@ def decode_scan(frames: list[bytes]) -> Scan | None:
             raise ValueError("no column xyz of shape (N, 3)")
         if any(len(values) != len(xyz) for values in columns.values()):
             raise ValueError("columns of different lengths")
-        pose = None
-        if head.pose is not None:
-            pose = np.array(head.pose).reshape(4, 4)
-            if not np.isfinite(pose).all():
-                raise ValueError("a pose that is not finite")
-    except (msgspec.DecodeError, ValueError, TypeError, IndexError) as error:
+        if not math.isfinite(head.stamp_s):
+            raise ValueError("a time that is not finite")
+        pose = None if head.pose is None else pose_of(head.pose)
+    except (msgspec.DecodeError, BadRequest, ValueError, TypeError, IndexError) as error:
         raise BadRequest(f"a message that is no scan: {error}") from None
     return Scan(head.name, head.stamp_s, columns, pose)
 

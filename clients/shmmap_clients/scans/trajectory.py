@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest, MapDataError, MapMissing
 
-__all__ = ["Trajectory", "matrix_of", "quaternion_of", "read_trajectory", "tum_line"]
+__all__ = ["Trajectory", "matrix_of", "pose_of", "quaternion_of", "read_trajectory", "tum_line"]
 
 _NORM_TOLERANCE = 1e-2
 
@@ -58,6 +58,25 @@ def matrix_of(translation: Iterable[float], quaternion: Iterable[float]) -> NDAr
     ]
     T[:3, 3] = list(translation)
     return T
+
+
+def pose_of(numbers: Sequence[float]) -> NDArray[np.float64]:
+    """Return the (4, 4) pose of 16 numbers, the rows one after the other.
+
+    Raises
+    ------
+    BadRequest
+        They are no rotation and translation.
+    """
+    T = np.array(numbers, np.float64)
+    # components first: their products may overflow
+    if T.shape == (16,) and np.isfinite(T).all() and np.abs(T.reshape(4, 4)[:3, :3]).max() < 2.0:
+        T = T.reshape(4, 4)
+        R = T[:3, :3]
+        turns = np.abs(R @ R.T - np.eye(3)).max() < _NORM_TOLERANCE and np.linalg.det(R) > 0
+        if turns and T[3].tolist() == [0.0, 0.0, 0.0, 1.0]:
+            return T
+    raise BadRequest("a pose is a rotation and a translation, 16 finite numbers")
 
 
 def quaternion_of(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:

@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import json
+import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -146,6 +149,26 @@ def test_poses_and_odometry_travel(tmp_path: Path) -> None:
 def test_what_is_no_pose_is_refused(message: bytes) -> None:
     with pytest.raises(shmmap.BadRequest, match="no pose"):
         decode_pose(message)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"T": [0.0] * 16},  # would have no inverse
+        {"T": [1e300] * 16},
+        {"T": [math.nan] * 16},
+        {"T": np.diag([1.0, 1.0, -1.0, 1.0]).ravel().tolist()},
+        {"T": np.eye(4).ravel().tolist()[:15]},
+        {"T": np.diag([1.0, 1.0, 1.0, 2.0]).ravel().tolist()},
+        {"stamp_s": math.nan},
+        {"shmmap_pose": 2},
+    ],
+)
+def test_a_pose_is_a_rigid_motion_at_a_time(wrong: dict[str, Any]) -> None:
+    good = {"stamp_s": 1.0, "T": np.eye(4).ravel().tolist()}
+    assert good["T"] == decode_pose(msgspec.msgpack.encode(good)).T
+    with pytest.raises(shmmap.BadRequest, match="no pose"):
+        decode_pose(msgspec.msgpack.encode(good | wrong))
 
 
 def test_addresses_that_make_no_sense_are_refused() -> None:

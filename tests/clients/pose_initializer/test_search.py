@@ -59,6 +59,7 @@ def test_headings_are_near_across_half_a_turn() -> None:
     [
         {"x": math.nan},
         {"sigma_m": 0.0},
+        {"sigma_m": math.inf},
         {"sigma_yaw": -1.0},
         {"covariance": ((1.0, 0.0), (0.0, 1.0))},
         {"covariance": ((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))},

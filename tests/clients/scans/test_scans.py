@@ -153,6 +153,11 @@ def test_messages_that_are_no_scans() -> None:
     for wrong in ([b""], [b"\x80"], good[:-1], [good[0], b"123", *good[2:]], [*good, b""]):
         with pytest.raises(BadRequest):
             decode_scan(wrong)
+    for pose in (np.zeros((4, 4)), np.diag([1.0, 2.0, 1.0, 1.0]), np.full((4, 4), np.nan)):
+        with pytest.raises(BadRequest, match="rotation"):
+            decode_scan(encode_scan(Scan("one", 0.0, make_scan().columns, pose)))
+    with pytest.raises(BadRequest, match="time"):
+        decode_scan(encode_scan(Scan("one", float("nan"), make_scan().columns)))
 
 
 def test_scans_over_a_socket(tmp_path: Path) -> None:
