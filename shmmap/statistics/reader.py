@@ -7,6 +7,7 @@ Nothing is mapped and nothing is locked, so a reader can neither delay nor hurt 
 from __future__ import annotations
 
 import os
+import stat
 import time
 from collections.abc import Callable
 from functools import cached_property
@@ -207,14 +208,20 @@ class StatisticsReader:
             status = None
         if status is None:
             try:
-                self._fd = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+                # a pipe of that name would keep the opener waiting
+                self._fd = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             except FileNotFoundError:
                 return Snapshot("absent", None)
             except PermissionError as error:
                 raise NotPermitted(
                     f"statistics {self._path}: this user may not read them", hint="join the daemon's group"
                 ) from error
+            except OSError as error:
+                raise SegmentCorrupt(f"statistics {self._path}: {error.strerror}") from error
             status = os.fstat(self._fd)
+            if not stat.S_ISREG(status.st_mode):
+                self.close()
+                raise SegmentCorrupt(f"statistics {self._path}: no regular file: no daemon made it")
         header = self._header
         if header is None:
             header = self._header = _read_header(self._fd, status.st_size)

@@ -10,6 +10,7 @@ statistics serve the operator, the daemon serves without them.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import struct
@@ -17,7 +18,8 @@ import time
 from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 
-from shmmap.segment.directory import ShmDirectory, measured_bytes
+from shmmap.errors import ConfigError
+from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import statistics_name
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
@@ -74,6 +76,8 @@ class StatisticsWriter:
     ------
     OSError
         If the directory is full.
+    ConfigError
+        If somebody else has the segment's name.
     """
 
     def __init__(
@@ -128,9 +132,20 @@ class StatisticsWriter:
     def _publish(self) -> None:
         """Give the finished segment its name in one step, over a predecessor's."""
         interim = self.name + ".next"
-        self._directory.unlink(interim)
-        self._directory.link(self._fd, interim)
-        self._directory.rename(interim, self.name)
+        try:
+            self._directory.unlink(interim)
+            self._directory.link(self._fd, interim)
+            self._directory.rename(interim, self.name)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._directory.unlink(interim)
+            if is_full(error):
+                raise
+            raise ConfigError(
+                f"the statistics cannot be {self._directory.path}{self.name}: {error.strerror}",
+                key="instance",
+                hint="remove what somebody else put there (or at .next), or choose another --instance",
+            ) from error
 
     def set(self, name: str, value: int) -> None:
         """Set a gauge."""

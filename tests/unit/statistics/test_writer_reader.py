@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.errors import NotPermitted, SegmentCorrupt
+from shmmap.errors import ConfigError, NotPermitted, SegmentCorrupt
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics import identity as identity_module
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow
@@ -308,6 +308,32 @@ def test_too_long_an_identity_is_refused(shm: ShmDirectory, identity: DaemonIden
     with pytest.raises(ValueError, match="does not fit"):
         StatisticsWriter(shm, "unit", replace(identity, map_path="/" + "x" * 20000))
     assert os.listdir(shm.path) == []
+
+
+@pytest.mark.parametrize("name", ["/shmmap.unit.statistics", "/shmmap.unit.statistics.next"])
+def test_a_name_that_somebody_else_has(shm: ShmDirectory, identity: DaemonIdentity, name: str) -> None:
+    """A directory stands for a stranger's file: it cannot be replaced either."""
+    os.mkdir(shm.path + name)
+    with pytest.raises(ConfigError, match="Is a directory"):
+        StatisticsWriter(shm, "unit", identity)
+    assert [f"/{left}" for left in os.listdir(shm.path)] == [name]
+    os.rmdir(shm.path + name)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "directory", "link"])
+def test_no_file_at_all(shm: ShmDirectory, kind: str) -> None:
+    path = f"{shm.path}/shmmap.unit.statistics"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "directory":
+        os.mkdir(path)
+    else:
+        os.symlink("/dev/null", path)
+    with StatisticsReader("unit", shm.path) as reader:
+        for _ in range(2):
+            with pytest.raises(SegmentCorrupt):
+                reader.snapshot()
+    os.rmdir(path) if kind == "directory" else os.unlink(path)
 
 
 def test_absent(shm: ShmDirectory) -> None:
