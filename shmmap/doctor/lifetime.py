@@ -47,7 +47,10 @@ def check_daemon(patient: Patient) -> Finding:
         return fail(name, fact, f"continue it: kill -CONT {identity.pid}")
     if state == "hung":
         return fail(
-            name, fact, "the watchdog ends it under systemd; elsewhere kill -ABRT " + str(identity.pid)
+            name,
+            fact,
+            "if its log says that it cannot write its statistics, lift that limit; else the watchdog ends it"
+            f" under systemd, elsewhere kill -ABRT {identity.pid}",
         )
     if identity.library_version != shmmap.__version__:
         return warn(
