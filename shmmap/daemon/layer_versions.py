@@ -18,6 +18,8 @@ __all__ = ["MAX_NEIGHBOURS", "LayerVersions"]
 
 MAX_NEIGHBOURS: Final = 64
 """Most files that a layer with a halo reads beside its own."""
+MOST_REMEMBERED: Final = 1 << 18
+"""Versions, about 200 bytes each; whoever asks for ever new layers must not fill the daemon's memory."""
 
 
 class LayerVersions:
@@ -56,6 +58,8 @@ class LayerVersions:
             own = self._catalogue().version
             cells = [index, *self.neighbours(index, layer)]
             version = xxh3_64_intdigest(struct.pack(f"<{len(cells)}Q", *map(own, cells)))
+            if len(self._versions) >= MOST_REMEMBERED:
+                self._versions.clear()
             self._versions[index, layer] = version
         return version
 

@@ -21,6 +21,8 @@ __all__ = ["MOST_CELLS", "admitted_layers", "bounded_intent", "check_count", "ch
 MOST_CELLS: Final = 20_000
 """Cells, in all layers together, of one request: about half a second of the loop when all are cold."""
 MOST_HELD: Final = 100_000
+MOST_LAYERS_HELD: Final = 64
+"""Different layers named as held; reading what a layer is called takes some 40 us."""
 MOST_LAYERS: Final = 16
 """Layers of one request."""
 LAYER_TABLES_BYTES: Final = 256 << 20
@@ -44,16 +46,21 @@ def check_count(count: int) -> None:
 
 
 def check_held(message: messages.Differential) -> None:
-    """Refuse a client that says it holds more than `MOST_HELD` cells.
+    """Refuse a client that says it holds more than `MOST_HELD` cells, or layers of cells named one by one.
 
     Raises
     ------
     BadRequest
-        It says so.
+        It says so, or names more than `MOST_LAYERS_HELD` different layers.
     """
-    count = len(message.held) + len(message.packed) // 8
+    count = len(message.packed) // 8 + sum(
+        1 if cell.layers is None else len(cell.layers) for cell in message.held
+    )
     if count > MOST_HELD:
         raise BadRequest(f"{count} cells held; {MOST_HELD} is the most one request may name")
+    layers = {layer for cell in message.held if cell.layers is not None for layer in cell.layers}
+    if len(layers) > MOST_LAYERS_HELD:
+        raise BadRequest(f"{len(layers)} layers held; {MOST_LAYERS_HELD} is the most one request may name")
 
 
 def admitted_layers(store: Store, specs: Sequence[str]) -> tuple[str, ...]:

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from xxhash import xxh3_64_intdigest
 
+from shmmap.daemon import layer_versions
 from shmmap.daemon.layer_versions import LayerVersions
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol import messages as m
@@ -19,7 +21,9 @@ from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 NDT = "ndt(leaf=5.0,min_points=3)"
 
 
-def test_a_layer_has_its_cell_s_version_unless_it_looks_farther(tmp_path: Path) -> None:
+def test_a_layer_has_its_cell_s_version_unless_it_looks_farther(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = make_map(tmp_path / "map", columns=4, rows=4, points=5)
     catalogue = open_map(str(made.root), cache_dir=str(tmp_path / "cache")).load()
     versions = LayerVersions(lambda: catalogue)
@@ -35,6 +39,11 @@ def test_a_layer_has_its_cell_s_version_unless_it_looks_farther(tmp_path: Path) 
         packed = np.array([catalogue.version(i) for i in (index, *sorted(around))], "<u8").tobytes()
         assert versions.version(index, layer) == xxh3_64_intdigest(packed)
     before = {i: versions.version(i, "denoise") for i in range(len(catalogue))}
+    monkeypatch.setattr(layer_versions, "MOST_REMEMBERED", 4)
+    assert {i: versions.version(i, "denoise") for i in before} == before
+    for number in range(10):  # whoever asks for ever new layers fills no memory
+        versions.version(0, f"normals(radius={number + 1}.0)")
+    assert len(versions._versions) <= 4
     made.write_cell("20_20.pcd", (20, 20), random_points(np.random.default_rng(3), (20, 20), 6))
     catalogue = open_map(str(made.root), cache_dir=str(tmp_path / "cache")).load(fresh=True)
     versions.forget()

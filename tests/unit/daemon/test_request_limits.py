@@ -32,6 +32,10 @@ def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> Non
     for message in (
         Differential(1, EVERYWHERE, held=(HeldCell("a"),) * (many + 1)),
         Differential(1, EVERYWHERE, packed=bytes(8 * (many + 1))),
+        Differential(1, EVERYWHERE, held=(HeldCell("a", 1, ("points",) * (many + 1)),)),
+        Differential(
+            1, EVERYWHERE, held=(HeldCell("a", 1, tuple(f"voxel(leaf={1 + n / 100})" for n in range(65))),)
+        ),
     ):
         with pytest.raises(BadRequest, match="held"):
             one.cells.differential(one.session(), message, one.now_s())
