@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from shmmap import InternalError, ShmmapError
-from shmmap.cli.parser import Parser
+from shmmap.cli.output import print_json
+from shmmap.cli.program import Parser, exit_code_of, join_negative_values
 
 if TYPE_CHECKING:
     from shmmap import Client
@@ -28,10 +25,6 @@ __all__ = [
     "run_command",
     "run_program",
 ]
-
-_EXIT_INTERRUPTED: Final = 130
-_EXIT_BROKEN_PIPE: Final = 141
-_NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*")
 
 
 class Verb(Protocol):
@@ -84,13 +77,6 @@ def add_json_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -
     parser.add_argument("--json", action="store_true", help="print one JSON document")
 
 
-def print_json(value: object) -> None:
-    """Print one JSON document; a number JSON cannot hold (NaN, infinity) is a defect."""
-    indent = 2 if sys.stdout.isatty() else None
-    json.dump(value, sys.stdout, indent=indent, allow_nan=False, ensure_ascii=False)
-    sys.stdout.write("\n")
-
-
 def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequence[str] | None = None) -> int:
     """Run a verb of a program; returns the exit code, as ``shmmap`` itself has them.
 
@@ -139,40 +125,9 @@ def run_command(
 
 
 def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
-    try:
-        args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
+    def run() -> int:
+        args = parser.parse_args(join_negative_values(sys.argv[1:] if argv is None else argv))
         code: int = args.run(args)
-        sys.stdout.flush()
-    except ShmmapError as error:
-        _complain(name, error.message, error.hint)
-        return error.exit_code
-    except BrokenPipeError:
-        # the interpreter flushes stdout once more at exit: let that go nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _EXIT_BROKEN_PIPE
-    except KeyboardInterrupt:
-        return _EXIT_INTERRUPTED
-    except Exception as error:  # noqa: BLE001
-        import traceback
+        return code
 
-        traceback.print_exc()
-        _complain(name, f"internal error: {type(error).__name__}: {error}", "please report the lines above")
-        return InternalError.exit_code
-    return code
-
-
-def _joined(words: Sequence[str]) -> list[str]:
-    """Write ``--guess -5,3,...`` as ``--guess=-5,3,...``: argparse takes it for an option else."""
-    joined: list[str] = []
-    for word in words:
-        if joined and joined[-1].startswith("--") and _NEGATIVE_NUMBERS.fullmatch(word):
-            joined[-1] = f"{joined[-1]}={word}"
-        else:
-            joined.append(word)
-    return joined
-
-
-def _complain(name: str, message: str, hint: str) -> None:
-    print(f"{name}: {message}", file=sys.stderr)
-    if hint:
-        print(f"hint: {hint}", file=sys.stderr)
+    return exit_code_of(name, run)

@@ -8,18 +8,13 @@ answers, 70 internal error, 73 an output cannot be written, 75 instance taken, 7
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
-from typing import Final
 
-from shmmap.cli.parser import build_parser, join_negative_values, verb_first
-from shmmap.errors import InternalError, ShmmapError
+from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
+from shmmap.cli.program import exit_code_of, join_negative_values
 
 __all__ = ["main", "serve_main"]
-
-EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
-EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -30,38 +25,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv
         Words after the program's name; those of this process by default.
     """
-    words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv))
-    try:
+    words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv), NUMBER_OPTIONS)
+
+    def run() -> int:
         args = build_parser(words).parse_args(words)
         code: int = args.run(args)
-        sys.stdout.flush()
-    except ShmmapError as error:
-        _complain(error.message, error.hint)
-        return error.exit_code
-    except BrokenPipeError:
-        # the interpreter flushes stdout once more at exit: let that go nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_BROKEN_PIPE
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    except Exception as error:  # noqa: BLE001
-        import traceback
+        return code
 
-        traceback.print_exc()
-        _complain(
-            f"internal error: {type(error).__name__}: {error}",
-            "this is a defect in shmmap: please report it with the lines above",
-        )
-        return InternalError.exit_code
-    return code
+    return exit_code_of("shmmap", run)
 
 
 def serve_main() -> int:
     """Run ``shmmapd``, which is ``shmmap serve``."""
     return main(["serve", *sys.argv[1:]])
-
-
-def _complain(message: str, hint: str) -> None:
-    print(f"shmmap: {message}", file=sys.stderr)
-    if hint:
-        print(f"hint: {hint}", file=sys.stderr)

@@ -13,10 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import shmmap_clients
 
 import shmmap
 
 PACKAGE = Path(shmmap.__file__).parent
+CLIENTS = Path(shmmap_clients.__file__).parent
+TESTS = Path(__file__).parents[1]
 
 LAYERS = {
     # part: what it may import besides itself
@@ -41,14 +44,14 @@ CLIENT_PACKAGES = {"numpy", "zmq", "posix_ipc", "msgspec"}
 HEAVY = {"open3d", "numba", "laspy", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
 
 
-def modules() -> list[str]:
-    return sorted(
-        m.name for m in pkgutil.walk_packages([str(PACKAGE)], "shmmap.") if not m.name.endswith("__main__")
-    )
+def modules(package: Path = PACKAGE) -> list[str]:
+    found = pkgutil.walk_packages([str(package)], f"{package.name}.")
+    return sorted(module.name for module in found if not module.name.endswith("__main__"))
 
 
 def source(module: str) -> Path:
-    path = PACKAGE.parent.joinpath(*module.split("."))
+    package = CLIENTS if module.startswith("shmmap_clients") else PACKAGE
+    path = package.parent.joinpath(*module.split("."))
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
@@ -86,7 +89,28 @@ def test_imports_point_one_way(module: str) -> None:
         assert "testing" not in used, f"{module} may not import shmmap.testing"
 
 
-@pytest.mark.parametrize("module", modules())
+@pytest.mark.parametrize("module", modules(CLIENTS))
+def test_programs_use_public_names_alone(module: str) -> None:
+    """But for their command lines, which answer as shmmap's own."""
+    for node in ast.walk(ast.parse(source(module).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "shmmap":
+            if module == "shmmap_clients.command_line" and (node.module or "").startswith("shmmap.cli."):
+                continue
+            assert node.module == "shmmap", f"{module} imports {node.module}"
+            assert {alias.name for alias in node.names} <= set(shmmap.__all__)
+        elif isinstance(node, ast.Import):
+            assert not any(alias.name.startswith("shmmap.") for alias in node.names)
+
+
+def test_no_test_file_imports_another() -> None:
+    """What two of them need stands in tests/support, or in the fixtures of their directory."""
+    for path in TESTS.rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("tests."):
+                assert not (node.module or "").rsplit(".", 1)[-1].startswith("test_"), path
+
+
+@pytest.mark.parametrize("module", [*modules(), *modules(CLIENTS)])
 def test_all_is_sorted_and_true(module: str) -> None:
     loaded = importlib.import_module(module)
     names = getattr(loaded, "__all__", None)
@@ -99,7 +123,7 @@ def test_all_is_sorted_and_true(module: str) -> None:
 
 
 def test_every_module_starts_with_its_licence() -> None:
-    for path in [*PACKAGE.rglob("*.py"), *Path(__file__).parents[1].rglob("*.py")]:
+    for path in [*PACKAGE.rglob("*.py"), *CLIENTS.rglob("*.py"), *TESTS.rglob("*.py")]:
         if path.stat().st_size:
             assert path.read_text(encoding="utf-8").startswith("# SPDX-License-Identifier: Apache-2.0\n"), (
                 path

@@ -9,7 +9,8 @@ import pytest
 
 from shmmap.cli.entry import main
 from shmmap.cli.options import area_from, numbers, seconds
-from shmmap.cli.parser import build_parser, join_negative_values, verb_first
+from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
+from shmmap.cli.program import join_negative_values
 from shmmap.errors import BadRequest
 from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
 
@@ -22,7 +23,7 @@ CONTRACT += ["top", "tail", "map", "metrics"]
 
 
 def parse(*words: str) -> argparse.Namespace:
-    return build_parser().parse_args(join_negative_values(words))
+    return build_parser().parse_args(join_negative_values(words, NUMBER_OPTIONS))
 
 
 def test_help_lists_exactly_the_verbs_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,9 +63,13 @@ def test_areas_with_negative_numbers(words: list[str], circle: list[float]) -> N
 
 
 def test_negative_numbers_are_joined_only_behind_their_options() -> None:
-    assert join_negative_values(["--id", "-5,3"]) == ["--id", "-5,3"]
-    assert join_negative_values(["--z", "-2,3", "-1"]) == ["--z=-2,3", "-1"]
-    assert join_negative_values(["--circle", "--json"]) == ["--circle", "--json"]
+    for words, joined in (
+        (["--id", "-5,3"], ["--id", "-5,3"]),
+        (["--z", "-2,3", "-1"], ["--z=-2,3", "-1"]),
+        (["--circle", "--json"], ["--circle", "--json"]),
+    ):
+        assert join_negative_values(words, NUMBER_OPTIONS) == joined
+    assert join_negative_values(["--guess", "-5,3", "-1"]) == ["--guess=-5,3", "-1"]
 
 
 @pytest.mark.parametrize(

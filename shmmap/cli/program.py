@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every program of the package does alike: how it complains, and what becomes of its errors."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Callable, Container, Iterable, Sequence
+from typing import Any, Final, NoReturn
+
+from shmmap.errors import InternalError, ShmmapError
+
+__all__ = ["Parser", "exit_code_of", "join_negative_values"]
+
+_EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
+_EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
+_NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that complains as the rest of the program does: what is wrong, then a hint."""
+
+    def __init__(self, **settings: Any) -> None:
+        # an abbreviation that works today would break with tomorrow's options
+        super().__init__(**settings, allow_abbrev=False)
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse, and let each verb refuse what it does not know itself: so the hint names its help."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self._refuse(f"unrecognized arguments: {' '.join(unknown)}", unknown[0].split("=")[0])
+        return found, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            self._refuse(f"there is no {str(action.metavar).lower()} {value!r}", str(value), action.choices)
+        super()._check_value(action, value)
+
+    def _refuse(self, message: str, word: str, known: Iterable[str] | None = None) -> NoReturn:
+        import difflib  # 6 ms, for mistakes alone
+
+        near = difflib.get_close_matches(word, known or self._option_string_actions, n=1)
+        self.error(f"{message}; did you mean {near[0]}?" if near else message)
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message}\nhint: {self.prog} --help", file=sys.stderr)
+        sys.exit(2)
+
+
+def join_negative_values(words: Sequence[str], options: Container[str] | None = None) -> list[str]:
+    """Write ``--circle -5,3,40`` as ``--circle=-5,3,40``, behind these options or else behind all.
+
+    argparse takes a word that starts with a minus for an option unless it is a single number.
+    """
+    joined: list[str] = []
+    for word in words:
+        before = joined[-1] if joined else ""
+        named = before.startswith("--") and "=" not in before
+        takes = before in options if options is not None else named
+        if takes and _NEGATIVE_NUMBERS.fullmatch(word):
+            joined[-1] = f"{before}={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def exit_code_of(name: str, run: Callable[[], int]) -> int:
+    """Run a program to its end; returns its exit code, after telling its errors on stderr."""
+    try:
+        code = run()
+        sys.stdout.flush()
+    except ShmmapError as error:
+        _complain(name, error.message, error.hint)
+        return error.exit_code
+    except BrokenPipeError:
+        # the interpreter flushes stdout once more at exit: let that go nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _EXIT_BROKEN_PIPE
+    except KeyboardInterrupt:
+        return _EXIT_INTERRUPTED
+    except Exception as error:  # noqa: BLE001
+        import traceback
+
+        traceback.print_exc()
+        _complain(
+            name,
+            f"internal error: {type(error).__name__}: {error}",
+            "this is a defect in shmmap: please report it with the lines above",
+        )
+        return InternalError.exit_code
+    return code
+
+
+def _complain(name: str, message: str, hint: str) -> None:
+    print(f"{name}: {message}", file=sys.stderr)
+    if hint:
+        print(f"hint: {hint}", file=sys.stderr)
