@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -104,6 +104,7 @@ class _Run:
         self._settings = settings
         self._progress = progress
         self._files = files
+        self._stack = stack
         self._state = space.state() if settings.resume else None
         if self._state is None:
             space.empty()
@@ -133,13 +134,13 @@ class _Run:
         final = space.directory("map/" + _CELLS)
         if settings.leaf:
             self._buckets = self._bucket_lattice()
-            stage = CellFiles(space.directory("buckets"), self._row, lambda x, y: f"{x}_{y}")
+            stage = self._cell_files(space.directory("buckets"), lambda x, y: f"{x}_{y}")
         elif settings.order != "input" or settings.encoding != "binary":
             self._buckets = self._lattice
-            stage = CellFiles(space.directory("buckets"), self._row, self._name)
+            stage = self._cell_files(space.directory("buckets"), self._name)
         else:
             self._buckets = self._lattice
-            stage = CellFiles(final, self._row, self._name)
+            stage = self._cell_files(final, self._name)
         stream = self._read_into(stage)
         check_unchanged(self._files)
         self._frame.check(stream.extremes)
@@ -162,6 +163,12 @@ class _Run:
         return report
 
     # --- parts ----------------------------------------------------------------------------------
+
+    def _cell_files(self, directory: str, name: Callable[[int, int], str]) -> CellFiles:
+        """Files that are closed however the run ends."""
+        files = CellFiles(directory, self._row, name)
+        self._stack.callback(files.close)
+        return files
 
     def _read_into(self, files: CellFiles) -> Stream:
         settings = self._settings
@@ -210,7 +217,7 @@ class _Run:
             later = settings.order != "input" or settings.encoding != "binary"
             thinned = self._space.directory("thinned") if later else final
             _empty_directory(thinned)
-            cells = CellFiles(thinned, self._row, self._name)
+            cells = self._cell_files(thinned, self._name)
             stage.close()
             voxels = CellLattice.of(settings.leaf, self._settings.origin).moved(*self._frame.origin[:2])
             thin_out(stage, cells, voxels, self._lattice, room, self._progress)

@@ -59,6 +59,17 @@ def test_bad_inputs_leave_nothing(
     assert sorted(os.listdir(tmp_path)) == before
 
 
+@pytest.mark.parametrize("settings", [{}, {"leaf": 0.5}, {"order": "morton"}])
+def test_a_run_that_fails_leaves_no_file_open(tmp_path: Path, settings: dict[str, Any]) -> None:
+    good = cloud_file(tmp_path / "good.pcd", xyzircaedt(20_000, reach=90.0))
+    bad = cloud_file(tmp_path / "bad.pcd", xyzircaedt(20_000, reach=90.0), "ascii")
+    bad.write_bytes(bad.read_bytes()[:-100] + b"x" * 100)
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(MapDataError):
+        divide_quickly([good, bad], tmp_path / "map", **settings)
+    assert len(os.listdir("/proc/self/fd")) == len(before)
+
+
 class RewrittenMeanwhile(NoProgress):
     """Replaces a file by one of as many points when a stage begins."""
 
