@@ -125,13 +125,14 @@ class ElevationGrid:
         (n, m) float32 metres, and (n, m) uint8: `NOTHING`, `MEASURED` or `FILLED`.
         """
         right = self.shape[1] if right is None else right
-        reach = fill_reach(fill_radius / self.resolution)
+        radius = round(fill_radius / self.resolution, 6)  # 0.6 / 0.2 is three columns, not a hair less
+        reach = fill_reach(radius)
         around = self.rows(begin - margin - reach, end + margin + reach, left - reach, right + reach)
         inner = (slice(reach, around.shape[0] - reach), slice(reach, around.shape[1] - reach))
         heights = around[inner]
         kind = np.where(np.isnan(heights), NOTHING, MEASURED).astype(np.uint8)
         if reach:
-            heights = fill_holes(around, fill_radius / self.resolution)[inner]
+            heights = fill_holes(around, radius)[inner]
             # nothing is filled beyond the grid
             row, column = np.arange(begin - margin, end + margin), np.arange(left, right)
             heights[(row < 0) | (row >= self.shape[0])] = np.nan

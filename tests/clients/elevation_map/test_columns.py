@@ -173,6 +173,18 @@ def test_a_plane_goes_on_through_holes(radius: float) -> None:
         assert np.percentile(np.abs(filled - plane)[new], 95) < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("resolution", "radius"), [(0.2, 0.6), (0.1, 0.3), (0.3, 0.9), (0.5, 1.5), (0.7, 2.1)]
+)
+def test_a_radius_of_three_columns_reaches_three_columns(
+    tmp_path: Path, resolution: float, radius: float
+) -> None:
+    grid = ElevationGrid.create(tmp_path / "heights", resolution, (0, 0), (1, 9))
+    grid.put(np.arange(3), np.zeros(3, np.int64), np.ones(3))
+    _, kind = grid.filled(0, 1, radius)
+    assert kind[0].tolist() == [MEASURED] * 3 + [FILLED] * 3 + [NOTHING] * 3
+
+
 def test_blocks_fill_as_the_whole_does(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     heights = rng.normal(700, 1, (50, 30)).astype(np.float32)
