@@ -217,20 +217,9 @@ class Store:
             self._statistics.add("loads_failed")
             self.loads.abandon(load)
             return
-        around = self.layers.neighbours(index, load.key.layer)
-        if len(around) != len(done.neighbours):
-            self.books.requeue(load)  # the map has got or lost a neighbour meanwhile
+        if not self._catch_up(index, load.key.layer, done):
+            self.books.requeue(load)
             return
-        for cell, read in zip((index, *around), (done.stamp, *done.neighbours), strict=True):
-            stamp, known = Stamp(*read), self.catalogue.stamp(cell)
-            if stamp != known:
-                if self._lies_on_disk(cell, known):
-                    self.books.requeue(load)  # it read what a reload has already found replaced
-                    return
-                self._remember({self.catalogue.id(cell)}, ())
-                self.catalogue.set_stamp(cell, stamp)
-                self._chill(cell)
-                self.events.changed(self.catalogue.id(cell), self.catalogue.version(cell))
         version = self.layers.version(index, load.key.layer)
         name = new_segment_name(self._instance)
         try:
@@ -304,6 +293,23 @@ class Store:
     def failed(self, key: Key, failure: Failure, now_s: float) -> None:
         """Hear that a load ended without a segment."""
         self.events.failed(key, failure, now_s)
+
+    def _catch_up(self, index: int, layer: str, done: jobs.Done) -> bool:
+        """Take over the states of the files that a worker has read; False if the map has newer ones."""
+        around = self.layers.neighbours(index, layer)
+        if len(around) != len(done.neighbours):
+            return False  # the map has got or lost a neighbour meanwhile
+        for cell, read in zip((index, *around), (done.stamp, *done.neighbours), strict=True):
+            stamp, known = Stamp(*read), self.catalogue.stamp(cell)
+            if stamp == known:
+                continue
+            if self._lies_on_disk(cell, known):
+                return False  # it read what a reload has already found replaced
+            self._remember({self.catalogue.id(cell)}, ())
+            self.catalogue.set_stamp(cell, stamp)
+            self._chill(cell)
+            self.events.changed(self.catalogue.id(cell), self.catalogue.version(cell))
+        return True
 
     def _lies_on_disk(self, index: int, stamp: Stamp) -> bool:
         try:
