@@ -17,7 +17,7 @@ import numpy as np
 from shmmap.daemon.cell_answers import Answer, CellAnswers
 from shmmap.daemon.difference import difference, warm_difference
 from shmmap.daemon.loading import SPACE_CODES
-from shmmap.daemon.request_limits import admitted_layers, check_count, check_held
+from shmmap.daemon.request_limits import admitted_layers, check_count, check_held, check_queue
 from shmmap.daemon.residency import Key, Resident
 from shmmap.daemon.session_quota import SessionQuota
 from shmmap.daemon.sessions import Session
@@ -151,6 +151,7 @@ class CellRequests:
         self._statistics.add("hits", len(wanted.cells) - len(cold))
         self._quota.check(wanted, cold)
         if cold:
+            check_queue(self._store, wanted.session, cold)
             self._statistics.add("misses", len(cold))
             self._load(wanted, cold, now_s)
             if wait_s and wanted.outstanding and self._patient.has_room(wanted.session):

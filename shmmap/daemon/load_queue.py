@@ -54,6 +54,11 @@ class LoadQueue(Generic[Queued]):
     def __len__(self) -> int:
         return len(self._loads)
 
+    def count(self, asker: Hashable) -> int:
+        """How many loads somebody asked for wait."""
+        mine = self._askers.get(asker)
+        return 0 if mine is None else sum(number in self._loads for number in mine.best)
+
     def push(self, load: Queued, priority: float, asker: Hashable) -> None:
         """Somebody wants this; asked for again, it is never moved back."""
         self._loads[load.number] = load

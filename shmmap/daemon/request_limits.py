@@ -10,16 +10,19 @@ from typing import Final
 
 import msgspec
 
-from shmmap.daemon.sessions import ROUTE_VERTICES
+from shmmap.daemon.residency import Key
+from shmmap.daemon.sessions import ROUTE_VERTICES, Session
 from shmmap.daemon.store import Store
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
 
-__all__ = ["MOST_CELLS", "admitted_layers", "bounded_intent", "check_count", "check_held"]
+__all__ = ["MOST_CELLS", "admitted_layers", "bounded_intent", "check_count", "check_held", "check_queue"]
 
 MOST_CELLS: Final = 20_000
 """Cells, in all layers together, of one request: about half a second of the loop when all are cold."""
+MOST_QUEUED: Final = 20_000
+"""A process of whose loads so many wait may add none; each takes 2 kB of the daemon's memory."""
 MOST_HELD: Final = 100_000
 MOST_LAYERS_HELD: Final = 64
 """Different layers named as held; reading what a layer is called takes some 40 us."""
@@ -61,6 +64,23 @@ def check_held(message: messages.Differential) -> None:
     layers = {layer for cell in message.held if cell.layers is not None for layer in cell.layers}
     if len(layers) > MOST_LAYERS_HELD:
         raise BadRequest(f"{len(layers)} layers held; {MOST_LAYERS_HELD} is the most one request may name")
+
+
+def check_queue(store: Store, session: Session, cold: Sequence[tuple[int, str]]) -> None:
+    """Refuse to queue more loads for a process that waits for very many; ``cold`` is what they are of.
+
+    Raises
+    ------
+    Busy
+        It waits for `MOST_QUEUED` loads, and these are others.
+    """
+    if store.books.queued_of(session.asker) < MOST_QUEUED:
+        return
+    slots, id_of = store.books.slots, store.catalogue.id
+    for index, layer in cold:
+        slot = slots.get(Key(id_of(index), layer))
+        if slot is None or slot.load is None:
+            raise Busy(f"{MOST_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
 def admitted_layers(store: Store, specs: Sequence[str]) -> tuple[str, ...]:

@@ -189,6 +189,10 @@ class Residency:
         """How many loads wait for a worker or for room."""
         return len(self._queue)
 
+    def queued_of(self, asker: Hashable) -> int:
+        """How many of those somebody asked for."""
+        return self._queue.count(asker)
+
     def want(self, key: Key, estimate: int, priority: float, asker: Hashable = None) -> Load:
         """Queue a load, or move a queued one forward; however many ask, there is one load.
 

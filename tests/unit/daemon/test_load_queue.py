@@ -24,6 +24,16 @@ def load(nbytes: int = 1 << 20) -> Load:
     return Load(next(_numbers), nbytes)
 
 
+def test_who_waits_for_how_many() -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    shared, own = load(), load()
+    for one, asker in ((shared, "a"), (shared, "b"), (own, "a"), (own, "a")):
+        queue.push(one, 1.0, asker)
+    assert [queue.count(asker) for asker in "abc"] == [2, 1, 0]
+    queue.discard(shared)
+    assert [queue.count(asker) for asker in "abc"] == [1, 0, 0]
+
+
 def start(queue: LoadQueue[Load]) -> Load | None:
     one = queue.next()
     if one is not None:

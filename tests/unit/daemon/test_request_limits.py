@@ -9,7 +9,7 @@ import pytest
 
 from shmmap.daemon import request_limits as limits
 from shmmap.daemon.sessions import ROUTE_VERTICES
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, Busy
 from shmmap.protocol.messages import Area, Differential, HeldCell, Intent, Selected
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
@@ -41,6 +41,27 @@ def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> Non
             one.cells.differential(one.session(), message, one.now_s())
     one.cells.differential(one.session(), Differential(2, EVERYWHERE, packed=bytes(8 * many)), one.now_s())
     assert len(one.replies) == 1
+
+
+def test_loads_that_one_process_waits_for(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asking again for the same ones is no more of them; others wait for nobody else's."""
+    monkeypatch.setattr(limits, "MOST_QUEUED", 5)
+    one = inner(small_map.root)
+    with one.loaders_standing_still():
+        greedy, other = one.session(), one.session()
+        one.cells.area(greedy, Area(1, EVERYWHERE), one.now_s())
+        assert len(one.cells_of(1).pending) == 16
+        one.cells.area(greedy, Area(2, EVERYWHERE), one.now_s())
+        assert len(one.cells_of(2).pending) == 16
+        with pytest.raises(Busy, match="5 loads"):
+            one.cells.area(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
+        one.cells.area(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
+        assert len(one.cells_of(4).pending) == 16
+    one.run_until(lambda: not one.books.queued)
+    one.cells.area(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0), one.now_s())
+    assert len(one.cells_of(5).cells) == 16
 
 
 def test_layers(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
