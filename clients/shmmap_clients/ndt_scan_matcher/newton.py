@@ -20,7 +20,7 @@ __all__ = ["Ascent", "StepRule", "ascend"]
 # what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
 _SINGULAR: Final = 6 * np.finfo(np.float64).eps
 
-_SAME_WAY: Final = 0.5  # cosine between steps that go the same way; negated: one goes back on the other
+_BACK: Final = 0.5  # negated cosine between steps of which one goes back on the other
 _FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
 
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
@@ -44,7 +44,8 @@ class StepRule:
         The originals may swing between two places until iterations are up: where the score is not concave
         they go back along a step that would lead down, and a step across the peak is answered by the same
         one back.  Here curvatures count by their magnitude (saddle-free Newton, Dauphin 2014), so that every
-        step leads up, and a step that goes back on the one before halves the longest one.
+        step sets out upwards.  Steps may end lower, and so leave small peaks behind, until one goes back on
+        the one before; from then on the longest step is halved instead.
     """
 
     convention: Convention
@@ -77,30 +78,31 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
         Gives an evaluation for a pose vector and a pitch sign.
     rule
     """
-    sign = rule.convention.pitch_sign
     pose = pose_from_matrix(T_guess)
-    longest, before = rule.max_step, np.zeros(6)
-    at = evaluate(pose, sign)
+    at = evaluate(pose, rule.convention.pitch_sign)
     ascent = Ascent(pose, at, [at], [T_guess])
+    longest, before, settling = rule.max_step, np.zeros(6), False
     while True:
         step = _upward_step(at) if rule.steady else _newton_step(at)
-        length = float(np.linalg.norm(step))
-        if length == 0.0 or length != length:
-            ascent.converged = length == 0.0 and at.found > 0
+        wanted = float(np.linalg.norm(step))
+        if wanted == 0.0 or wanted != wanted:
+            ascent.converged = wanted == 0.0 and at.found > 0
             return ascent
-        direction = step / length
-        if rule.steady:
-            cosine = float(direction @ before)
-            if cosine < -_SAME_WAY:
-                longest /= 2
-            elif cosine > _SAME_WAY:
-                longest = min(2 * longest, rule.max_step)
-        length, direction, at = _take_step(ascent, at, length, direction, evaluate, rule, longest)
-        before, step = direction, direction * length
-        ascent.pose = ascent.pose + step
-        ascent.last = at
+        direction = step / wanted
+        if rule.steady and not settling and float(direction @ before) < -_BACK:
+            settling, longest = True, longest / 2
+        length, direction, reached = _take_step(ascent, at, wanted, direction, evaluate, rule, longest)
+        if settling and reached.score < at.score:
+            longest = length / 2
+        else:
+            ascent.pose = ascent.pose + direction * length
+            ascent.last = at = reached
+            before = direction
+            longest = min(2 * longest, rule.max_step)
         ascent.transforms.append(matrix_from_pose(ascent.pose))
-        small = _is_small(ascent.iterations, length, step, rule)
+        # a steady step may be short because it was cut short: that is not yet the peak
+        small = _is_small(ascent.iterations, wanted if rule.steady else length, direction, rule)
+        small = small or (settling and longest < rule.epsilon / 2.0)
         ascent.iterations += 1
         if small or _is_last(ascent.iterations, rule):
             ascent.converged = small
@@ -170,9 +172,10 @@ def _take_step(
     return length, direction, latest
 
 
-def _is_small(iterations_before: int, length: float, step: NDArray[np.float64], rule: StepRule) -> bool:
+def _is_small(iterations_before: int, length: float, direction: NDArray[np.float64], rule: StepRule) -> bool:
     if rule.convention.stop == "squared_translation":
-        return float(step[:3] @ step[:3]) <= rule.epsilon
+        translation = direction[:3] * length
+        return float(translation @ translation) <= rule.epsilon
     if rule.convention.stop == "step_late" and not iterations_before:
         return False
     return abs(length) < rule.epsilon

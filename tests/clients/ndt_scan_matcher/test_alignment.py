@@ -119,6 +119,27 @@ def test_steady_steps_do_not_swing() -> None:
     assert scores[-1] > 0.999
 
 
+@pytest.mark.parametrize("start", [0.13, 0.22])
+def test_steady_steps_do_not_bounce_between_the_sides_of_a_crease(start: float) -> None:
+    # the sides are straight: Newton's step leads far over the crease, along which the peak still lies ahead
+    def evaluate(pose: NDArray[np.float64], _sign: float) -> Evaluation:
+        width, steep = 0.002, 4.0
+        length = float(np.hypot(pose[1], width))
+        gradient, hessian = -pose, -np.eye(6)
+        gradient[1] = -steep * pose[1] / length
+        hessian[1, 1] = -steep * width**2 / length**3
+        value = -steep * length - 0.5 * float(np.delete(pose, 1) @ np.delete(pose, 1))
+        return Evaluation(value, gradient, hessian, 0.0, 1, 1, 0, 0)
+
+    guess = np.eye(4)
+    guess[:2, 3] = 0.8, start
+    rule = StepRule(convention_named("autoware"), 0.01, 0.1, 30, False, steady=True)
+    ascent = ascend(guess, evaluate, rule)
+    assert ascent.converged
+    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=2e-3)
+    assert ascent.last.score == max(at.score for at in ascent.evaluations)
+
+
 def test_the_same_pose_at_large_coordinates(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
     shift = np.array([89570.0, 42300.0, 0.0])
     here = aligned(map_of(points, 2.0), scan)
