@@ -11,9 +11,7 @@ grid, 0.7 for the cells.  PCL's part needs g++ and libpcl-dev.
 from __future__ import annotations
 
 import argparse
-import glob
 import os
-import shutil
 import subprocess
 import tempfile
 import time
@@ -23,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.layers.build import build_layer
+from tests.support.pcl_program import built_pcl_program
 
 CELL_M = 20.0
 
@@ -54,17 +53,10 @@ class Pcl:
     """The C++ program, built on the spot."""
 
     def __init__(self, folder: Path) -> None:
-        headers = sorted(glob.glob("/usr/include/pcl-1.*"))
-        if shutil.which("g++") is None or not headers:
+        source = Path(__file__).with_name("layer_build_pcl.cpp")
+        program = built_pcl_program(source, folder, ("common", "kdtree", "search", "filters"))
+        if program is None:
             raise SystemExit("PCL's part needs g++ and libpcl-dev")
-        program = folder / "layer_build_pcl"
-        # not -march=native: Eigen would align otherwise than in Debian's libraries, and crash
-        command = [
-            "g++", "-O3", "-msse4.2", "-std=c++17", f"-I{headers[-1]}", "-I/usr/include/eigen3",
-            str(Path(__file__).with_name("layer_build_pcl.cpp")), "-o", str(program),
-            "-lpcl_common", "-lpcl_kdtree", "-lpcl_search", "-lpcl_filters", "-lboost_system",
-        ]  # fmt: skip
-        subprocess.run(command, check=True)
         self.process = subprocess.Popen(
             [str(program)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
         )

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tests.support.pcl_program import built_pcl_program
 
 __all__ = ["PclAlignment", "PclEvaluation", "PclNdt", "build_pcl_ndt"]
 
@@ -40,15 +41,8 @@ class PclAlignment:
 
 def build_pcl_ndt(folder: Path, *, optimize: str = "-O3") -> Path | None:
     """Compile the program; None where it cannot be."""
-    headers = sorted(Path("/usr/include").glob("pcl-*"))
-    if shutil.which("g++") is None or not headers:
-        return None
-    program = folder / "pcl_ndt"
-    # not -march=native: Eigen would align otherwise than in Debian's libraries, and crash
-    command = ["g++", optimize, "-msse4.2", "-std=c++17", f"-I{headers[-1]}", "-I/usr/include/eigen3"]
-    source = str(Path(__file__).with_name("pcl_ndt.cpp"))
-    subprocess.run([*command, source, "-o", program, *(f"-lpcl_{name}" for name in _LIBRARIES)], check=True)
-    return program
+    source = Path(__file__).with_name("pcl_ndt.cpp")
+    return built_pcl_program(source, folder, _LIBRARIES, optimize=optimize)
 
 
 class PclNdt:
