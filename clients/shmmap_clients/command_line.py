@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
+import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from shmmap.cli.options import seconds
 from shmmap.cli.output import print_json
 from shmmap.cli.program import Parser, exit_code_of, join_negative_values
+from shmmap.formats.durable_file import writing_errors
 
 if TYPE_CHECKING:
     from shmmap import Client
@@ -19,11 +25,17 @@ __all__ = [
     "add_daemon_options",
     "add_json_option",
     "add_scan_option",
+    "at_least",
     "connect",
     "numbers",
+    "output_file",
+    "positive",
     "print_json",
     "run_command",
     "run_program",
+    "seconds",
+    "write_text",
+    "writing_errors",
 ]
 
 
@@ -47,6 +59,52 @@ def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
         return values
 
     return parse
+
+
+def at_least(lowest: int) -> Callable[[str], int]:
+    """Return an argparse type: a whole number, not below ``lowest``."""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch(r"[+-]?\d{1,18}", text) or int(text) < lowest:
+            raise argparse.ArgumentTypeError(f"expected a whole number, {lowest} or more, not {text!r}")
+        return int(text)
+
+    return parse
+
+
+def positive(text: str) -> float:
+    """Read a positive and finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
+    return value
+
+
+def output_file(text: str) -> Path:
+    """Read the name of a file to write, and find out before the work begins that it can be.
+
+    Raises
+    ------
+    CannotWrite
+        There is no such directory, or it or the file may not be written to.
+    """
+    path = Path(text)
+    with writing_errors(text):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), text)
+        os.stat(os.path.join(path.parent, "."))  # a directory, and there
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), text)
+    return path
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file; what keeps it from being written is `CannotWrite`."""
+    with writing_errors(str(path)):
+        path.write_text(text, encoding="utf-8")
 
 
 def add_daemon_options(parser: argparse.ArgumentParser) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import write_pcd
+from shmmap.formats.durable_file import writing_errors
 from shmmap_clients.compare_map_filter.drive import ComparedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
@@ -46,10 +47,16 @@ class PcdDirectory:
         Made if missing; files of the same name are replaced.
     mask
         All points and a column ``kept``, instead of the kept ones and a column ``index``.
+
+    Raises
+    ------
+    CannotWrite
+        The directory cannot be made; later, a file cannot be written.
     """
 
     def __init__(self, directory: Path, *, mask: bool) -> None:
-        directory.mkdir(parents=True, exist_ok=True)
+        with writing_errors(str(directory)):
+            directory.mkdir(parents=True, exist_ok=True)
         self._directory = directory
         self._mask = mask
 
@@ -60,7 +67,8 @@ class PcdDirectory:
         x, y, z, w = quaternion_of(T[:3, :3])
         viewpoint = (*T[:3, 3].tolist(), w, x, y, z)
         path = self._directory / f"{Path(compared.scan.name).name}.pcd"
-        write_pcd(path, _columns(compared, self._mask), viewpoint=viewpoint)
+        with writing_errors(str(path)):
+            write_pcd(path, _columns(compared, self._mask), viewpoint=viewpoint)
 
     def close(self) -> None:
         """Nothing to do: every file is complete."""

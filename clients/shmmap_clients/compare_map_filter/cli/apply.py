@@ -6,7 +6,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from shmmap_clients.command_line import add_json_option, add_scan_option, numbers, print_json
+from shmmap_clients.command_line import (
+    add_json_option,
+    add_scan_option,
+    numbers,
+    output_file,
+    print_json,
+    write_text,
+)
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
 
 __all__ = ["add_parser", "run"]
@@ -33,7 +40,9 @@ def add_parser(subparsers: Any) -> None:
     add_rule_options(parser)
     parser.add_argument("--out", metavar="DIR", help="write SCAN.pcd there")
     parser.add_argument("--mask", action="store_true", help="write all points, with a column kept")
-    parser.add_argument("--picture", metavar="FILE", help="write an SVG of kept and removed points")
+    parser.add_argument(
+        "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
+    )
     add_json_option(parser)
     parser.set_defaults(run=run)
 
@@ -64,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         view = TopView()
         view.add(to_map(scan.xyz, T), comparison.kept, (float(T[0, 3]), float(T[1, 3])))
         note = f"{len(scan.xyz)} points, {kept} kept; {args.mode}, {args.distance:g} m"
-        Path(args.picture).write_text(view.svg(scan.name, note), encoding="utf-8")
+        write_text(args.picture, view.svg(scan.name, note))
     if args.json:
         milliseconds = comparison.compare_s * 1e3
         print_json({"points": len(scan.xyz), "kept": kept, "compare_ms": milliseconds})

@@ -7,7 +7,15 @@ import argparse
 import sys
 from typing import Any
 
-from shmmap_clients.command_line import add_daemon_options, add_json_option, connect, print_json
+from shmmap_clients.command_line import (
+    add_daemon_options,
+    add_json_option,
+    connect,
+    output_file,
+    print_json,
+    seconds,
+    write_text,
+)
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
 
 __all__ = ["add_parser", "run"]
@@ -37,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
     window.add_argument("--radius", type=float, default=150.0, metavar="M", help="default 150")
     window.add_argument("--update-distance", type=float, default=10.0, metavar="M", help="default 10")
     window.add_argument(
-        "--wait", type=float, metavar="SECONDS",
+        "--wait", type=seconds, metavar="SECONDS",
         help="how long a scan may wait for cells (default: 30 for a directory, not at all for a publisher)",
     )  # fmt: skip
     output = parser.add_argument_group("output")
@@ -45,7 +53,9 @@ def add_parser(subparsers: Any) -> None:
     output.add_argument(
         "--mask", action="store_true", help="all points with a column kept, not the kept ones"
     )
-    output.add_argument("--picture", metavar="FILE", help="an SVG of kept and removed points")
+    output.add_argument(
+        "--picture", type=output_file, metavar="FILE", help="an SVG of kept and removed points"
+    )
     output.add_argument("--quiet", action="store_true", help="no line for each scan on stderr")
     add_json_option(output)
     add_daemon_options(parser)
@@ -55,7 +65,6 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Follow the scans to their end."""
     from contextlib import ExitStack
-    from pathlib import Path
 
     from shmmap import MapWindow
     from shmmap_clients.compare_map_filter.drive import compare_drive
@@ -98,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
             f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;"
             f" {args.mode}, {args.distance:g} m"
         )
-        Path(args.picture).write_text(view.svg("shmmap-compare", note), encoding="utf-8")
+        write_text(args.picture, view.svg("shmmap-compare", note))
     if args.json:
         print_json(summary)
     else:

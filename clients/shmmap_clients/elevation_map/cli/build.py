@@ -10,7 +10,16 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import add_daemon_options, add_json_option, connect, print_json
+from shmmap_clients.command_line import (
+    add_daemon_options,
+    add_json_option,
+    at_least,
+    connect,
+    output_file,
+    print_json,
+    seconds,
+    writing_errors,
+)
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress
@@ -33,9 +42,12 @@ def add_parser(subparsers: Any) -> None:
         " their cell, failed (cells that could not be had), files.  Exit code: 0, or 1 where cells failed.",
     )
     parser.add_argument(
-        "--out", action="append", default=[], metavar="FILE", help=".npz, .tif or .png; may be given again"
+        "--out", action="append", default=[], type=output_file, metavar="FILE",
+        help=".npz, .tif or .png; may be given again",
+    )  # fmt: skip
+    parser.add_argument(
+        "--hillshade", type=output_file, metavar="FILE", help="a shaded picture (PNG) and its world file"
     )
-    parser.add_argument("--hillshade", metavar="FILE", help="a shaded picture (PNG) and its world file")
     rule = parser.add_argument_group("heights")
     rule.add_argument(
         "--rule", choices=("surface", "min", "mean", "max"), default="surface",
@@ -48,9 +60,9 @@ def add_parser(subparsers: Any) -> None:
     rule.add_argument(
         "--fill-radius", type=float, default=1.0, metavar="M", help="fill holes this near to heights (1.0)"
     )
-    parser.add_argument("--epsg", type=int, metavar="CODE", help="coordinate system of a GeoTIFF")
+    parser.add_argument("--epsg", type=at_least(1), metavar="CODE", help="coordinate system of a GeoTIFF")
     parser.add_argument("--cache", metavar="DIR", help="default: $XDG_CACHE_HOME/shmmap/elevation")
-    parser.add_argument("--wait", type=float, default=60.0, metavar="SECONDS", help="for one cell (60)")
+    parser.add_argument("--wait", type=seconds, default=60.0, metavar="SECONDS", help="for one cell (60)")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json_option(parser)
     add_daemon_options(parser)
@@ -68,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.elevation_map.rule import ElevationRule
 
     rule = ElevationRule(args.rule, args.resolution, args.tolerance, args.height_range, args.min_points)
-    files = [Path(name) for name in args.out]
+    files: list[Path] = args.out
     for path in files:
         if path.suffix.lower() not in SUFFIXES:
             raise BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
@@ -78,9 +90,10 @@ def run(args: argparse.Namespace) -> int:
         with connect(args, "shmmap-elevation") as client:
             for attempt in range(_ATTEMPTS):
                 try:
-                    built = build_elevation_map(
-                        client, rule, _cache(args.cache), wait_s=args.wait, progress=progress
-                    )
+                    with writing_errors("the cache of elevation maps"):
+                        built = build_elevation_map(
+                            client, rule, _cache(args.cache), wait_s=args.wait, progress=progress
+                        )
                     break
                 except MapChanged:
                     if attempt == _ATTEMPTS - 1:
@@ -93,13 +106,16 @@ def run(args: argparse.Namespace) -> int:
         }
         for path in files:
             progress.say(f"writing {path}")
-            write_elevation(path, grid, args.fill_radius, document, epsg=args.epsg)
+            with writing_errors(str(path)):
+                write_elevation(path, grid, args.fill_radius, document, epsg=args.epsg)
         if args.hillshade:
             progress.say(f"writing {args.hillshade}")
-            write_hillshade(Path(args.hillshade), grid, args.fill_radius)
+            with writing_errors(str(args.hillshade)):
+                write_hillshade(args.hillshade, grid, args.fill_radius)
         counts = np.zeros(3, np.int64)
         for _, _, kind in grid.blocks(args.fill_radius):
             counts += np.bincount(kind.ravel(), minlength=3)
+    written = [*files, *([args.hillshade] if args.hillshade else [])]
     summary = {
         "map_version": document["map_version"],
         "cells": built.cells,
@@ -114,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
         "failed": [
             {"id": error.cell_id, "code": error.code, "message": str(error)} for error in built.failed
         ],
-        "files": [str(path) for path in files] + ([args.hillshade] if args.hillshade else []),
+        "files": [str(path) for path in written],
     }
     if args.json:
         print_json(summary)
@@ -123,6 +139,7 @@ def run(args: argparse.Namespace) -> int:
             f"{built.cells} cells, {built.loaded} loaded: {grid.shape[1]} x {grid.shape[0]} columns of"
             f" {grid.resolution:g} m, {counts[MEASURED]} measured, {counts[FILLED]} filled"
         )
+        print(f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out")
         for error in built.failed:
             print(f"missing: {error}", file=sys.stderr)
     return 1 if built.failed else 0

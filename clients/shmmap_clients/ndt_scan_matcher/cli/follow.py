@@ -6,10 +6,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import add_daemon_options, add_json_option, connect, numbers, print_json
+from shmmap_clients.command_line import (
+    add_daemon_options,
+    add_json_option,
+    at_least,
+    connect,
+    numbers,
+    output_file,
+    positive,
+    print_json,
+    seconds,
+    write_text,
+    writing_errors,
+)
 from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, matcher_from
 
 if TYPE_CHECKING:
@@ -43,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--odometry", metavar="FILE|ENDPOINT", help="TUM file, or poses over ZeroMQ")
     parser.add_argument(
         "--odometry-wait",
-        type=float,
+        type=seconds,
         default=0.0,
         metavar="S",
         help="how long a scan may wait until an endpoint's odometry has reached its time (default: not at"
@@ -52,9 +63,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m; 0: all)"
     )
-    parser.add_argument("--frames", type=int, metavar="N", help="stop after so many scans")
+    parser.add_argument("--frames", type=at_least(1), metavar="N", help="stop after so many scans")
     parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="hold scans of a directory back to this rate"
+        "--rate", type=positive, metavar="HZ", help="hold scans of a directory back to this rate"
     )
     window = parser.add_argument_group("map window, as in Autoware")
     window.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
@@ -63,16 +74,18 @@ def add_parser(subparsers: Any) -> None:
     window.add_argument("--lidar-radius", type=float, default=100.0, metavar="M", help="default 100")
     add_alignment_options(parser)
     out = parser.add_argument_group("output")
-    out.add_argument("--tum", metavar="FILE", help="write poses in the TUM format")
+    out.add_argument("--tum", type=output_file, metavar="FILE", help="write poses in the TUM format")
     out.add_argument("--publish", metavar="ENDPOINT", help="bind a ZeroMQ publisher of poses")
     out.add_argument(
         "--listener-wait",
-        type=float,
+        type=seconds,
         default=0.0,
         metavar="S",
         help="how long to wait for the first subscriber, which then gets every pose (default: not at all)",
     )
-    out.add_argument("--plot", metavar="FILE", help="write an SVG of way, errors and latency")
+    out.add_argument(
+        "--plot", type=output_file, metavar="FILE", help="write an SVG of way, errors and latency"
+    )
     add_json_option(out)
     add_daemon_options(parser)
     parser.set_defaults(run=run)
@@ -131,7 +144,10 @@ def run(args: argparse.Namespace) -> int:
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(MapUpdater(client, rules, prepare=matcher.prepare))
         follower = Follower(matcher, maps, prediction, thin=args.thin or None)
-        tum = stack.enter_context(open(args.tum, "w", encoding="utf-8")) if args.tum else None
+        tum = None
+        if args.tum:
+            stack.enter_context(writing_errors(str(args.tum)))
+            tum = stack.enter_context(open(args.tum, "w", encoding="utf-8"))
         told = 0
         scan = first
         while scan is not None and (args.frames is None or len(frames) < args.frames):
@@ -152,7 +168,7 @@ def run(args: argparse.Namespace) -> int:
     if sys.stderr.isatty():
         print(file=sys.stderr)
     if args.plot:
-        Path(args.plot).write_text(drive_svg(frames), encoding="utf-8")
+        write_text(args.plot, drive_svg(frames))
     if args.json:
         print_json(summary.as_document())
     else:

@@ -10,6 +10,7 @@ from shmmap_clients.command_line import (
     add_daemon_options,
     add_json_option,
     add_scan_option,
+    at_least,
     connect,
     numbers,
     print_json,
@@ -51,7 +52,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--map-radius", type=float, default=150.0, metavar="M", help="default 150")
     parser.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
     parser.add_argument("--candidates", type=int, default=200, metavar="N", help="poses scored (default 200)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the search (default 0)")
+    parser.add_argument("--seed", type=at_least(0), default=0, metavar="N", help="of the search (default 0)")
     parser.add_argument(
         "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m)"
     )
