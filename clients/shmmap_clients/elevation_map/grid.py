@@ -12,12 +12,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap import BadRequest
 from shmmap_clients.elevation_map.holes import fill_holes, fill_reach
 
 __all__ = ["FILLED", "MEASURED", "NOTHING", "ElevationGrid"]
 
 NOTHING, MEASURED, FILLED = range(3)
 _NAN_BITS: Final = np.float32(np.nan).view(np.uint32)
+_LONGEST_SIDE: Final = 1 << 20  # columns: 100 km of 0.1 m
 _BLOCK_BYTES: Final = 1 << 18
 
 
@@ -49,7 +51,18 @@ class ElevationGrid:
     def create(
         cls, path: Path, resolution: float, first: tuple[int, int], shape: tuple[int, int]
     ) -> ElevationGrid:
-        """Make the file, without any height; it takes no room on the disk yet."""
+        """Make the file, without any height; it takes no room on the disk yet.
+
+        Raises
+        ------
+        BadRequest
+            The grid is so large that something must be wrong.
+        """
+        if max(shape) > _LONGEST_SIDE:
+            raise BadRequest(
+                f"an elevation map of {shape[1]} x {shape[0]} columns of {resolution:g} m is too large",
+                hint="use a coarser resolution; or cells of the map lie far from the others",
+            )
         with open(path, "wb") as file:
             file.truncate(4 * shape[0] * shape[1])
         return cls(path, resolution, first, shape)

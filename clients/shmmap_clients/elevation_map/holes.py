@@ -15,17 +15,27 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
+from shmmap import BadRequest
 from shmmap_clients.compiling import compiled, read_only
 
 __all__ = ["fill_holes", "fill_reach"]
 
 _FIT_MORE: Final = 2.0  # columns: behind the rim of a hole, so that there is a plane and not a line
+_FARTHEST: Final = 100.0  # columns: the time goes with the square
 _LEAST: Final = 3  # heights: fewer are too lonely to say anything of their surroundings
 _FLAT: Final = 1e-6  # relative determinant below which a plane is not determined
 
 
 def fill_reach(radius: float) -> int:
-    """How many columns away heights are looked at when filling within ``radius`` columns."""
+    """How many columns away heights are looked at when filling within ``radius`` columns.
+
+    Raises
+    ------
+    BadRequest
+        The radius is negative, or so large that filling would not end.
+    """
+    if not 0 <= radius <= _FARTHEST:
+        raise BadRequest(f"holes are filled within 0 to {_FARTHEST:g} columns, not {radius:g}")
     return int(radius + _FIT_MORE) if radius >= 1 else 0
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import math
 import secrets
@@ -20,11 +21,34 @@ from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.hillshade import hillshade
 from shmmap_clients.png import PngWriter
 
-__all__ = ["SUFFIXES", "write_elevation", "write_hillshade"]
+__all__ = ["check_output", "write_elevation", "write_hillshade"]
 
-SUFFIXES: Final = (".npz", ".tif", ".tiff", ".png")
+_GEOTIFF: Final = (".tif", ".tiff")
+_SUFFIXES: Final = (".npz", ".png", *_GEOTIFF)
+_USER_DEFINED: Final = 32767  # GeoTIFF 1.1: the highest code, a system of the user's own
 _TILE: Final = 256
 _FINEST_STEP: Final = 0.001  # metres: a PNG has no finer steps
+
+
+def check_output(path: Path, epsg: int | None = None) -> None:
+    """Find out before the work begins whether a file can be written as its suffix says.
+
+    Raises
+    ------
+    BadRequest
+        The suffix is unknown; or it is a GeoTIFF's, and the package for these is not installed, or there is
+        no such coordinate system.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise BadRequest(f"{path.name}: elevation is written as {', '.join(_SUFFIXES)}")
+    if suffix in _GEOTIFF:
+        if importlib.util.find_spec("tifffile") is None:
+            raise BadRequest(
+                "GeoTIFF needs the package tifffile", hint="pip install 'shmmap[geotiff]', or write .npz"
+            )
+        if epsg is not None and not 1024 <= epsg <= _USER_DEFINED:
+            raise BadRequest(f"EPSG codes of GeoTIFF are 1024 to {_USER_DEFINED}, not {epsg}")
 
 
 def write_elevation(
@@ -50,18 +74,17 @@ def write_elevation(
     Raises
     ------
     BadRequest
-        The suffix is unknown, or the package for GeoTIFF is not installed.
+        As `check_output`.
     """
+    check_output(path, epsg)
     suffix = path.suffix.lower()
     if suffix == ".npz":
         with _replacing(path) as file:
             _npz(file, grid, fill_radius, document)
-    elif suffix in (".tif", ".tiff"):
+    elif suffix in _GEOTIFF:
         _geotiff(path, grid, fill_radius, document, epsg)
-    elif suffix == ".png":
-        _png(path, grid, fill_radius, document)
     else:
-        raise BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
+        _png(path, grid, fill_radius, document)
 
 
 def write_hillshade(path: Path, grid: ElevationGrid, fill_radius: float) -> None:
@@ -112,16 +135,12 @@ def _npz(file: IO[bytes], grid: ElevationGrid, fill_radius: float, document: dic
 def _geotiff(
     path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str, Any], epsg: int | None
 ) -> None:
-    try:
-        import tifffile
-    except ImportError:
-        raise BadRequest(
-            "GeoTIFF needs the package tifffile", hint="pip install 'shmmap[geotiff]', or write .npz"
-        ) from None
+    import tifffile
+
     west, south = grid.origin
     north = south + grid.shape[0] * grid.resolution
-    # GeoTIFF 1.1 (OGC 19-008r4): projected, pixels are areas; 32767: a system of the user's own
-    keys = [1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, epsg if epsg is not None else 32767]
+    # GeoTIFF 1.1 (OGC 19-008r4): projected, pixels are areas
+    keys = [1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, epsg or _USER_DEFINED]
     tags = [
         (33550, "d", 3, (grid.resolution, grid.resolution, 0.0), True),
         (33922, "d", 6, (0.0, 0.0, 0.0, west, north, 0.0), True),

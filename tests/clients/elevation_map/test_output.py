@@ -118,11 +118,15 @@ def test_a_larger_grid_takes_no_more_memory(tmp_path: Path, suffix: str) -> None
     assert peak_bytes(2000) < 1.5 * peak_bytes(600) < 10e6
 
 
-def test_an_empty_grid_and_unknown_suffixes(tmp_path: Path) -> None:
+def test_an_empty_grid_and_what_cannot_be_written(tmp_path: Path) -> None:
     grid = ElevationGrid.create(tmp_path / "grid", 1.0, (0, 0), (3, 4))
     for name in ("e.npz", "e.png"):
         write_elevation(tmp_path / name, grid, 1.0, DOCUMENT)
     with np.load(tmp_path / "e.npz") as read:
         assert np.isnan(read["height"]).all()
+    for name, epsg, radius in (("e.xyz", None, 1.0), ("e.tif", 99999, 1.0), ("e.png", None, 1e9)):
+        with pytest.raises(BadRequest):
+            write_elevation(tmp_path / name, grid, radius, DOCUMENT, epsg=epsg)
     with pytest.raises(BadRequest):
-        write_elevation(tmp_path / "e.xyz", grid, 1.0, DOCUMENT)
+        ElevationGrid.create(tmp_path / "endless", 1e-6, (0, 0), (3, 20_000_000))
+    assert [path.name for path in tmp_path.glob("*.tmp")] == []

@@ -76,16 +76,17 @@ def run(args: argparse.Namespace) -> int:
     from shmmap import BadRequest
     from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
     from shmmap_clients.elevation_map.grid import FILLED, MEASURED
-    from shmmap_clients.elevation_map.output import SUFFIXES, write_elevation, write_hillshade
+    from shmmap_clients.elevation_map.holes import fill_reach
+    from shmmap_clients.elevation_map.output import check_output, write_elevation, write_hillshade
     from shmmap_clients.elevation_map.rule import ElevationRule
 
     rule = ElevationRule(args.rule, args.resolution, args.tolerance, args.height_range, args.min_points)
     files: list[Path] = args.out
     for path in files:
-        if path.suffix.lower() not in SUFFIXES:
-            raise BadRequest(f"{path.name}: elevation is written as {', '.join(SUFFIXES)}")
-    if not args.fill_radius >= 0:
-        raise BadRequest(f"--fill-radius must not be negative, it is {args.fill_radius}")
+        check_output(path, args.epsg)
+    if args.hillshade and Path(args.hillshade).suffix.lower() != ".png":
+        raise BadRequest(f"{args.hillshade}: a hillshade is written as .png")
+    fill_reach(args.fill_radius / rule.resolution)
     with _ProgressLine(quiet=args.quiet) as progress:
         with connect(args, "shmmap-elevation") as client:
             for attempt in range(_ATTEMPTS):
