@@ -8,6 +8,7 @@ is the correctly rounded float64, rounded once more.
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Callable, Iterator
 from decimal import Decimal, InvalidOperation
 from typing import Any, Final
@@ -232,6 +233,9 @@ def _parse_fast(
 ) -> NDArray[Any] | None:
     """Parse all words by one built-in function, or return None if one of them is unusual."""
     try:
+        if dtype.kind == "u":
+            # numpy before 2 takes -1 for 2**64 - 1; an array refuses it
+            return np.asarray(array("Q", map(convert, words)))
         return np.fromiter(map(convert, words), dtype, len(words))
     except (ValueError, OverflowError):
         return None
