@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -78,14 +77,15 @@ def _load(path: str, suffix: str) -> dict[str, NDArray[Any]]:
             f"Open3D cannot be loaded to read {path}: {error}",
             hint="it needs the system packages libegl1 libgl1 libx11-6 libusb-1.0-0",
         ) from error
+    encoded = os.fsencode(path)  # Open3D 0.18 takes no Path, and a str only where it is UTF-8
     try:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            tensors = o3d.t.io.read_point_cloud(Path(path)).point
+            tensors = o3d.t.io.read_point_cloud(encoded).point
             given = sorted(set(tensors) - {_POSITIONS})
             names = column_names(_NAMES.get(name, name) for name in given)
             columns = {name: np.array(tensors[one].numpy()) for name, one in zip(names, given, strict=True)}
             if suffix != ".ply":  # the tensor reader rounds text to float32
-                columns["xyz"] = np.array(o3d.io.read_point_cloud(Path(path)).points)
+                columns["xyz"] = np.array(o3d.io.read_point_cloud(encoded).points)
             elif _POSITIONS in tensors:
                 columns["xyz"] = np.array(tensors[_POSITIONS].numpy())
     except RuntimeError as error:

@@ -98,6 +98,7 @@ def test_reading_a_pcd_loads_no_open3d() -> None:
             ["xyz", "colors"],
         ),
         ("a.pts", b"3\n" + TEXT.encode(), ["xyz", "intensity"]),
+        ("\udcff.pts", b"3\n" + TEXT.encode(), ["xyz", "intensity"]),  # a name that is not UTF-8
     ],
 )
 def test_formats_of_open3d(tmp_path: Path, name: str, data: bytes, columns: list[str]) -> None:
