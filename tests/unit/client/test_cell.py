@@ -157,10 +157,17 @@ def test_open3d_over_the_same_memory(segments: Segments) -> None:
 
 def test_torch_over_the_same_memory(segments: Segments) -> None:
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    cell = segments.cell("/map/a.pcd", {"xyz": XYZ, "intensity": COLUMNS["intensity"]})
+    cell = segments.cell("/map/a.pcd", COLUMNS)
     tensors = cell.to_torch()
-    assert tensors["xyz"].data_ptr() == cell.xyz.ctypes.data
-    assert torch.equal(tensors["xyz"].clone(), torch.tensor(XYZ))
+    assert {name: tensor.data_ptr() for name, tensor in tensors.items()} == {
+        name: view.ctypes.data for name, view in cell.columns.items()
+    }
+    del cell
+    assert mappings_under(segments.path) == 1, "the tensors keep the mapping"
+    for name, values in COLUMNS.items():
+        assert tensors[name].numpy().dtype == values.dtype
+        np.testing.assert_array_equal(tensors[name].numpy(), values)
+    assert torch.equal(tensors["xyz"].sum(dim=0), torch.tensor(XYZ).sum(dim=0))
 
 
 def test_writing_past_numpy_ends_the_process_and_harms_nobody(segments: Segments) -> None:
