@@ -15,6 +15,7 @@ import numpy as np
 
 from shmmap.errors import ShmmapError
 from shmmap.formats.cloud import read_cloud
+from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.layers.build import build_layer
 from shmmap.layers.registry import kinds
 
@@ -39,14 +40,11 @@ def main(arguments: list[str] | None = None) -> int:
         columns: dict[str, Any] = dict(table.columns)
         if table.lattice is not None:
             columns |= {f"lattice_{key}": np.array(v) for key, v in table.lattice._asdict().items()}
-        with open(args.out, "wb") as file:
+        with writing_errors(args.out), appearing_file(args.out) as file:
             np.savez(file, **columns)
     except ShmmapError as error:
         sys.stderr.write(f"{parser.prog}: {error}\n")
         return error.exit_code
-    except OSError as error:
-        sys.stderr.write(f"{parser.prog}: {args.out}: {error.strerror}\n")
-        return 73
     return 0
 
 

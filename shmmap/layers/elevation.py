@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ``elevation`` layer: heights of each column of a ground grid.
 
-Each table is (ny, nx): the column of a point (x, y) is ``[j - j0, i - i0]`` with ``i = floor(x /
-resolution)``, ``j`` likewise, and ``(i0, j0)`` the header's ``lattice_first``.
+Each table is (ny, nx): the column of a point (x, y) is ``[j - j0, i - i0]`` with ``i = floor(x * (1 /
+resolution))``, ``j`` likewise (in the points' own precision, see `shmmap.layers.lattice_kernels`), and
+``(i0, j0)`` the header's ``lattice_first``.
 """
 
 from __future__ import annotations

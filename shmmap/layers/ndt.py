@@ -3,7 +3,8 @@
 
 Rows are the voxels of at least ``min_points`` points, x fastest, then y, then z.  ``table`` finds a
 voxel's row without a tree: a point at ``(x, y, z)`` is in row ``table[k - k0, j - j0, i - i0]`` with
-``i = floor(x / leaf)`` and so on, and ``(i0, j0, k0)`` the header's ``lattice_first``; -1: no row.
+``i = floor(x * (1 / leaf))`` and so on (in the points' own precision, see `shmmap.layers.lattice_kernels`),
+and ``(i0, j0, k0)`` the header's ``lattice_first``; -1: no row.
 """
 
 from __future__ import annotations

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pytest
@@ -33,6 +36,23 @@ def test_a_layer_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["points", str(tmp_path / "missing.pcd"), str(out)]) == 65
     assert main(["points", str(tmp_path / "cloud.pcd"), str(tmp_path / "no" / "out.npz")]) == 73
     assert "unknown layer" in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_pcd(tmp_path / "cloud.pcd", random_points(np.random.default_rng(1), (0, 0), 50))
+    (tmp_path / "out.npz").write_bytes(b"an older one")
+
+    def full(file: IO[bytes], **columns: object) -> None:
+        file.write(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "savez", full)
+    assert main(["points", str(tmp_path / "cloud.pcd"), str(tmp_path / "out.npz")]) == 73
+    assert "No space left" in capsys.readouterr().err
+    assert (tmp_path / "out.npz").read_bytes() == b"an older one"
+    assert sorted(os.listdir(tmp_path)) == ["cloud.pcd", "out.npz"]
 
 
 def test_the_document_tells_every_kind_and_column() -> None:
