@@ -30,7 +30,7 @@ __all__ = ["Block", "PcdReader"]
 Block = tuple[NDArray[Any], ...]
 
 _FIRST_READ_BYTES: Final = 2048  # holds nearly every header
-_DATA_LINE: Final = re.compile(rb"^[ \t]*DATA[^\n]*\n", re.MULTILINE | re.IGNORECASE)
+_DATA_LINE: Final = re.compile(rb"^[ \t]*DATA(?=\s)[^\n]*\n", re.MULTILINE | re.IGNORECASE)
 _TAIL_READ_BYTES: Final = 1 << 18
 
 

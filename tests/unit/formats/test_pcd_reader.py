@@ -301,6 +301,15 @@ def test_truncation_at_every_byte(tmp_path: Path, encoding: str) -> None:
             assert error.offset is None or 0 <= error.offset <= size
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("line", [b"# DATA follows\n", b"DATABASE survey 7\n", b"DATA_SOURCE a drive\n"])
+def test_a_header_longer_than_the_first_read(tmp_path: Path, encoding: str, line: bytes) -> None:
+    for comment_bytes in (0, 1900, 2048, 2100, 60_000):
+        more = line + b"#" * comment_bytes + b"\nFIELDS"
+        found = read(tmp_path, pcd(XYZ, encoding).replace(b"FIELDS", more, 1))
+        assert found.reader.kept == 3
+
+
 @pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
 def test_trailing_bytes_are_reported(tmp_path: Path, encoding: str) -> None:
     found = read(tmp_path, pcd(XYZ, encoding) + b"extra")
