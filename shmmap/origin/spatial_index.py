@@ -90,7 +90,7 @@ class SpatialIndex:
         # column-major: the exact test reads one coordinate of many cells at a time
         self.boxes: Floats = np.asfortranarray(boxes)
         self._grids: list[_Grid] = []
-        if len(boxes) > _LINEAR_CELLS:
+        if len(boxes) > _LINEAR_CELLS and _has_extent(boxes):
             extent = np.maximum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
             level = np.frexp(extent)[1]
             for exponent in np.unique(level):
@@ -114,6 +114,12 @@ class SpatialIndex:
         hit = candidates[_touched(area, self.boxes.T.take(candidates, axis=1).T)]
         hit.sort()
         return hit
+
+
+def _has_extent(boxes: Floats) -> bool:
+    """Whether a number says how far the outermost corners are apart: no grid spans more."""
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)).all())
 
 
 def _touched(area: Area, boxes: Floats) -> NDArray[np.bool_]:

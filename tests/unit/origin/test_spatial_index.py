@@ -165,6 +165,17 @@ def test_cells_scattered_further_than_keys_can_count() -> None:
         assert index.query(Circle(x, y, 0.5)).tolist() == [i]
 
 
+def test_corners_further_apart_than_any_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two such cells cost the others their grid, and no query its answer."""
+    monkeypatch.setattr("shmmap.origin.spatial_index._LINEAR_CELLS", 4)
+    boxes = np.array([[20.0 * i, 0.0, 20.0 * i + 20.0, 20.0] for i in range(6)])
+    boxes = np.concatenate([boxes, [[1.1e308, 0.0, 1.2e308, 1.0], [-1.2e308, 0.0, -1.1e308, 1.0]]])
+    index = SpatialIndex(boxes)
+    assert index.query(Circle(0.0, 0.0, 5.0)).tolist() == [0]
+    assert index.query(Circle(1.15e308, 0.0, 5.0)).tolist() == [6]
+    assert index.query(Box(-1.7e308, 0.0, 1.7e308, 0.5)).tolist() == list(range(8))
+
+
 def test_empty() -> None:
     assert SpatialIndex(np.empty((0, 4))).query(Circle(0.0, 0.0, 1e9)).tolist() == []
 
