@@ -70,6 +70,7 @@ class Connection:
         self._name = name
         self._next_request = int.from_bytes(os.urandom(6), "little")
         self._handshakes = 0
+        self._hung_up = False
         self._slot = 0  # kept over restarts of the daemon: what is mapped is locked under it
         # a context of our own: no other library's sockets can hold up its end
         context = zmq.Context()
@@ -81,7 +82,10 @@ class Connection:
         self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
         self._monitor = self._socket.get_monitor_socket(
-            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_DISCONNECTED
+            zmq.EVENT_HANDSHAKE_SUCCEEDED
+            | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+            | zmq.EVENT_DISCONNECTED
+            | zmq.EVENT_CONNECT_RETRIED
         )
         # also when nobody calls close(), and at the end of the program
         sockets = (self._monitor, self._socket)
@@ -206,14 +210,24 @@ class Connection:
                 return reply
 
     def _watch_connection(self) -> None:
+        hung_up = self._hung_up
         while self._monitor.poll(0):
             # zmq.utils.monitor would do this, but loads asyncio (20 ms)
             event, _value = _EVENT.unpack(self._monitor.recv_multipart()[0])
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._handshakes += 1
-            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL or not self._handshakes:
-                # a socket of a pattern that does not fit (SUB, say) hangs up without a word
-                raise ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")
+            elif event == zmq.EVENT_CONNECT_RETRIED:
+                self._hung_up = False
+            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+                raise self._no_daemon()
+            else:
+                self._hung_up = not self._handshakes
+        # libzmq tries again where a connection broke, but not where sockets' patterns do not fit (SUB, say)
+        if hung_up and self._hung_up:
+            raise self._no_daemon()
+
+    def _no_daemon(self) -> ProtocolMismatch:
+        return ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")
 
 
 def _slice_ms(deadline_s: float) -> int:

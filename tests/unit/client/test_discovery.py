@@ -209,6 +209,26 @@ def test_a_zeromq_socket_of_another_pattern(place: Path) -> None:
         connect(place / "s.sock")
 
 
+def test_a_daemon_that_ends_while_one_connects(place: Path) -> None:
+    """It hung up once, and is gone: that is no reason to take it for another program."""
+    with listening(place / "s.sock") as server:
+
+        def end() -> None:
+            probe, _ = server.accept()
+            probe.sendall(b"\xff\0\0\0\0\0\0\0\x01\x7f")
+            connection, _ = server.accept()
+            server.close()
+            (place / "s.sock").unlink()
+            probe.close()
+            connection.close()
+
+        thread = threading.Thread(target=end)
+        thread.start()
+        with pytest.raises(NoAnswer):
+            connect(place / "s.sock")
+        thread.join()
+
+
 def test_all_places_are_told_about(place: Path) -> None:
     with listening(place / "stale.sock"):
         pass
