@@ -77,7 +77,8 @@ def _load(path: str, suffix: str) -> dict[str, NDArray[Any]]:
             f"Open3D cannot be loaded to read {path}: {error}",
             hint="it needs the system packages libegl1 libgl1 libx11-6 libusb-1.0-0",
         ) from error
-    encoded = os.fsencode(path)  # Open3D 0.18 takes no Path, and a str only where it is UTF-8
+    # Open3D 0.18 takes no Path, and a str only where it is UTF-8; the stubs of 0.20 know nothing of bytes
+    encoded: Any = os.fsencode(path)
     try:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             tensors = o3d.t.io.read_point_cloud(encoded).point
