@@ -137,7 +137,7 @@ class MapDataError(ShmmapError):
         cause: str = "bad_data",
         hint: str = "",
     ) -> None:
-        place = f" at byte {offset}" if offset is not None else ""
+        place = f" (at byte {offset})" if offset is not None else ""
         super().__init__(f"{path}: {message}{place}" if path else message + place, hint=hint)
         self.path = path
         self.offset = offset

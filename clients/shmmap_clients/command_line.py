@@ -6,13 +6,12 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from shmmap.cli.options import seconds
+from shmmap.cli.options import at_least, seconds
 from shmmap.cli.output import print_json
 from shmmap.cli.program import Parser, exit_code_of, join_negative_values
 from shmmap.formats.durable_file import writing_errors
@@ -57,17 +56,6 @@ def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
         if len(values) != count or not all(abs(value) < float("inf") for value in values):
             raise argparse.ArgumentTypeError(f"{count} numbers with commas between them, not {text!r}")
         return values
-
-    return parse
-
-
-def at_least(lowest: int) -> Callable[[str], int]:
-    """Return an argparse type: a whole number, not below ``lowest``."""
-
-    def parse(text: str) -> int:
-        if not re.fullmatch(r"[+-]?\d{1,18}", text) or int(text) < lowest:
-            raise argparse.ArgumentTypeError(f"expected a whole number, {lowest} or more, not {text!r}")
-        return int(text)
 
     return parse
 

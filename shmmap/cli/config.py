@@ -11,7 +11,7 @@ from typing import Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.output import print_json
-from shmmap.errors import BadRequest, ConfigError, MapMissing
+from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapMissing
 
 __all__ = ["add_parser", "run_check", "run_init", "run_show"]
 
@@ -125,6 +125,6 @@ def run_init(args: argparse.Namespace) -> int:
     except FileExistsError:
         raise BadRequest(f"{path} exists", hint="name another FILE, or move it away") from None
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+        raise CannotWrite(f"cannot write {path}: {error.strerror}") from error
     print(f"{path}: every setting, explained; `shmmap serve --config {path}` uses it")
     return 0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.output import Column, format_bytes, format_duration, print_json, print_table
-from shmmap.errors import BadRequest
+from shmmap.errors import CannotWrite
 
 if TYPE_CHECKING:
     from shmmap.testing.demo import DemoResult, DriveResult
@@ -161,7 +161,7 @@ def _picture_path(named: str | None) -> Path:
     ):
         return path
     if named:
-        raise BadRequest(f"{path} cannot be written", hint="give another --svg FILE")
+        raise CannotWrite(f"{path} cannot be written", hint="give another --svg FILE")
     return Path(tempfile.gettempdir(), path.name)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.options import Subparsers, add_area_options, add_daemon_options, add_verb, area_from
 from shmmap.cli.output import format_bytes, wants_style
-from shmmap.errors import BadRequest, DaemonUnreachable
+from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
     from shmmap.cli.map_scene import BoxTuple, Scene
@@ -35,7 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="the map from above: what is in memory, who is where",
         description="Draw the map's cells by state, clients and the areas they follow: on the terminal, or "
         "into a file with tooltips.  While the daemon does not answer, only what is in memory is drawn.",
-        epilog="Exit code: 0, or 69 when the daemon is dead or was never started.",
+        epilog="Exit code: 0, 69 when the daemon is dead or was never started, 73 a file cannot be written.",
     )
     parser.add_argument("--svg", metavar="FILE", type=Path, help="write a picture")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write a page that needs nothing else")
@@ -47,15 +47,14 @@ def run(args: argparse.Namespace) -> int:
     """Draw."""
     from shmmap.cli.daemon_address import snapshot
     from shmmap.cli.map_scene import html_page, svg
+    from shmmap.formats.durable_file import writing_errors
 
     found, identity = snapshot(args)
     scene = _scene(args, found, f"{identity.map_path} ({identity.instance})", identity.id_prefix)
     for path, make in ((args.svg, svg), (args.html, html_page)):
         if path is not None:
-            try:
+            with writing_errors(str(path)):
                 path.write_text(make(scene), encoding="utf-8")
-            except OSError as error:
-                raise BadRequest(f"cannot write {path}: {error.strerror}") from error
             print(f"wrote {path}")
     if args.svg is None and args.html is None:
         _print(scene)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from threading import TIMEOUT_MAX
 from typing import TYPE_CHECKING, TypeAlias
@@ -23,6 +24,7 @@ __all__ = [
     "add_statistics_options",
     "add_verb",
     "area_from",
+    "at_least",
     "cells_or_all",
     "numbers",
     "seconds",
@@ -55,6 +57,17 @@ def seconds(text: str) -> float:
     if not (0.0 <= value <= TIMEOUT_MAX):
         raise argparse.ArgumentTypeError(f"expected seconds, not {text!r}")
     return value
+
+
+def at_least(lowest: int) -> Callable[[str], int]:
+    """Return an argparse type: a whole number, not below ``lowest``."""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch(r"[+-]?\d{1,18}", text) or int(text) < lowest:
+            raise argparse.ArgumentTypeError(f"expected a whole number, {lowest} or more, not {text!r}")
+        return int(text)
+
+    return parse
 
 
 def size_bytes(text: str) -> int:

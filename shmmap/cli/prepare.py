@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb, size_bytes
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least, size_bytes
 from shmmap.cli.output import format_bytes, format_duration, print_json, print_pairs
 
 __all__ = ["add_parser", "run"]
@@ -42,7 +42,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
     )
-    parser.add_argument("--workers", metavar="N", type=int, default=0, help="processes (default: all cores)")
+    parser.add_argument(
+        "--workers", metavar="N", type=at_least(0), default=0, help="processes (default: all cores)"
+    )
     parser.add_argument("--cache-dir", metavar="DIR", default="", help="where layers are kept")
     parser.add_argument(
         "--cache-size",

@@ -19,7 +19,7 @@ __all__ = ["add_parser", "run_install", "run_print"]
 _INSTALL = """\
 Writes units, the account `shmmap`, directories and /etc/shmmap/shmmap.toml, and starts nothing.  Units
 are replaced (changes belong in drop-ins: `systemctl edit shmmapd`), a configuration that exists is kept.
-Exit code: 0, 66 no map there, 78 a file cannot be written."""
+Exit code: 0, 66 no map there, 73 a file cannot be written."""
 
 _PRINT = """\
 FILE is a unit as it would be installed, or another file that comes with this package, such as

@@ -120,7 +120,8 @@ class Cell:
         return MappingProxyType({name: self[name] for name in self.column_names})
 
     def unit(self, column: str) -> str:
-        """SI unit of a column, empty where the source does not tell."""
+        """SI unit of a column, empty where the source does not tell; errors are those of ``cell[column]``."""
+        self[column]
         return next(row[5] for row in self._attached.columns if row[0] == column)
 
     # --- what the header says -------------------------------------------------------------------

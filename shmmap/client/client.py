@@ -64,6 +64,9 @@ class Client:
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return f"<Client of {self.endpoint}, map {self.welcome.map_path}>"
+
     def close(self) -> None:
         """End the session; attached cells stay readable."""
         self._session.close()
@@ -191,7 +194,7 @@ class Client:
 
     def selected(
         self,
-        ids: Iterable[str],
+        ids: str | Iterable[str],
         layers: str | Sequence[str] = ("points",),
         *,
         wait: float | None = DEFAULT_WAIT_S,
@@ -203,7 +206,7 @@ class Client:
         parameters and errors are those of `area`.
         """
         specs = _layers(layers)
-        wanted = tuple(ids)
+        wanted = _ids(ids)
         return self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, intent), wait)
 
     def release(self) -> int:
@@ -275,7 +278,7 @@ class Client:
         """
         return self._session.ask(messages.Reload, messages.Reloaded)
 
-    def evict(self, ids: Iterable[str] | None = None) -> messages.Evicted:
+    def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
         """Have the daemon drop cells, all by default; mapped ones are freed when they are let go.
 
         Raises
@@ -283,10 +286,12 @@ class Client:
         NotPermitted
             The daemon lets only administrators do this.
         """
-        wanted = tuple(ids) if ids is not None else None
+        wanted = _ids(ids) if ids is not None else None
         return self._session.ask(lambda n: messages.Evict(n, wanted), messages.Evicted)
 
-    def pin(self, ids: Iterable[str] = (), layers: str | Sequence[str] = ("points",)) -> messages.Pinned:
+    def pin(
+        self, ids: str | Iterable[str] = (), layers: str | Sequence[str] = ("points",)
+    ) -> messages.Pinned:
         """Have the daemon keep cells resident, until `unpin` or its end; without ids, list its pins.
 
         Raises
@@ -296,10 +301,10 @@ class Client:
         OverBudget
             All pins together would exceed the budget.
         """
-        wanted, specs = tuple(ids), _layers(layers)
+        wanted, specs = _ids(ids), _layers(layers)
         return self._session.ask(lambda n: messages.Pin(n, wanted, specs), messages.Pinned)
 
-    def unpin(self, ids: Iterable[str] | None = None) -> messages.Pinned:
+    def unpin(self, ids: str | Iterable[str] | None = None) -> messages.Pinned:
         """Have the daemon keep cells, all by default, no longer; returns what stays pinned.
 
         Raises
@@ -307,7 +312,7 @@ class Client:
         NotPermitted
             The daemon lets only administrators do this.
         """
-        wanted = tuple(ids) if ids is not None else None
+        wanted = _ids(ids) if ids is not None else None
         return self._session.ask(lambda n: messages.Unpin(n, wanted), messages.Pinned)
 
     def shutdown(self) -> None:
@@ -319,6 +324,10 @@ class Client:
             The daemon lets only administrators do this.
         """
         self._session.ask(messages.Shutdown, messages.Stopping)
+
+
+def _ids(ids: str | Iterable[str]) -> tuple[str, ...]:
+    return (ids,) if isinstance(ids, str) else tuple(ids)
 
 
 def _layers(layers: str | Sequence[str]) -> tuple[str, ...]:

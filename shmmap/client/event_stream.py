@@ -23,7 +23,7 @@ import zmq
 
 from shmmap.client.connection import Connection
 from shmmap.client.discovery import candidates
-from shmmap.errors import NoAnswer, ProtocolMismatch
+from shmmap.errors import BadRequest, NoAnswer, ProtocolMismatch
 from shmmap.protocol.events import Beat, Event, EventPage, Recent, decode_event
 
 __all__ = ["EventStream", "Missed"]
@@ -87,6 +87,8 @@ class EventStream:
         name: str = "",
         timeout: float = _TIMEOUT_S,
     ) -> None:
+        if since is not None and not since >= 0:
+            raise BadRequest(f"since must be seconds, not negative, it is {since!r}")
         self._timeout_s = timeout
         self._connection = Connection(candidates(endpoint), name=name, timeout_s=min(timeout, _CONNECT_S))
         try:
@@ -155,7 +157,7 @@ class EventStream:
         page = self._ask(Recent(0, limit=0))
         self.epoch, self._expected, self._highest = page.epoch, page.next, 0
         if since is not None:
-            since_ns = max(time.time_ns() - int(since * 1e9), 0)
+            since_ns = int(max(time.time() - since, 0.0) * 1e9)
             while not self._catch_up(after=0, since_ns=since_ns):  # it was restarted just now
                 self.epoch = self._ask(Recent(0, limit=0)).epoch
 

@@ -84,6 +84,9 @@ class MapListing(Sequence[CellInfo]):
             None if math.isnan(z_min + z_max) else (z_min, z_max),
         )
 
+    def __repr__(self) -> str:
+        return f"<MapListing of {len(self)} cells, {len(self.removed)} removed>"
+
     def __len__(self) -> int:
         return len(self._versions)
 

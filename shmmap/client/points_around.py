@@ -46,6 +46,9 @@ class PointsAround:
         self.cells = cells
         self.whole = whole
 
+    def __repr__(self) -> str:
+        return f"<PointsAround ({self.x:g}, {self.y:g}), {self.radius:g} m: {len(self.cells)} cells>"
+
     def __len__(self) -> int:
         """How many cells."""
         return len(self.cells)

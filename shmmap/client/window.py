@@ -97,6 +97,7 @@ class MapWindow:
                 f" they are {update_distance!r} m and {refresh_interval!r} s"
             )
         Circle(0.0, 0.0, radius)
+        self._radius = radius
         self._owns_client = not isinstance(client, Client)
         self._client = client if isinstance(client, Client) else connect(client, name=name)
         self._layers = (layers,) if isinstance(layers, str) else tuple(layers)
@@ -142,6 +143,10 @@ class MapWindow:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def __repr__(self) -> str:
+        where = "closed" if self._closed else f"of radius {self._radius:g} m"
+        return f"<MapWindow {where}, {len(self.cells)} cells of {', '.join(self._layers)}>"
 
     def close(self) -> None:
         """Stop following and let the window's cells go; views that live elsewhere stay readable."""

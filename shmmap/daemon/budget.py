@@ -55,14 +55,16 @@ def choose_budget(
     if asked_bytes:
         if asked_bytes > free:
             raise ConfigError(
-                f"a budget of {asked_bytes} bytes does not fit {directory.path}, which has {free} free",
+                f"a budget of {asked_bytes >> 20:,} MiB does not fit {directory.path}, which has"
+                f" {free >> 20:,} MiB free",
                 key="budget",
                 hint="lower --budget, or enlarge the tmpfs (docker: --shm-size)",
             )
         if limit_bytes is not None and asked_bytes > group_room:
             raise ConfigError(
-                f"a budget of {asked_bytes} bytes does not fit the control group's memory limit of"
-                f" {limit_bytes} bytes, of which {limit_bytes - group_room} are left to the processes",
+                f"a budget of {asked_bytes >> 20:,} MiB does not fit the control group's memory limit of"
+                f" {limit_bytes >> 20:,} MiB, of which {limit_bytes - group_room >> 20:,} MiB are left to the"
+                " processes",
                 key="budget",
                 hint="lower --budget, or raise the limit (systemd: MemoryMax=, docker: --memory)",
             )

@@ -29,6 +29,12 @@ _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNOREC
 LARGEST_BYTES: Final = 1 << 62
 _ENVIRONMENT: Final = "SHMMAP_"
 _TRUTHS: Final = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+_RANGES: Final = {
+    "session_quota": "a part of the budget, up to 1, or at least 1M",
+    "workers": "0 to 64; 0: one less than there are processors",
+    "load_timeout_s": "seconds, more than 0 and at most a day",
+    "eviction": "distance or lru",
+}
 _NOT_SETTINGS: Final = ("SHMMAP_TEST_", "SHMMAP_ENDPOINT")
 
 
@@ -159,7 +165,7 @@ def _convert(name: str, value: Any, origin: str) -> Any:
             f"{origin}: {name} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
         ) from None
     allowed: dict[str, Callable[[Any], bool]] = {
-        "session_quota": lambda v: 0 < v <= LARGEST_BYTES,
+        "session_quota": lambda v: 0 < v <= 1 or 1 << 20 <= v <= LARGEST_BYTES,
         "workers": lambda v: 0 <= v <= 64,
         "load_timeout_s": lambda v: 0 < v <= 86400,
         "budget_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
@@ -167,7 +173,9 @@ def _convert(name: str, value: Any, origin: str) -> Any:
         "eviction": lambda v: v in ("distance", "lru"),
     }
     if name in allowed and not allowed[name](value):
-        raise ConfigError(f"{origin}: {name} cannot be {value!r}", key=name, origin=origin)
+        raise ConfigError(
+            f"{origin}: {name} cannot be {value!r}", key=name, origin=origin, hint=_RANGES.get(name, "")
+        )
     return value
 
 

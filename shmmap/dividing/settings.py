@@ -78,6 +78,8 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
     """
     lattice = CellLattice.of(settings.cell_size, settings.origin)
     if settings.leaf:
+        if not settings.leaf > 0:
+            raise BadRequest(f"the leaf must be a positive number of metres, not {settings.leaf}")
         CellLattice.of(settings.leaf, settings.origin)
         if settings.leaf > settings.cell_size:
             raise BadRequest(f"voxels of {settings.leaf} m are larger than cells of {settings.cell_size} m")
@@ -91,7 +93,7 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
         raise BadRequest("a translation is three numbers of metres")
     if settings.memory_bytes < MIN_MEMORY_BYTES:
         raise BadRequest(
-            f"{settings.memory_bytes >> 20} MiB of memory are too little",
+            f"{settings.memory_bytes:,} bytes of memory are too little",
             hint=f"at least {MIN_MEMORY_BYTES >> 20}M: code and libraries are counted",
         )
     return lattice

@@ -13,6 +13,7 @@ them.  ``of`` names the layer it is built of: ``ndt(leaf=2.0,of=voxel(leaf=0.1))
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -147,8 +148,10 @@ def _spec(words: _Words, depth: int) -> LayerSpec:
     name = words.need("name")
     kind = find_kind(name)
     if kind is None:
+        near = difflib.get_close_matches(name, [known.name for known in kinds()], n=1)
+        suggestion = f"did you mean {near[0]!r}?  " if near else ""
         known = ", ".join(known.describe() for known in kinds())
-        raise BadRequest(f"unknown layer {name!r}", hint=f"layers are: {known}")
+        raise BadRequest(f"unknown layer {name!r}", hint=f"{suggestion}layers are: {known}")
     given: dict[str, Value] = {}
     of: LayerSpec | None = None
     if words.take("sign", "("):

@@ -69,6 +69,8 @@ def area_from_message(message: AreaMessage) -> geometry.Area:
 
 def area_to_message(area: geometry.Area) -> AreaMessage:
     """Return the message that describes an area."""
+    if not isinstance(area, (geometry.Circle, geometry.AutowareSquare, geometry.Box)):
+        raise TypeError(f"an area is a Circle, a Box or an AutowareSquare, not {area!r}")
     z = (area.z.min, area.z.max) if area.z is not None else (None, None)
     if isinstance(area, geometry.Circle):
         return CircleMessage(area.x, area.y, area.radius, *z)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from shmmap.errors import ConfigError, MapMissing
+from shmmap.errors import CannotWrite, MapMissing
 from shmmap.service.program import daemon_command, hidden_directories, is_hidden, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
 
@@ -138,7 +138,7 @@ def write(planned: Sequence[PlannedFile]) -> None:
 
     Raises
     ------
-    ConfigError
+    CannotWrite
         A file cannot be written.
     """
     for one in planned:
@@ -151,6 +151,6 @@ def write(planned: Sequence[PlannedFile]) -> None:
             interim.chmod(0o644)
             interim.replace(one.path)
         except OSError as error:
-            raise ConfigError(
+            raise CannotWrite(
                 f"cannot write {one.path}: {error.strerror}", hint="run it with sudo, or with --user"
             ) from error

@@ -226,7 +226,7 @@ def test_a_file_system_smaller_than_the_budget(
     directory = private_tmpfs("16m")
     one = daemon(heavy_map.root, "--budget", "64M", shm_dir=directory, start=False)
     assert one.run_to_end() == 78
-    assert f"a budget of {64 << 20} bytes does not fit {directory}" in one.log
+    assert f"a budget of 64 MiB does not fit {directory}" in one.log
     assert "lower --budget, or enlarge the tmpfs" in one.log
     assert one.leftovers() == []
     one.arguments[1] = "12M"

@@ -52,6 +52,23 @@ def test_the_first_program(daemon: Factory, divided_map: DividedMap, monkeypatch
     assert sum(len(cell.xyz) for cell in cells) == 500 * len(divided_map.in_circle(3.0, 4.0, 50))
 
 
+def test_everything_says_what_it_is(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        assert repr(client) == f"<Client of {one.endpoint}, map {divided_map.root}>"
+        listing = client.metadata()
+        assert repr(listing) == f"<MapListing of {len(listing)} cells, 0 removed>"
+        with shmmap.MapWindow(client, 5.0) as window:
+            window.move_to(10.0, 10.0, wait=30.0)
+            assert repr(window) == f"<MapWindow of radius 5 m, {len(window.cells)} cells of points>"
+            around = window.points_around(10.0, 10.0, 1.5)
+            assert repr(around) == f"<PointsAround (10, 10), 1.5 m: {len(around)} cells>"
+            del around
+        assert repr(window) == "<MapWindow closed, 0 cells of points>"
+        with pytest.raises(TypeError, match="AutowareSquare"):
+            client.area((1.0, 2.0, 3.0))  # type: ignore[arg-type]
+
+
 def test_areas(daemon: Factory, divided_map: DividedMap) -> None:
     with shmmap.connect(daemon(divided_map.root).endpoint, name="areas") as client:
         circle = client.area(shmmap.Circle(5.0, -7.0, 33.0))
@@ -114,6 +131,7 @@ def test_selected_keeps_order_and_duplicates(daemon: Factory, divided_map: Divid
         assert failure.cell_id == "none.pcd"
         with pytest.raises(UnknownCell, match=r"none\.pcd"):
             answer.raise_for_failures()
+        assert names(client.selected("0_0.pcd")) == ["0_0.pcd"], "one id needs no list"
 
 
 def test_a_broken_cell_costs_only_itself(daemon: Factory, divided_map: DividedMap) -> None:
@@ -204,7 +222,7 @@ def test_show_stats_and_evict(daemon: Factory, divided_map: DividedMap) -> None:
             client.show("none.pcd")
         (session,) = client.stats().sessions
         assert (session.client, session.cells) == ("mine", 1)
-        assert client.evict(["0_0.pcd"]).pinned == 1
+        assert client.evict("0_0.pcd").pinned == 1
         assert_bits(cell, divided_map)
         del cell
         gc.collect()

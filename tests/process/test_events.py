@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import zmq
 
-from shmmap import EventStream, Missed
+from shmmap import BadRequest, EventStream, Missed
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
@@ -128,6 +128,12 @@ def test_the_stream_goes_on_in_the_next_life(
     assert stream.epoch == after[0].epoch
     assert one.stop() == 0
     assert until(stream, lambda h: isinstance(h, e.Epoch))[-1].what == "stopping"
+
+
+@pytest.mark.parametrize("since", [-1.0, float("nan")])
+def test_a_beginning_that_makes_no_sense(since: float) -> None:
+    with pytest.raises(BadRequest, match="since"):
+        EventStream("/nowhere.sock", since=since)
 
 
 def test_a_gap_is_noticed_and_closed(

@@ -59,6 +59,8 @@ def test_an_unknown_column_is_named_with_those_there_are(segments: Segments) -> 
     cell = segments.cell("/map/a.pcd", COLUMNS)
     with pytest.raises(KeyError, match="no column 'colour'; it has xyz, intensity, ring, rgb"):
         cell["colour"]
+    with pytest.raises(KeyError, match="no column 'colour'"):
+        cell.unit("colour")
 
 
 def test_views_cannot_be_written_nor_made_writeable(segments: Segments) -> None:

@@ -73,7 +73,8 @@ BAD: list[tuple[str, Any]] = [
     ("workers", "1e9"), ("load_timeout_s", float("nan")),
     ("load_timeout_s", 0), ("load_timeout_s", -1.0), ("load_timeout_s", "soon"),
     ("load_timeout_s", 86401), ("load_timeout_s", True), ("load_timeout_s", 10**400),
-    ("session_quota", 0), ("session_quota", -0.5), ("session_quota", "x"), ("session_quota", float("inf")),
+    ("session_quota", 0), ("session_quota", 2), ("session_quota", "90"),
+    ("session_quota", -0.5), ("session_quota", "x"), ("session_quota", float("inf")),
     ("session_quota", float("nan")), ("session_quota", "1.2.3"), ("session_quota", "\u00b2"),
     ("budget_bytes", -1), ("budget_bytes", "lots"), ("budget_bytes", 1.5), ("budget_bytes", 1 << 70),
     ("budget_bytes", True), ("eviction", "fifo"), ("eviction", 3), ("strict", "maybe"), ("strict", 1),
@@ -91,6 +92,13 @@ def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None
     assert failure.value.message.startswith("command line: ")
     assert name in failure.value.message
     assert failure.value.exit_code == 78
+
+
+def test_a_value_out_of_range_is_told_what_may_be() -> None:
+    for name, value, hint in (("eviction", "fifo", "distance or lru"), ("session_quota", "90", "up to 1")):
+        with pytest.raises(ConfigError) as failure:
+            load({name: value})
+        assert hint in failure.value.hint
 
 
 def test_a_wrong_variable_is_named() -> None:

@@ -130,6 +130,8 @@ def test_an_empty_directory_and_settings_that_make_no_sense(tmp_path: Path) -> N
     ):  # fmt: skip
         with pytest.raises(BadRequest):
             divide_quickly([file], tmp_path / "map", **options)
+    with pytest.raises(BadRequest, match="leaf must be a positive"):
+        divide_quickly([file], tmp_path / "map", leaf=-1.0)
     with pytest.raises(BadRequest, match="nothing"):
         divide_quickly([], tmp_path / "map")
     assert sorted(os.listdir(tmp_path)) == ["empty", "in.pcd"]

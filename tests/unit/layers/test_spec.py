@@ -40,6 +40,7 @@ def test_canonical_forms(text: str, canonical: str) -> None:
         ("", "cut short"),
         ("nonsense", "ndt(leaf,min_points=6)"),
         ("nonsense", "voxel("),
+        ("ndtt(2)", "did you mean 'ndt'?"),
         ("ndt", "needs leaf"),
         ("ndt(leaf=0)", "out of range"),
         ("ndt(leaf=-1)", "out of range"),

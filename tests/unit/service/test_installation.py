@@ -141,7 +141,7 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "etc").write_text("in the way")
-    assert main(["unit", "install", "--root", str(tmp_path)]) == 78
+    assert main(["unit", "install", "--root", str(tmp_path)]) == 73
 
 
 def test_planned_files_know_what_they_replace(tmp_path: Path) -> None:
