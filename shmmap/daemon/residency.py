@@ -12,11 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from shmmap.daemon.load_queue import LoadQueue
 
 __all__ = ["Failure", "Key", "Load", "Residency", "Resident", "Slot", "Zombie"]
+
+MOST_FAILURES: Final = 1 << 14
+"""Failures of a kind that are remembered: who asks for ever new layers must not fill the memory with them."""
 
 
 class Key(NamedTuple):
@@ -136,7 +139,7 @@ class Residency:
         self.overhead_bytes = 0
         self.unchecked_count = 0
         self._by_name: dict[str, Resident] = {}
-        self._failed: set[Key] = set()
+        self._failed: dict[str, dict[Key, None]] = {}  # by code, those that failed longest ago first
         self._queue: LoadQueue[Load] = LoadQueue()
         self._numbers = 0
 
@@ -299,7 +302,13 @@ class Residency:
             slot.load = None
             slot.failure = failure
             if failure is not None:
-                self._failed.add(load.key)
+                keys = self._failed.setdefault(failure.code, {})
+                keys.pop(load.key, None)
+                keys[load.key] = None
+                if len(keys) > MOST_FAILURES:
+                    oldest = next(iter(keys))
+                    del keys[oldest]
+                    self._forget_failure(oldest, failure.code)
             self.forget_if_empty(load.key)
 
     def cancel(self, key: Key) -> None:
@@ -315,14 +324,15 @@ class Residency:
 
     def clear_failures(self, codes: frozenset[str]) -> None:
         """Forget standing failures of these kinds: what caused them may have passed."""
-        for key in list(self._failed):
-            slot = self.slots.get(key)
-            if slot is None or slot.failure is None:
-                self._failed.discard(key)
-            elif slot.failure.code in codes:
-                self._failed.discard(key)
-                slot.failure = None
-                self.forget_if_empty(key)
+        for code in codes:
+            for key in self._failed.pop(code, ()):
+                self._forget_failure(key, code)
+
+    def _forget_failure(self, key: Key, code: str) -> None:
+        slot = self.slots.get(key)
+        if slot is not None and slot.failure is not None and slot.failure.code == code:
+            slot.failure = None
+            self.forget_if_empty(key)
 
     # --- retiring -----------------------------------------------------------------------------
 

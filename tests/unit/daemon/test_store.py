@@ -12,7 +12,7 @@ import sys
 
 import pytest
 
-from shmmap.daemon import jobs
+from shmmap.daemon import jobs, residency
 from shmmap.daemon.residency import Key
 from shmmap.daemon.workers import Worker
 from shmmap.protocol.messages import Area, CircleMessage, Selected
@@ -68,6 +68,25 @@ def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
     one.cells.selected(session, Selected(99, ("0_0.pcd",), wait=30.0), one.now_s())
     one.cells_of(99)
     assert one.statistics.values["worker_crashes"] == 4, "another state of the file is tried at once"
+
+
+def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last ones of each kind; of those forgotten nothing stays."""
+    monkeypatch.setattr(residency, "MOST_FAILURES", 3)
+    books = residency.Residency(1 << 20)
+
+    def fail(number: int, code: str) -> Key:
+        key = Key(f"/{number}.pcd", "points")
+        load = books.want(key, 0, 1.0)
+        books.start(load, 0.0)
+        books.failed(load, residency.Failure(code, "", None, 0.0, 0.0))
+        return key
+
+    broken = [fail(number, "load_failed") for number in (0, 1, 2, 0, 3, 4)]
+    full = [fail(number, "no_space") for number in (5, 6)]
+    assert set(books.slots) == {broken[0], broken[4], broken[5], *full}
+    books.clear_failures(frozenset({"no_space"}))
+    assert set(books.slots) == {broken[0], broken[4], broken[5]}
 
 
 class Puppet:
