@@ -30,8 +30,6 @@ __all__ = [
     "encode",
 ]
 
-MAX_PACKET_BYTES: Final = 1 << 16
-
 
 class Job(msgspec.Struct, array_like=True, tag="job"):
     """Load one layer of one cell; ``granted`` bytes are reserved for it.

@@ -20,6 +20,7 @@ from typing import Final
 from shmmap.daemon import jobs
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS
 from shmmap.daemon.time_slices import take_slices
+from shmmap.daemon.worker_process import MAX_PACKET_BYTES
 from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
@@ -67,7 +68,7 @@ class _Worker:
                 self._check(job)
 
     def _receive(self) -> jobs.ToWorker | None:
-        data = self._channel.recv(jobs.MAX_PACKET_BYTES)
+        data = self._channel.recv(MAX_PACKET_BYTES)
         return jobs.decode_to_worker(data) if data else None
 
     def _send(self, message: jobs.FromWorker, fd: int | None = None) -> None:

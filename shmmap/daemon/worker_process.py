@@ -7,8 +7,19 @@ import os
 import socket
 import subprocess
 import sys
+from typing import Final
 
-__all__ = ["start_worker"]
+__all__ = ["MAX_PACKET_BYTES", "channel", "start_worker"]
+
+MAX_PACKET_BYTES: Final = 1 << 19
+"""A job may name its cell and 65 neighbours by paths of 4095 bytes each."""
+
+
+def channel() -> tuple[socket.socket, socket.socket]:
+    """Return both ends of a channel, the parent's first, which takes the longest job there is."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_PACKET_BYTES)
+    return ours, theirs
 
 
 def start_worker(
@@ -29,7 +40,7 @@ def start_worker(
     -------
     The process, and our end of the channel.
     """
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours, theirs = channel()
     try:
         with theirs:
             process = subprocess.Popen(

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from shmmap.daemon import jobs
-from shmmap.daemon.worker_process import start_worker
+from shmmap.daemon.worker_process import MAX_PACKET_BYTES, start_worker
 
 __all__ = ["Worker", "WorkerPool"]
 
@@ -163,7 +163,7 @@ class WorkerPool:
         """
         while True:
             try:
-                data, fds, _flags, _address = socket.recv_fds(worker.channel, jobs.MAX_PACKET_BYTES, 1)
+                data, fds, _flags, _address = socket.recv_fds(worker.channel, MAX_PACKET_BYTES, 1)
                 break
             except ConnectionResetError:
                 continue  # told once, before what the dead worker had still said

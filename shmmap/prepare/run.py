@@ -20,7 +20,7 @@ from typing import Final, Protocol
 import msgspec
 
 from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
-from shmmap.daemon.worker_process import start_worker
+from shmmap.daemon.worker_process import MAX_PACKET_BYTES, start_worker
 from shmmap.errors import InternalError
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.spec import canonical_layers
@@ -137,7 +137,7 @@ class _Run:
 
     def _hear(self, worker: _Worker) -> None:
         try:
-            data = worker.channel.recv(work.MAX_PACKET_BYTES)
+            data = worker.channel.recv(MAX_PACKET_BYTES)
             message = work.decode_done(data) if data else None
         except (OSError, msgspec.MsgspecError):
             message = None

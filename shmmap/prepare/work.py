@@ -9,8 +9,6 @@ import msgspec
 
 __all__ = ["CellDone", "CellWork", "FromWorker", "LayerDone", "Ready", "decode_done", "decode_work", "encode"]
 
-MAX_PACKET_BYTES: Final = 1 << 16
-
 
 class CellWork(msgspec.Struct, array_like=True, tag="cell"):
     """Prepare these layers of a cell; ``around`` are, for each layer, the neighbours' files it looks into.

@@ -15,6 +15,7 @@ from typing import Final
 
 import xxhash
 
+from shmmap.daemon.worker_process import MAX_PACKET_BYTES
 from shmmap.errors import ShmmapError
 from shmmap.layers.derive import CellJob, combined_digest
 from shmmap.layers.disk_cache import CacheKey, LayerCache
@@ -132,7 +133,7 @@ def main(arguments: list[str]) -> int:
     cache = LayerCache(arguments[2], limit_bytes=int(arguments[3]))
     try:
         channel.send(work.encode(work.Ready()))
-        while data := channel.recv(work.MAX_PACKET_BYTES):
+        while data := channel.recv(MAX_PACKET_BYTES):
             channel.send(work.encode(_prepare_cell(work.decode_work(data), cache)))
     except (BrokenPipeError, ConnectionResetError):
         pass

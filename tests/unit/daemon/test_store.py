@@ -13,7 +13,9 @@ import sys
 import pytest
 
 from shmmap.daemon import jobs, residency
+from shmmap.daemon.layer_versions import MAX_NEIGHBOURS
 from shmmap.daemon.residency import Key
+from shmmap.daemon.worker_process import MAX_PACKET_BYTES, channel
 from shmmap.daemon.workers import Worker
 from shmmap.protocol.messages import Area, CircleMessage, Selected
 from tests.support.daemon_process import wait_readable
@@ -94,7 +96,7 @@ class Puppet:
 
     def __init__(self, one: InnerDaemon) -> None:
         self.one = one
-        ours, self.channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours, self.channel = channel()
         ours.setblocking(False)
         process = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
         self.worker = Worker(process, ours, ready=True)
@@ -220,6 +222,15 @@ def test_a_loader_that_cannot_be_killed(puppet: Puppet) -> None:
     assert len(one.cells_of(2).cells) == 1
     sleeper.kill()
     sleeper.wait()
+    puppet.channel.close()
+
+
+def test_the_longest_job_there_is(puppet: Puppet) -> None:
+    """All neighbours that a layer may look at, on the longest paths that a file system has."""
+    path = "/" + "p" * 4094
+    job = jobs.Job(1, path, path, "denoise", (0.0,) * 4, "map", 1 << 20, "", (path,) * (MAX_NEIGHBOURS + 1))
+    assert puppet.one.pool.submit(job, 0.0)
+    assert jobs.decode_to_worker(puppet.channel.recv(MAX_PACKET_BYTES)) == job
     puppet.channel.close()
 
 

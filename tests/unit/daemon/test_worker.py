@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from shmmap.daemon import jobs
+from shmmap.daemon.worker_process import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import PublishBlock
 from shmmap.segment.pins import is_pinned, prepare_process
@@ -62,7 +63,7 @@ class Loader:
         """Return the next message; with `jobs.Done`, the descriptor that came before it."""
         kept = -1
         while True:
-            data, fds, _, _ = socket.recv_fds(self.channel, jobs.MAX_PACKET_BYTES, 1)
+            data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
             assert data, "the loader closed its channel"
             message = jobs.decode_from_worker(data)
             assert bool(fds) is isinstance(message, jobs.Segment)
