@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import write_pcd
-from shmmap.formats.durable_file import writing_errors
+from shmmap_clients.command_line import writing_errors
 from shmmap_clients.compare_map_filter.drive import ComparedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
