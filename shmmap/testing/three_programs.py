@@ -34,7 +34,8 @@ from shmmap.testing.environment import without_settings
 __all__ = ["ProgramRun", "ThreePrograms", "run_three_programs", "table"]
 
 _ON_THEIR_WAY: Final = 6  # scans
-_PATIENCE_S: Final = 120.0
+_PATIENCE_S: Final = 120.0  # for an answer
+_LAST_RUN_S: Final = 900.0  # for a program's end: the elevation map may just have begun a large map
 _POLL_MS: Final = 1000
 _LAST_WORDS: Final = 2000
 
@@ -140,7 +141,7 @@ class _Program:
         """Wait for its end and read what it said."""
         if self._process is None:
             return
-        self.run.exit_code = self._process.wait(_PATIENCE_S)
+        self.run.exit_code = self._process.wait(_LAST_RUN_S)
         self.run.runs += 1
         text = self._out.read_text(encoding="utf-8")
         if not text.strip():
