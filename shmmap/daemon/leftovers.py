@@ -168,8 +168,8 @@ class Leftovers:
     def _keep_for_readers(self, fd: int, name: str, found: _Found, now_s: float) -> bool:
         """Watch it as a zombie if somebody uses it, else remove it; True if it is used."""
         try:
-            used = self._reclaimer.pins.told(fd)
-        except OSError:  # not ours, or nothing that has leases
+            used = os.fstat(fd).st_uid == os.geteuid() and self._reclaimer.pins.told(fd)
+        except OSError:  # nothing that has leases
             used = False
         if not used:
             self._remove(name, found.why_not)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import shmmap
+from shmmap.segment.pins import lock_slot
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.damage import (
@@ -324,3 +325,23 @@ def test_a_name_that_somebody_else_took(
         assert client.ask("stats")[4]["zombies"] == 1
         assert reader.checksums() == [checksum]
     place.rmdir()
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("pins", ["leases", "locks"])
+def test_a_stranger_s_file_takes_no_budget(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, pins: str
+) -> None:
+    """However much it is in use: whoever has no segment of ours open keeps none of ours."""
+    environment = {"SHMMAP_TEST_PINS": pins} if pins == "locks" else {}
+    one = daemon(divided_map.root, start=False, environment=environment)
+    strange = Path(f"{one.shm_dir}/shmmap.{one.instance}.0123456789abcdef")
+    strange.write_bytes(bytes(1 << 20))
+    os.chown(strange, 12345, 12345)
+    with strange.open("rb") as file:
+        lock_slot(file.fileno(), 7)
+        one.start()
+        client = connect(one)
+        assert len(client.area(EVERYTHING).cells) == 36
+        counters = client.ask("stats")[4]
+        assert (counters["zombies"], counters["bytes_zombie"]) == (0, 0)
