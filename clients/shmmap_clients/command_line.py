@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from shmmap.cli.options import at_least, seconds
 from shmmap.cli.output import print_json
-from shmmap.cli.program import Parser, exit_code_of, join_negative_values
-from shmmap.formats.durable_file import writing_errors
+from shmmap.cli.program import Parser, exit_code_of, join_negative_values, writing_errors
 
 if TYPE_CHECKING:
     from shmmap import Client
