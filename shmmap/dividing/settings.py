@@ -83,14 +83,17 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
         CellLattice.of(settings.leaf, settings.origin)
         if settings.leaf > settings.cell_size:
             raise BadRequest(f"voxels of {settings.leaf} m are larger than cells of {settings.cell_size} m")
-    if "/" in settings.prefix or not settings.prefix.isprintable():
+    # hidden files would be no cells for whoever looks for clouds in a directory
+    if "/" in settings.prefix or settings.prefix.startswith(".") or not settings.prefix.isprintable():
         raise BadRequest(f"{settings.prefix!r} cannot start a file name")
     choices = (("encoding", settings.encoding, ENCODINGS), ("order", settings.order, ORDERS))
     for name, value, allowed in choices:
         if value not in allowed:
             raise BadRequest(f"{name} {value!r} is not one of {', '.join(allowed)}")
-    if isinstance(settings.translate, tuple) and not all(map(math.isfinite, settings.translate)):
-        raise BadRequest("a translation is three numbers of metres")
+    if isinstance(settings.translate, tuple):
+        if not all(map(math.isfinite, settings.translate)):
+            raise BadRequest("a translation is three numbers of metres")
+        lattice.moved(*settings.translate[:2])  # refuses what makes no exact corners
     if settings.memory_bytes < MIN_MEMORY_BYTES:
         raise BadRequest(
             f"{settings.memory_bytes:,} bytes of memory are too little",

@@ -120,21 +120,21 @@ def test_a_file_cut_short_is_refused_before_anything_is_read(tmp_path: Path) -> 
 
 
 def test_an_empty_directory_and_settings_that_make_no_sense(tmp_path: Path) -> None:
-    file = cloud_file(tmp_path / "in.pcd", xyzircaedt(10))
     (tmp_path / "empty").mkdir()
     with pytest.raises(MapMissing, match="no cloud"):
         divide_quickly([tmp_path / "empty"], tmp_path / "map")
     for options in (
         {"cell_size": 0.0}, {"leaf": -1.0}, {"leaf": 30.0}, {"prefix": "a/b"}, {"encoding": "zip"},
         {"order": "hilbert"}, {"memory_bytes": 1 << 20}, {"translate": (0.0, float("nan"), 0.0)},
+        {"translate": (1 / 3, 0.0, 0.0)}, {"prefix": ".hidden"},
     ):  # fmt: skip
-        with pytest.raises(BadRequest):
-            divide_quickly([file], tmp_path / "map", **options)
+        with pytest.raises(BadRequest):  # before any file is looked at
+            divide_quickly([tmp_path / "gone.pcd"], tmp_path / "map", **options)
     with pytest.raises(BadRequest, match="leaf must be a positive"):
-        divide_quickly([file], tmp_path / "map", leaf=-1.0)
+        divide_quickly([tmp_path / "gone.pcd"], tmp_path / "map", leaf=-1.0)
     with pytest.raises(BadRequest, match="nothing"):
         divide_quickly([], tmp_path / "map")
-    assert sorted(os.listdir(tmp_path)) == ["empty", "in.pcd"]
+    assert os.listdir(tmp_path) == ["empty"]
 
 
 def test_a_map_is_replaced_only_by_force_and_only_a_map(tmp_path: Path) -> None:
