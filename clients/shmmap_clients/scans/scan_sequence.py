@@ -50,7 +50,8 @@ class Scan:
 
 
 class ScanSequence:
-    """The scans in a directory (PCD, NPZ or KITTI ``.bin``), by name; read when their turn comes.
+    """The scans in a directory (PCD, NPZ or KITTI ``.bin``), by name, ``s_9`` before ``s_10``; read when
+    their turn comes.
 
     A scan gets its pose by its place, where there are as many poses as scans; else by the last number in
     its name, which counts the poses from 0 (``scan_0081.npz`` gets the 82nd).
@@ -72,7 +73,8 @@ class ScanSequence:
 
     def __init__(self, directory: str | os.PathLike[str], trajectory: Trajectory | None = None) -> None:
         try:
-            self.files = sorted(p for p in Path(directory).iterdir() if p.suffix.lower() in SCAN_SUFFIXES)
+            found = [path for path in Path(directory).iterdir() if path.suffix.lower() in SCAN_SUFFIXES]
+            self.files = sorted(found, key=_by_numbers)
         except (FileNotFoundError, NotADirectoryError):
             raise MapMissing(f"{os.fspath(directory)} is no directory") from None
         except OSError as error:
@@ -97,6 +99,12 @@ class ScanSequence:
             else:
                 stamp_s = float(self._trajectory.stamps_s[row])
                 yield Scan(path.stem, stamp_s, columns, self._trajectory.T_map_sensor[row])
+
+
+def _by_numbers(path: Path) -> tuple[list[str | int], str]:
+    """Key for sorting by name, numbers in it by their value: not all programs write leading zeros."""
+    words = re.split(r"([0-9]+)", path.name)
+    return [int(word) if place % 2 else word for place, word in enumerate(words)], path.name
 
 
 def _row(path: Path, poses: int, scans: int) -> int:

@@ -97,6 +97,12 @@ def test_poses_go_to_scans_by_place_or_by_number(tmp_path: Path) -> None:
         ScanSequence(tmp_path / "empty")
 
 
+def test_scans_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    names = ["b_1", "s_8", "s_9", "s_9_1", "s_9_10", "s_10", "s_11", "s_0012"]
+    write_scans(tmp_path / "a", sorted(names))
+    assert [scan.name for scan in ScanSequence(tmp_path / "a")] == names
+
+
 def test_files_that_are_no_scans_are_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     np.savez_compressed(tmp_path / "good.npz", xyz=rng.normal(size=(5000, 3)))
