@@ -17,6 +17,7 @@ from tests.support.pcl_program import built_pcl_program
 
 __all__ = ["PclAlignment", "PclEvaluation", "PclNdt", "build_pcl_ndt"]
 
+_OLDEST = (1, 13)
 _LIBRARIES = ("registration", "filters", "search", "kdtree", "common")
 
 
@@ -40,9 +41,9 @@ class PclAlignment:
 
 
 def build_pcl_ndt(folder: Path, *, optimize: str = "-O3") -> Path | None:
-    """Compile the program; None where it cannot be."""
+    """Compile the program; None where it cannot be, or where PCL is older than the convention ``pcl``."""
     source = Path(__file__).with_name("pcl_ndt.cpp")
-    return built_pcl_program(source, folder, _LIBRARIES, optimize=optimize)
+    return built_pcl_program(source, folder, _LIBRARIES, optimize=optimize, oldest=_OLDEST)
 
 
 class PclNdt:

@@ -10,15 +10,21 @@ from pathlib import Path
 
 
 def built_pcl_program(
-    source: Path, folder: Path, libraries: Sequence[str], *, optimize: str = "-O3"
+    source: Path,
+    folder: Path,
+    libraries: Sequence[str],
+    *,
+    optimize: str = "-O3",
+    oldest: tuple[int, int] = (1, 0),
 ) -> Path | None:
-    """Compile a program, linked with these of PCL's libraries; None where it cannot be."""
-    headers = sorted(Path("/usr/include").glob("pcl-*"))
-    if shutil.which("g++") is None or not headers:
+    """Compile a program, linked with these of PCL's libraries; None where it cannot be, or PCL is too old."""
+    found = {tuple(map(int, path.name[4:].split("."))): path for path in Path("/usr/include").glob("pcl-*")}
+    newest = max(found, default=(0, 0))
+    if shutil.which("g++") is None or newest < oldest:
         return None
     program = folder / source.stem
     # not -march=native: Eigen would align otherwise than in Debian's libraries, and crash
-    command = ["g++", optimize, "-msse4.2", "-std=c++17", f"-I{headers[-1]}", "-I/usr/include/eigen3"]
+    command = ["g++", optimize, "-msse4.2", "-std=c++17", f"-I{found[newest]}", "-I/usr/include/eigen3"]
     linked = [f"-lpcl_{name}" for name in libraries]
     subprocess.run([*command, source, "-o", program, *linked, "-lboost_system"], check=True)
     return program
