@@ -8,6 +8,20 @@ Scans are each started from the true pose disturbed by 0.3 m and 1 degree, once 
 of that or in one of them (`DISTURBANCES`).  Bars: at least 99% within 0.1 m and 0.2 degrees, median at most
 3 cm in Autoware's mode and 2 cm in fine mode, at 0.5 m and 6000 points; the city: fine at most half of
 Autoware's error; simulated scans: not worse.
+
+Of 1000 starts at 0.5 m and 6000 points (at Autoware's own sampling, 3 m and 1500 points) per cent within:
+
+    disturbance   Autoware's mode   steady          fine
+    direction     98.3   (98.8)     100   (100)     100   (100)
+    planar        100    (100)      100   (100)     100   (100)
+    within        96.4   (98.6)     100   (100)     100   (100)
+    gaussian      96.2   (98.3)     100   (99.9)    100   (100)
+
+What fails in Autoware's mode swings: step after step of the full 0.1 m, up and down again between the same
+two places on either side of the peak in height, until the 30 iterations are up.  (So do all twelve that were
+looked at, of direction's 17 on twelve different scans; from the same starts the original's arithmetic takes
+30 steps to the same errors.)  More than 20 reversals are counted, and ten make Autoware drop a pose: of the
+8000 poses in this column those that Autoware would publish are all within, but one.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 What PCL does its own way is repeated: it stops where a step's translation, squared, is below epsilon (0.1 by
 default: a third of a metre), takes angles below 1e-4 for zero in derivatives, and clips its line search.  Two
 things are not.  It moves points and measures how near centroids are in float32, which the tolerances are for.
-And a voxel that it has refused (points all the same) counts for it as one of zero inverse covariance; there is
-none in these clouds.
+And a voxel that it has refused (points all the same) counts for it as one of zero inverse covariance; these
+clouds have none.
 """
 
 from __future__ import annotations
