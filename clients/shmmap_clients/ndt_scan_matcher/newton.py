@@ -21,6 +21,7 @@ __all__ = ["Ascent", "StepRule", "ascend"]
 _SINGULAR: Final = 6 * np.finfo(np.float64).eps
 
 _BACK: Final = 0.5  # negated cosine between steps of which one goes back on the other
+_MAY_LOSE: Final = 0.1  # of the score, by one steady step
 _FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
 
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
@@ -44,8 +45,8 @@ class StepRule:
         The originals may swing between two places until iterations are up: where the score is not concave
         they go back along a step that would lead down, and a step across the peak is answered by the same
         one back.  Here curvatures count by their magnitude (saddle-free Newton, Dauphin 2014), so that every
-        step sets out upwards.  Steps may end lower, and so leave small peaks behind, until one goes back on
-        the one before; from then on the longest step is halved instead.
+        step sets out upwards.  Steps may end a tenth lower, and so leave small peaks behind, until one goes
+        back on the one before, then no lower; instead of others the longest step is halved.
     """
 
     convention: Convention
@@ -92,7 +93,8 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
         if rule.steady and not settling and float(direction @ before) < -_BACK:
             settling, longest = True, longest / 2
         length, direction, reached = _take_step(ascent, at, wanted, direction, evaluate, rule, longest)
-        if settling and reached.score < at.score:
+        may_lose = 0.0 if settling else _MAY_LOSE * abs(at.score)
+        if rule.steady and reached.score < at.score - may_lose:
             longest = length / 2
         else:
             ascent.pose = ascent.pose + direction * length
@@ -102,7 +104,7 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
         ascent.transforms.append(matrix_from_pose(ascent.pose))
         # a steady step may be short because it was cut short: that is not yet the peak
         small = _is_small(ascent.iterations, wanted if rule.steady else length, direction, rule)
-        small = small or (settling and longest < rule.epsilon / 2.0)
+        small = small or (rule.steady and longest < rule.epsilon / 2.0)
         ascent.iterations += 1
         if small or _is_last(ascent.iterations, rule):
             ascent.converged = small

@@ -140,6 +140,25 @@ def test_steady_steps_do_not_bounce_between_the_sides_of_a_crease(start: float) 
     assert ascent.last.score == max(at.score for at in ascent.evaluations)
 
 
+def test_a_steady_step_that_loses_much_is_not_taken() -> None:
+    # beside the start is a peak, a lower one farther on; with hardly any curvature a step leads over both
+    def evaluate(pose: NDArray[np.float64], _sign: float) -> Evaluation:
+        value, gradient, hessian = 0.0, np.zeros(6), np.zeros((6, 6))
+        for peak, height in ((0.0, 1.0), (0.09, 0.6)):
+            off = pose - peak * np.eye(6)[5]
+            part = height * float(np.exp(-0.5 * (off @ off) / 0.0004))
+            value += part
+            gradient -= part * off / 0.0004
+            hessian += part * (np.outer(off, off) / 0.0004 - np.eye(6)) / 0.0004
+        return Evaluation(value, gradient, hessian, 0.0, 1, 1, 0, 0)
+
+    guess = matrix_from_pose(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.0199]))
+    rule = StepRule(convention_named("autoware"), 1e-4, 0.1, 30, False, steady=True)
+    ascent = ascend(guess, evaluate, rule)
+    assert ascent.converged
+    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=1e-3)
+
+
 def test_the_same_pose_at_large_coordinates(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
     shift = np.array([89570.0, 42300.0, 0.0])
     here = aligned(map_of(points, 2.0), scan)
