@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 from xml.sax.saxutils import escape
 
@@ -20,6 +20,7 @@ BoxTuple: TypeAlias = tuple[float, float, float, float]
 WIDTH_PX: Final = 960.0
 MARGIN_PX: Final = 16.0
 CAPTION_PX: Final = 72.0
+LABEL_PX: Final = 16.0  # labels nearer than a line to one another could not be read
 
 _STYLE: Final = """
   text { font-family: system-ui, "DejaVu Sans", sans-serif; font-size: 14px; fill: #1f2933; }
@@ -161,7 +162,7 @@ def top_view_svg(
     for window in windows:
         tooltip = f"<title>{escape(window.title)}</title>"
         parts.append(f'<rect class="window" {page.rectangle(window.box)}>{tooltip}</rect>')
-    for one in (*others, *([vehicle] if vehicle is not None else [])):
+    for one in _labelled_apart(page, [*others, *([vehicle] if vehicle is not None else [])]):
         parts += _vehicle(page, one)
     parts += [
         "</g>",
@@ -170,6 +171,19 @@ def top_view_svg(
         "",
     ]
     return "\n".join(parts)
+
+
+def _labelled_apart(page: _Page, vehicles: Sequence[Vehicle]) -> list[Vehicle]:
+    """Join the labels of those that stand on one another, as the programs of one vehicle do."""
+    found: list[Vehicle] = []
+    for vehicle in vehicles:
+        for index, other in enumerate(found):
+            apart_px = math.hypot(vehicle.x - other.x, vehicle.y - other.y) * page.scale
+            if other.label and apart_px < LABEL_PX:
+                vehicle = replace(vehicle, label=f"{other.label}, {vehicle.label}".rstrip(", "))
+                found[index] = replace(other, label="")
+        found.append(vehicle)
+    return found
 
 
 def _vehicle(page: _Page, vehicle: Vehicle) -> list[str]:

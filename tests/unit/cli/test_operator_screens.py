@@ -161,6 +161,15 @@ def test_the_picture_is_xml_with_tooltips() -> None:
     assert 'rect class="window"' in svg(Scene(**{**vars(SCENE), "clients": [boxed]}))
 
 
+def test_names_of_clients_on_one_another_stand_side_by_side() -> None:
+    beside = CLIENT._replace(client="perception")
+    far = CLIENT._replace(client="planning", pose=(10.0, 30.0))
+    root = ElementTree.fromstring(svg(Scene(**{**vars(SCENE), "clients": [CLIENT, beside, far]})))
+    texts = root.iter("{http://www.w3.org/2000/svg}text")
+    labels = [node.text for node in texts if node.get("class") == "label"]
+    assert labels == ["localization, perception", "planning"]
+
+
 class Tags(HTMLParser):
     """Notes what a page refers to."""
 
