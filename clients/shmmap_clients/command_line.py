@@ -4,16 +4,14 @@
 from __future__ import annotations
 
 import argparse
-import errno
-import os
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from shmmap.cli.files import output_file, write_text, writing_errors
 from shmmap.cli.options import at_least, seconds
 from shmmap.cli.output import print_json
-from shmmap.cli.program import Parser, exit_code_of, join_negative_values, writing_errors
+from shmmap.cli.program import Parser, exit_code_of, join_negative_values
 
 if TYPE_CHECKING:
     from shmmap import Client
@@ -68,30 +66,6 @@ def positive(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
     return value
-
-
-def output_file(text: str) -> Path:
-    """Read the name of a file to write, and find out before the work begins that it can be.
-
-    Raises
-    ------
-    CannotWrite
-        There is no such directory, or it or the file may not be written to.
-    """
-    path = Path(text)
-    with writing_errors(text):
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), text)
-        os.stat(os.path.join(path.parent, "."))  # a directory, and there
-        if not os.access(path if path.exists() else path.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), text)
-    return path
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file; what keeps it from being written is `CannotWrite`."""
-    with writing_errors(str(path)):
-        path.write_text(text, encoding="utf-8")
 
 
 def add_daemon_options(parser: argparse.ArgumentParser) -> None:

@@ -46,15 +46,14 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw."""
     from shmmap.cli.daemon_address import snapshot
+    from shmmap.cli.files import write_text
     from shmmap.cli.map_scene import html_page, svg
-    from shmmap.formats.durable_file import writing_errors
 
     found, identity = snapshot(args)
     scene = _scene(args, found, f"{identity.map_path} ({identity.instance})", identity.id_prefix)
     for path, make in ((args.svg, svg), (args.html, html_page)):
         if path is not None:
-            with writing_errors(str(path)):
-                path.write_text(make(scene), encoding="utf-8")
+            write_text(path, make(scene))
             print(f"wrote {path}")
     if args.svg is None and args.html is None:
         _print(scene)

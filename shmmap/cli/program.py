@@ -11,9 +11,8 @@ from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any, Final, NoReturn
 
 from shmmap.errors import InternalError, ShmmapError
-from shmmap.formats.durable_file import writing_errors
 
-__all__ = ["Parser", "exit_code_of", "join_negative_values", "writing_errors"]
+__all__ = ["Parser", "exit_code_of", "join_negative_values"]
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import write_pcd
-from shmmap_clients.command_line import writing_errors
 from shmmap_clients.compare_map_filter.drive import ComparedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
@@ -50,13 +49,12 @@ class PcdDirectory:
 
     Raises
     ------
-    CannotWrite
+    OSError
         The directory cannot be made; later, a file cannot be written.
     """
 
     def __init__(self, directory: Path, *, mask: bool) -> None:
-        with writing_errors(str(directory)):
-            directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(parents=True, exist_ok=True)
         self._directory = directory
         self._mask = mask
 
@@ -67,8 +65,7 @@ class PcdDirectory:
         x, y, z, w = quaternion_of(T[:3, :3])
         viewpoint = (*T[:3, 3].tolist(), w, x, y, z)
         path = self._directory / f"{Path(compared.scan.name).name}.pcd"
-        with writing_errors(str(path)):
-            write_pcd(path, _columns(compared, self._mask), viewpoint=viewpoint)
+        write_pcd(path, _columns(compared, self._mask), viewpoint=viewpoint)
 
     def close(self) -> None:
         """Nothing to do: every file is complete."""

@@ -13,6 +13,7 @@ from shmmap_clients.command_line import (
     output_file,
     print_json,
     write_text,
+    writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
 
@@ -68,7 +69,8 @@ def run(args: argparse.Namespace) -> int:
     comparison = CompareMapFilter(rule, backend=args.backend).use_tables([table]).apply(scan.xyz, T)
     kept = int(comparison.kept.sum())
     if args.out:
-        PcdDirectory(Path(args.out), mask=args.mask).write(ComparedScan(scan, comparison))
+        with writing_errors(args.out):
+            PcdDirectory(Path(args.out), mask=args.mask).write(ComparedScan(scan, comparison))
     if args.picture:
         view = TopView()
         view.add(to_map(scan.xyz, T), comparison.kept, (float(T[0, 3]), float(T[1, 3])))

@@ -15,6 +15,7 @@ from shmmap_clients.command_line import (
     print_json,
     seconds,
     write_text,
+    writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
 
@@ -88,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
         )
         output = None
         if args.out:
+            stack.enter_context(writing_errors(args.out))
             output = open_output(args.out, mask=args.mask, wait_s=30.0)
             stack.callback(output.close)
         for compared in compare_drive(scans, window, compare, first_wait_s=30.0, wait_s=wait_s):
