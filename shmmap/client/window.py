@@ -313,22 +313,41 @@ class MapWindow:
         x, y, radius
             Metres, map frame; what lies beyond the window is not there.
         layer
-            Which one, as `Cell.layer` names it (`shmmap.canonical_layer`); by default the window's first.
+            Which of the window's layers, as it was asked for or as `Cell.layer` names it; by default the
+            first.  Of two layers of one kind, the name is that of `Cell.layer` (`shmmap.canonical_layer`).
 
         Raises
         ------
         BadRequest
-            The circle makes no sense.
+            The circle makes no sense, or the window has no such layer.
         """
         state = self._current
-        name = layer if layer is not None else self._layers[0]
-        if layer is None and len(self._layers) == 1:
-            name = next(iter(state.by_layer), name)  # cells have the canonical form, whatever was asked for
+        name = self._name_of(layer if layer is not None else self._layers[0], state)
         cells = state.by_layer.get(name)
         if not cells:
             Circle(x, y, radius)
             return PointsAround(x, y, radius, (), ())
         return points_around(cells, state.boxes[name], x, y, radius)
+
+    def _name_of(self, layer: str, state: WindowState) -> str:
+        """Return the name that the cells of a layer go by, in whatever form it was asked for."""
+        if layer in state.by_layer:
+            return layer
+        kind = _kind(layer)
+        asked = [one for one in self._layers if _kind(one) == kind]
+        if len(asked) > 1:
+            return layer  # parameters tell them apart; only the canonical form does so by itself
+        there = next((name for name in state.by_layer if _kind(name) == kind), None)
+        if layer in asked:
+            return there or layer
+        if there or not asked:
+            names = ", ".join([*state.by_layer] or self._layers)
+            raise BadRequest(f"the window has no layer {layer!r}", hint=f"it has {names}")
+        return layer
+
+
+def _kind(layer: str) -> str:
+    return layer.partition("(")[0].strip()
 
 
 def _intent(

@@ -142,6 +142,23 @@ def test_a_window_follows_layers_however_they_are_written(
             del near
 
 
+def test_points_around_finds_each_layer_of_a_window_as_it_was_asked_for(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    asked = ["voxel( 1 )", "points"]
+    with shmmap.MapWindow(one.endpoint, 30, layers=asked) as window:
+        assert window.points_around(0.0, 0.0, 5.0).count() == 0
+        window.move_to(0.0, 0.0, wait=60)
+        voxels = window.points_around(0.0, 0.0, 5.0).count()
+        assert 0 < voxels <= window.points_around(0.0, 0.0, 5.0, layer="points").count()
+        for written in ("voxel( 1 )", "voxel(leaf=1.0)"):
+            assert window.points_around(0.0, 0.0, 5.0, layer=written).count() == voxels
+        for other in ("voxel(leaf=2.0)", "ndt(leaf=2.0)"):
+            with pytest.raises(shmmap.BadRequest, match="no layer"):
+                window.points_around(0.0, 0.0, 5.0, layer=other)
+
+
 def offered(tmp_path: Path) -> dict[str, str]:
     return {"PYTHONPATH": f"{ROOT}:{install(tmp_path / 'offered')}"}
 
