@@ -79,5 +79,6 @@ def writing_errors(what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise CannotWrite(
-            f"{error.filename or what}: {error.strerror or error}", hint=_HINTS.get(error.errno or 0, "")
+            f"cannot write {error.filename or what}: {error.strerror or error}",
+            hint=_HINTS.get(error.errno or 0, ""),
         ) from error
