@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from shmmap.cli.files import output_file, write_text, writing_errors
 from shmmap.cli.options import at_least, seconds
-from shmmap.cli.output import print_json
 from shmmap.cli.program import Parser, exit_code_of, join_negative_values
+from shmmap.cli.screens.output import print_json
 
 if TYPE_CHECKING:
     from shmmap import Client

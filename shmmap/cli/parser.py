@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmmap.cli.program import Parser
-from shmmap.cli.version import installed_version
+from shmmap.cli.verbs.version import installed_version
 
 __all__ = ["NUMBER_OPTIONS", "VERBS", "build_parser", "verb_first"]
 
@@ -75,5 +75,5 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
     wanted = words[:1] if words and words[0] in VERBS else tuple(VERBS)
     for verb in wanted:
-        importlib.import_module(f"shmmap.cli.{VERBS[verb]}").add_parser(subparsers)
+        importlib.import_module(f"shmmap.cli.verbs.{VERBS[verb]}").add_parser(subparsers)
     return parser

@@ -21,9 +21,9 @@ from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
 from shmmap.client.visible import check_visible, owner_of_segments
 from shmmap.errors import BadRequest, NoAnswer
+from shmmap.failpoints import step
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
-from shmmap.segment.crash_steps import step
 
 __all__ = ["Session"]
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Final, NamedTuple
 
-from shmmap.daemon.settings_file import read_settings_file
+from shmmap.daemon.config_file import read_settings_file
 from shmmap.errors import ConfigError
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,

@@ -7,7 +7,7 @@ import re
 import resource
 from typing import Final
 
-from shmmap.daemon.pin_support import probe_pins
+from shmmap.daemon.pins.probe import probe_pins
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Patient
 from shmmap.errors import ConfigError

@@ -19,13 +19,13 @@ from typing import Final, Protocol
 
 import msgspec
 
-from shmmap.daemon.layer_versions import MAX_NEIGHBOURS, LayerVersions
-from shmmap.daemon.worker_process import MAX_PACKET_BYTES, start_worker
 from shmmap.errors import InternalError
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.spec import canonical_layers
+from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.origin.catalogue import Catalogue
 from shmmap.prepare import work
+from shmmap.processes.start_child import MAX_PACKET_BYTES, start_worker
 
 __all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map"]
 

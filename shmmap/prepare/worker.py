@@ -15,7 +15,6 @@ from typing import Final
 
 import xxhash
 
-from shmmap.daemon.worker_process import MAX_PACKET_BYTES
 from shmmap.errors import ShmmapError
 from shmmap.layers.derive import CellJob, combined_digest
 from shmmap.layers.disk_cache import CacheKey, LayerCache
@@ -24,7 +23,8 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource, read_source
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
-from shmmap.segment.parent import die_with
+from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 
 __all__ = ["main"]
 

@@ -20,7 +20,7 @@ import posix_ipc
 from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
-from shmmap.segment.crash_steps import step
+from shmmap.failpoints import step
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.layout import (
     PAGE_BYTES,

@@ -12,7 +12,7 @@ import errno
 import os
 
 from shmmap.errors import ConfigError
-from shmmap.segment.crash_steps import step
+from shmmap.failpoints import step
 from shmmap.segment.layout import PublishBlock, pack_publish_block
 
 __all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]

@@ -18,7 +18,7 @@ import struct
 import time
 from typing import Final
 
-from shmmap.segment.crash_steps import step
+from shmmap.failpoints import step
 
 __all__ = ["LOADER_SLOT", "MAX_SLOT", "holders", "is_pinned", "lock_slot", "prepare_process"]
 

@@ -17,7 +17,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.segment.crash_steps import step
+from shmmap.failpoints import step
 from shmmap.segment.layout import Column, SegmentHeader, SourceStamp, header_size, pack_header, plan_columns
 
 __all__ = ["SegmentWriter", "write_all"]

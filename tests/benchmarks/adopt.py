@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from shmmap.daemon.leftovers import Leftovers
+from shmmap.daemon.loading.adoption import Leftovers
 from shmmap.layers.points import build_points
 from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name

@@ -32,9 +32,9 @@ from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 
 import shmmap
 from shmmap.origin.map_writer import MapWriter
-from shmmap.testing.lidar import Lidar
-from shmmap.testing.town import Town
-from shmmap.testing.town_traffic import Traffic
+from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.town import Town
+from shmmap.simulation.town_traffic import Traffic
 from tests.support.daemon_process import DaemonProcess
 
 __all__ = ["main"]

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from shmmap_clients.elevation_map import ElevationGrid, ElevationRule, build_elevation_map
 
 import shmmap
-from shmmap.testing.town import Town
+from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.pcd_files import write_pcd
 

@@ -22,18 +22,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings
-from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
-from shmmap_clients.ndt_scan_matcher.follower import Follower, Frame
-from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
-from shmmap_clients.ndt_scan_matcher.prediction import Odometry
-from shmmap_clients.ndt_scan_matcher.smallest_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
+from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame
+from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import Odometry
+from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.trajectory import Trajectory, read_trajectory
 
 from shmmap import read_cloud
-from shmmap.testing.daemon_process import DaemonProcess
-from shmmap.testing.process_memory import process_memory
+from shmmap.demo.daemon_process import DaemonProcess
+from shmmap.demo.process_memory import process_memory
 from tests.benchmarks.ndt_clouds import data_dir, sampled
 from tests.benchmarks.tile_map import tile_map
 

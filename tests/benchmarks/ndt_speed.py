@@ -57,7 +57,7 @@ FIRST = """
 import time
 began = time.perf_counter()
 import sys, numpy as np
-from shmmap_clients.ndt_scan_matcher.smallest_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
 align_smallest()
 print(time.perf_counter() - began)
 """

@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import pose_from_matrix
-from shmmap_clients.ndt_scan_matcher.drive_errors import pose_errors
-from shmmap_clients.ndt_scan_matcher.follower import thinned
-from shmmap_clients.ndt_scan_matcher.smallest_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.drive.follower import thinned
+from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
 from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.trajectory import read_trajectory
 
 from shmmap import connect
-from shmmap.testing.daemon_process import DaemonProcess
+from shmmap.demo.daemon_process import DaemonProcess
 from tests.benchmarks.ndt_clouds import data_dir
 from tests.benchmarks.tile_map import tile_map
 

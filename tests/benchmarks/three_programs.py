@@ -25,11 +25,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from shmmap_clients.demo.three_programs import ThreePrograms, run_three_programs, table
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
-from shmmap.testing.three_programs import ThreePrograms, run_three_programs, table
 from tests.benchmarks.tile_map import tile_map
 from tests.support.daemon_process import DaemonProcess
 

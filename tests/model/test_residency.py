@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from shmmap.daemon.eviction import POLICIES
-from shmmap.daemon.reclaim import HAND_OUT_GRACE_S, Outcome, Reclaimer
-from shmmap.daemon.residency import Failure, Key, Load, Residency, Resident
-from shmmap.daemon.sessions import Peer, Session, Sessions
+from shmmap.daemon.cache.eviction_policy import POLICIES
+from shmmap.daemon.cache.ledger import Failure, Key, Load, Residency, Resident
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Outcome, Reclaimer
+from shmmap.daemon.transport.sessions import Peer, Session, Sessions
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import lock_slot, prepare_process
 

@@ -109,9 +109,9 @@ def test_a_demo_whose_daemon_dies_says_so_and_leaves_nothing(tmp_path: Path) -> 
 
 
 def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Path) -> None:
+    from shmmap.demo.demo import run_demo
+    from shmmap.demo.demo_town import DemoSettings
     from shmmap.errors import BadRequest
-    from shmmap.testing.demo import run_demo
-    from shmmap.testing.demo_town import DemoSettings
 
     class NothingMayBegin:
         def stage(self, text: str, total: int) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.segment.crash_steps import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
+from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, random_points

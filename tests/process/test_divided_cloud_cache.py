@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.daemon import divided_cloud
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.divided_cloud import DividedCloud, find_origin
+from shmmap.dividing import served_cloud
+from shmmap.dividing.served_cloud import DividedCloud, find_origin
 from shmmap.errors import CannotWrite, MapDataError, MapMissing
 from shmmap.formats.pcd_writer import write_pcd
 from shmmap.origin import single_pcd
@@ -43,7 +43,7 @@ def test_which_maps_are_divided_first(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_the_cache_keeps_what_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(divided_cloud, "_KEPT_CLOUDS", 1)
+    monkeypatch.setattr(served_cloud, "_KEPT_CLOUDS", 1)
     told: list[str] = []
     served = DividedCloud(
         str(cloud(tmp_path / "0.pcd")), str(tmp_path / "cache"), tell=lambda *lines: told.extend(lines)

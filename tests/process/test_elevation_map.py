@@ -18,7 +18,7 @@ from shmmap_clients.elevation_map.build import BuildProgress, MapChanged
 from shmmap_clients.elevation_map.surface import surface_heights
 
 import shmmap
-from shmmap.testing.town import Town
+from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
 

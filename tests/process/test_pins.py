@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import shmmap
-from shmmap.daemon.inotify import NAME_GONE, Inotify
+from shmmap.daemon.host.inotify import NAME_GONE, Inotify
 from tests.process.conftest import DaemonFactory
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess

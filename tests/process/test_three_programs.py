@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from shmmap_clients.demo.full_demo import run_full_demo
+from shmmap_clients.demo.three_programs import run_three_programs, table
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
-from shmmap.cli.demo_progress import QuietProgress
-from shmmap.testing.demo_town import DemoSettings
-from shmmap.testing.full_demo import run_full_demo
-from shmmap.testing.three_programs import run_three_programs, table
+from shmmap.cli.screens.demo_progress import QuietProgress
+from shmmap.demo.demo_town import DemoSettings
 from tests.support.daemon_process import DaemonProcess
 from tests.support.town_drive import make_town_drive
 
@@ -76,7 +76,7 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
 
 
 def test_the_full_demonstration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("shmmap.testing.full_demo._BLOCKS", (3, 2))
+    monkeypatch.setattr("shmmap_clients.demo.full_demo._BLOCKS", (3, 2))
     before = set(os.listdir("/dev/shm"))
     result = run_full_demo(
         DemoSettings(density=8.0), QuietProgress(), map_dir=str(tmp_path / "town"), length=12.0

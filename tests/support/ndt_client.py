@@ -13,11 +13,11 @@ import sys
 
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
-from shmmap_clients.ndt_scan_matcher.smallest_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.scans.scan_file import read_scan
 
-from shmmap.testing.process_memory import process_memory
+from shmmap.demo.process_memory import process_memory
 
 
 def main() -> None:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import matrix_from_pose
 from shmmap_clients.scans.trajectory import tum_line
 
-from shmmap.testing.lidar import Lidar
-from shmmap.testing.town import Town
+from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.town import Town
 
 _HEIGHT_M = 1.8
 _SEEN_DENSITY = 12.0

@@ -12,15 +12,15 @@
 The same result as Autoware's, ndt_omp's or PCL's program, by the chosen convention; see `Settings`.
 """
 
-from shmmap_clients.ndt_scan_matcher.angles import matrix_from_pose, pose_from_matrix
-from shmmap_clients.ndt_scan_matcher.backend import BACKENDS, Backend
-from shmmap_clients.ndt_scan_matcher.caps import Caps, Cut
-from shmmap_clients.ndt_scan_matcher.evaluation import Evaluation
-from shmmap_clients.ndt_scan_matcher.matcher import NdtMatcher, Settings
-from shmmap_clients.ndt_scan_matcher.regularization import Regularization
-from shmmap_clients.ndt_scan_matcher.result import Result
-from shmmap_clients.ndt_scan_matcher.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
-from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.backends.backend import BACKENDS, Backend
+from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
+from shmmap_clients.ndt_scan_matcher.matching.limits import Caps, Cut
+from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
+from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
+from shmmap_clients.ndt_scan_matcher.matching.result import Result
 
 __all__ = [
     "BACKENDS",

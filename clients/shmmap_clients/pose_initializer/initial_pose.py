@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.result import Result
+from shmmap_clients.ndt_scan_matcher.matching.result import Result
 
 __all__ = ["Alternative", "InitialPose"]
 

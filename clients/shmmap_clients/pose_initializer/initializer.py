@@ -23,7 +23,7 @@ from shmmap_clients.ndt_scan_matcher import (
     cell_from_layer,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.result import Result
+from shmmap_clients.ndt_scan_matcher.matching.result import Result
 from shmmap_clients.pose_initializer.height import ground_heights
 from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
 from shmmap_clients.pose_initializer.parzen import ParzenEstimator

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import VoxelMap
-from shmmap_clients.ndt_scan_matcher.voxel_map import Covariance
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 
 FACES = {(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)}
 

@@ -17,10 +17,10 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
     pose_from_matrix,
 )
-from shmmap_clients.ndt_scan_matcher.conventions import convention_named
-from shmmap_clients.ndt_scan_matcher.newton import StepRule, ascend
-from shmmap_clients.ndt_scan_matcher.result import covariance_of, oscillations
-from shmmap_clients.ndt_scan_matcher.worst_case import predict_worst_case
+from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule, ascend
+from shmmap_clients.ndt_scan_matcher.matching.result import covariance_of, oscillations
+from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_worst_case
+from shmmap_clients.ndt_scan_matcher.matching.variants import convention_named
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street

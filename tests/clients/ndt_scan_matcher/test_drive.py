@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.drive_errors import Spread, drive_errors, pose_errors
-from shmmap_clients.ndt_scan_matcher.drive_plot import drive_svg
-from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
-from shmmap_clients.ndt_scan_matcher.follower import Frame, thinned
-from shmmap_clients.ndt_scan_matcher.map_updater import MapUpdate
-from shmmap_clients.ndt_scan_matcher.pose_stream import OdometryListener, PosePublisher, decode_pose
-from shmmap_clients.ndt_scan_matcher.prediction import ConstantVelocity, Odometry, interpolate
+from shmmap_clients.ndt_scan_matcher.drive.drive_plot import drive_svg
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
+from shmmap_clients.ndt_scan_matcher.drive.follower import Frame, thinned
+from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
+from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher, decode_pose
+from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import Spread, drive_errors, pose_errors
+from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdate
 from shmmap_clients.scans.trajectory import Trajectory
 
 import shmmap

@@ -16,7 +16,7 @@ from shmmap_clients.ndt_scan_matcher import (
     pose_from_matrix,
     voxel_cell,
 )
-from shmmap_clients.ndt_scan_matcher.backend import backend_named
+from shmmap_clients.ndt_scan_matcher.backends.backend import backend_named
 
 from tests.clients.ndt_scan_matcher.brute_force import rotation, score
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from shmmap_clients.ndt_scan_matcher.more_thuente import MAX_TRIALS, search_step
+from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS, search_step
 
 KINK = 0.00024
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from shmmap import errors
-from shmmap.cli import version
 from shmmap.cli.entry import main
+from shmmap.cli.verbs import version
 
 EXIT_CODES = {
     "ConfigError": 78,

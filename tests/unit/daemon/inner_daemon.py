@@ -17,16 +17,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from shmmap.daemon.admin import Admin
-from shmmap.daemon.cells import CellRequests
+from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.eviction_policy import POLICIES
+from shmmap.daemon.cache.ledger import Key, Residency
+from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.event_log import EventLog
-from shmmap.daemon.eviction import POLICIES
-from shmmap.daemon.reclaim import Reclaimer
-from shmmap.daemon.residency import Key, Residency
-from shmmap.daemon.sessions import Peer, Session, Sessions
-from shmmap.daemon.store import Store
-from shmmap.daemon.workers import WorkerPool
+from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.loading.worker_pool import WorkerPool
+from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.requests.operators.operator_requests import Admin
+from shmmap.daemon.transport.sessions import Peer, Session, Sessions
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply

@@ -9,7 +9,7 @@ from typing import Any
 
 import zmq
 
-from shmmap.daemon.connections import Census
+from shmmap.daemon.transport.connections import Census
 
 WAIT_MS = 30_000
 

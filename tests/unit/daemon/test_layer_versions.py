@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from xxhash import xxh3_64_intdigest
 
-from shmmap.daemon import layer_versions
-from shmmap.daemon.layer_versions import LayerVersions
+from shmmap.layers import versions as layer_versions
+from shmmap.layers.versions import LayerVersions
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol import messages as m
 from shmmap.protocol.messages import Selected

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shmmap.layers.build import build_layer
 from shmmap.layers.ground import ground_height
 from shmmap.testing.layer_clouds import CORNERS, corner, surface
-from shmmap.testing.layer_oracles import columns_of, fitted_height, inliers_of, normal_of
+from tests.support.layer_oracles import columns_of, fitted_height, inliers_of, normal_of
 
 TABLES = [name for name in CORNERS if name != "far_apart"]
 

@@ -77,8 +77,8 @@ def add_backend_options(parser: argparse.ArgumentParser | argparse._ArgumentGrou
 
 def matcher_from(args: argparse.Namespace) -> Any:
     """Return the matcher that the options ask for."""
-    from shmmap_clients.ndt_scan_matcher.caps import Caps
-    from shmmap_clients.ndt_scan_matcher.matcher import NdtMatcher, Settings
+    from shmmap_clients.ndt_scan_matcher.matching.limits import Caps
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
 
     settings = Settings(
         convention=args.convention,
@@ -106,10 +106,10 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from shmmap import BadRequest
-    from shmmap_clients.ndt_scan_matcher.angles import matrix_from_pose
-    from shmmap_clients.ndt_scan_matcher.voxel_cell import voxel_cell
-    from shmmap_clients.ndt_scan_matcher.voxel_map import VoxelMap
-    from shmmap_clients.ndt_scan_matcher.worst_case import predict_worst_case
+    from shmmap_clients.ndt_scan_matcher.map.voxel_cell import voxel_cell
+    from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+    from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose
+    from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_worst_case
     from shmmap_clients.scans.scan_file import read_scan
 
     if not args.leaf > 0:

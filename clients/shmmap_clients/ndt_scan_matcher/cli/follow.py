@@ -24,8 +24,8 @@ from shmmap_clients.command_line import (
 from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, matcher_from
 
 if TYPE_CHECKING:
-    from shmmap_clients.ndt_scan_matcher.drive_summary import DriveSummary
-    from shmmap_clients.ndt_scan_matcher.follower import Frame
+    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveSummary
+    from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 
 __all__ = ["add_parser", "run"]
 
@@ -96,13 +96,13 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from shmmap import BadRequest
-    from shmmap_clients.ndt_scan_matcher.angles import matrix_from_pose
-    from shmmap_clients.ndt_scan_matcher.drive_plot import drive_svg
-    from shmmap_clients.ndt_scan_matcher.drive_summary import summarize
-    from shmmap_clients.ndt_scan_matcher.follower import Follower
-    from shmmap_clients.ndt_scan_matcher.map_updater import MapRules, MapUpdater
-    from shmmap_clients.ndt_scan_matcher.pose_stream import OdometryListener, PosePublisher
-    from shmmap_clients.ndt_scan_matcher.prediction import ConstantVelocity, Odometry, Prediction
+    from shmmap_clients.ndt_scan_matcher.drive.drive_plot import drive_svg
+    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
+    from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
+    from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, Prediction
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
+    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+    from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose
     from shmmap_clients.scans.scan_source import open_scans
     from shmmap_clients.scans.trajectory import read_trajectory, tum_line
     from shmmap_clients.streams import is_endpoint

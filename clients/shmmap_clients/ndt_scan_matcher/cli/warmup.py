@@ -25,8 +25,8 @@ def run(args: argparse.Namespace) -> int:
     """Compile, or load what was compiled, and say how long it took."""
     del args
     begin = time.monotonic()
-    from shmmap_clients.ndt_scan_matcher import kernels
-    from shmmap_clients.ndt_scan_matcher.smallest_alignment import align_smallest
+    from shmmap_clients.ndt_scan_matcher.backends import kernels
+    from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
 
     loaded = kernels.loaded_from_cache()
     align_smallest()

@@ -62,7 +62,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from shmmap_clients.ndt_scan_matcher.follower import thinned
+    from shmmap_clients.ndt_scan_matcher.drive.follower import thinned
     from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
     from shmmap_clients.scans.scan_file import read_scan
 

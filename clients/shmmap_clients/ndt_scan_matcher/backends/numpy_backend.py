@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The backend for machines without a compiler: the same sums by whole-array operations.
+
+It holds the map's Gaussians once more, in private arrays of 80 bytes a voxel.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import derivative_matrices, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
+    AX,
+    BJ,
+    JBJ,
+    NEGLIGIBLE_EXPONENT,
+    SUMS,
+    A,
+    B,
+    Evaluation,
+    gauss_for,
+    search_columns,
+    total,
+)
+from shmmap_clients.ndt_scan_matcher.matching.limits import Caps
+from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import SourcePoints
+
+__all__ = ["NumpyBackend"]
+
+_BLOCK_POINTS: Final = 4096  # keeps intermediate arrays within the caches
+
+
+class _Gaussians:
+    """All Gaussians of a map under one lattice key each, in key order."""
+
+    def __init__(self, voxel_map: VoxelMap) -> None:
+        self.map = voxel_map
+        cells = list(voxel_map.cells.values())
+        places = [np.argwhere(cell.lattice >= 0) for cell in cells]
+        rows = [cell.lattice[tuple(place.T)] for cell, place in zip(cells, places, strict=True)]
+        ijk = [place + cell.lattice_origin for cell, place in zip(cells, places, strict=True)]
+        lattice = np.concatenate([np.empty((0, 3), np.int64), *ijk])
+        # one step of room around, so that every neighbour of a clipped index has a key
+        self.low = (lattice.min(axis=0) if len(lattice) else np.zeros(3, np.int64)) - 2
+        self.shape = (lattice.max(axis=0) if len(lattice) else np.zeros(3, np.int64)) - self.low + 3
+        keys = np.ravel_multi_index((lattice - self.low).T, tuple(self.shape))
+        order = np.argsort(keys, kind="stable")
+        self.keys = keys[order]
+        mean = [cell.mean[row] + cell.origin for cell, row in zip(cells, rows, strict=True)]
+        self.mean = np.concatenate([np.empty((0, 3)), *mean])[order]
+        self._rows, self._order = rows, order
+        self._inverse: dict[Covariance, NDArray[np.float64]] = {}
+
+    def inverse(self, covariance: Covariance) -> NDArray[np.float64]:
+        if covariance not in self._inverse:
+            parts = [
+                self.map.inverses(key, covariance)[row]
+                for key, row in zip(self.map.cells, self._rows, strict=True)
+            ]
+            self._inverse[covariance] = np.concatenate([np.empty((0, 6)), *parts])[self._order]
+        return self._inverse[covariance]
+
+
+def _unpacked(packed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Symmetric matrices (V, 3, 3) from their xx, xy, xz, yy, yz, zz."""
+    return packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+class NumpyBackend:
+    """`Backend` by whole-array operations; ``threads`` are not used."""
+
+    name = "numpy"
+
+    def __init__(self, caps: Caps, threads: int = 1) -> None:  # noqa: ARG002
+        self._source = SourcePoints(caps.source_points)
+        self._most = caps.neighbors
+        self._gaussians = _Gaussians(VoxelMap({}))
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def set_map(self, voxel_map: VoxelMap) -> None:
+        """Match against this map from now on."""
+        self._gaussians = _Gaussians(voxel_map)
+
+    def set_source(self, points: NDArray[np.floating]) -> int:
+        """Take a scan; returns how many points the cap left out."""
+        return self._source.take(points)
+
+    def evaluate(
+        self,
+        pose: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        T: NDArray[np.float64] | None = None,
+    ) -> Evaluation:
+        """Return score, gradient and Hessian at a pose vector."""
+        matrix = matrix_from_pose(pose) if T is None else T
+        J = derivative_matrices(pose, pitch_sign)[:3]
+        source = self._source.points
+        blocks = [source[at : at + _BLOCK_POINTS] for at in range(0, len(source), _BLOCK_POINTS)]
+        rows = [self._sums(block, matrix, J, neighbors, covariance) for block in blocks]
+        return total(np.array(rows).reshape(-1, SUMS), pose, pitch_sign)
+
+    def _pairs(
+        self,
+        moved: NDArray[np.float64],
+        neighbors: Neighbors,
+        inverse: NDArray[np.float64],
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], int, int]:
+        """Return points and their neighbours, point by point; and what the cap cut off."""
+        gaussians = self._gaussians
+        leaf = gaussians.map.leaf
+        lattice = np.floor(moved * (1.0 / leaf)) - gaussians.low
+        inside = np.isfinite(lattice).all(axis=1)
+        lattice = np.where(inside[:, None], lattice, 0.0).clip(0, gaussians.shape - 1)
+        inside &= ((lattice >= 1) & (lattice <= gaussians.shape - 2)).all(axis=1)
+        points = np.flatnonzero(inside)
+        strides = np.array([gaussians.shape[1] * gaussians.shape[2], gaussians.shape[2], 1])
+        steps = [
+            (di, dj, dk)
+            for di, dj, low, high in search_columns(neighbors).tolist()
+            for dk in range(low, high + 1)
+        ]
+        keys = (lattice[points].astype(np.int64) @ strides)[:, None] + np.array(steps) @ strides
+        first = np.searchsorted(gaussians.keys, keys)
+        last = np.searchsorted(gaussians.keys, keys, side="right")
+        number = (last - first).ravel()
+        hits = np.flatnonzero(number)
+        repeats = number[hits]
+        # the voxels first, first + 1, ... of each hit: more than one where cells share a lattice place
+        begin = np.cumsum(repeats) - repeats
+        voxel = np.repeat(first.ravel()[hits] - begin, repeats) + np.arange(int(repeats.sum()))
+        point = points[np.repeat(hits // len(steps), repeats)]
+        usable = inverse[voxel, 0] > 0.0  # else refused in this convention
+        distance2 = ((moved[point] - gaussians.mean[voxel]) ** 2).sum(axis=1)
+        if neighbors == "radius":
+            usable &= distance2 <= leaf**2
+        point, voxel, distance2 = point[usable], voxel[usable], distance2[usable]
+        count = np.bincount(point, minlength=len(moved))
+        if not len(count) or count.max() <= self._most:
+            return point, voxel, 0, 0
+        by_distance = np.lexsort((distance2, point))
+        rank = np.arange(len(point)) - (np.cumsum(count) - count)[point]
+        keep = np.sort(by_distance[rank < self._most])
+        surplus = np.maximum(count - self._most, 0)
+        return point[keep], voxel[keep], int((surplus > 0).sum()), int(surplus.sum())
+
+    def _sums(
+        self,
+        source: NDArray[np.float64],
+        matrix: NDArray[np.float64],
+        J: NDArray[np.float64],
+        neighbors: Neighbors,
+        covariance: Covariance,
+    ) -> NDArray[np.float64]:
+        sums = np.zeros(SUMS)
+        gauss = gauss_for(self._gaussians.map.leaf)
+        inverse = self._gaussians.inverse(covariance)
+        with np.errstate(invalid="ignore"):
+            moved = source @ matrix[:3, :3].T + matrix[:3, 3]
+        point, voxel, cut_points, cut_neighbours = self._pairs(moved, neighbors, inverse)
+        if not len(point):
+            return sums
+        near = inverse[voxel]
+        d = moved[point] - self._gaussians.mean[voxel]
+        C = _unpacked(near)
+        q = np.matmul(C, d[:, :, None])[:, :, 0]
+        exponent = 0.5 * gauss.d2 * (d * q).sum(axis=1)
+        e = np.exp(-exponent)
+        e[~((exponent >= 0.0) & (exponent < NEGLIGIBLE_EXPONENT))] = 0.0
+        share = -gauss.d1 * e
+        w = gauss.d1 * gauss.d2 * e
+        starts = np.flatnonzero(np.r_[True, point[1:] != point[:-1]])
+        owner = point[starts]
+        x = source[owner]
+        upper = q[:, [0, 0, 0, 1, 1, 2]] * q[:, [0, 1, 2, 1, 2, 2]]
+        a = np.add.reduceat(w[:, None] * q, starts)
+        b = np.add.reduceat(w[:, None] * (near - gauss.d2 * upper), starts)
+        b_full = _unpacked(b)
+        jacobian = np.matmul(x, J.transpose(2, 1, 0).reshape(3, 9)).reshape(-1, 3, 3)
+        bj = np.matmul(b_full, jacobian)
+        jbj = np.matmul(jacobian.transpose(0, 2, 1), bj).sum(axis=0)
+        sums[0] = share.sum()
+        sums[1] = np.maximum.reduceat(share, starts).sum()
+        sums[2:6] = len(owner), len(point), cut_points, cut_neighbours
+        sums[A] = a.sum(axis=0)
+        sums[AX] = (a.T @ x).ravel()
+        sums[B] = b.sum(axis=0)
+        sums[BJ] = bj.sum(axis=0).ravel()
+        sums[JBJ] = jbj[np.triu_indices(3)]
+        return sums

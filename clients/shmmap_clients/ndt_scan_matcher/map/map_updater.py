@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map around a moving vehicle, kept by Autoware's rules: no scan waits for an update.
+
+`MapUpdater` has a thread that asks the daemon when the vehicle has moved ``update_distance``, and makes
+the next `VoxelMap` beside the one in use (map_update_module of autoware_core does the same with a second
+NDT object).  The caller gets whichever is newest; taking it is an assignment.  Only the first map, and one
+that came too late (``distance + lidar_radius > map_radius``), is waited for.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final
+
+from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
+from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+
+__all__ = ["MapRules", "MapUpdate", "MapUpdater"]
+
+_REFRESH_S: Final = 1.0  # Autoware's timer; also how soon a changed map is noticed
+_REQUEST_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class MapRules:
+    """When to ask for which part of the map; defaults as in Autoware.
+
+    Attributes
+    ----------
+    update_distance
+        Metres moved since the last request, after which the next is due.
+    map_radius
+        Of the area that is asked for, metres (a square of that half-side, Autoware's area test).
+    lidar_radius
+        How far the scanner sees, metres: the area should reach beyond that.
+    leaf
+        Edge of a voxel, metres.
+    max_voxels
+        Cap on the map, see `VoxelMap`.
+    wait_s
+        How long a map that has to be waited for may take.
+    """
+
+    update_distance: float = 20.0
+    map_radius: float = 150.0
+    lidar_radius: float = 100.0
+    leaf: float = 2.0
+    max_voxels: int | None = None
+    wait_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not (self.update_distance >= 0 and self.map_radius > 0 and self.lidar_radius >= 0):
+            raise BadRequest("distances of the map's rules must not be negative")
+        if self.lidar_radius + self.update_distance > self.map_radius:
+            raise BadRequest(
+                f"a map of {self.map_radius} m radius cannot keep {self.lidar_radius} m around a vehicle that"
+                f" asks every {self.update_distance} m",
+                hint="map_radius must be at least lidar_radius + update_distance",
+            )
+
+    @property
+    def layer(self) -> str:
+        """The layer that is asked for."""
+        return canonical_layer(f"ndt(leaf={self.leaf!r})")
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """One change of the map in use.
+
+    Attributes
+    ----------
+    added, removed
+        Cells.
+    request_s
+        From asking until the daemon's cells were attached.
+    build_s
+        For the tables beside the map in use.
+    private_bytes
+        This process's own memory for the new map.
+    """
+
+    added: int
+    removed: int
+    request_s: float
+    build_s: float
+    private_bytes: int
+
+
+class MapUpdater:
+    """Keeps a `VoxelMap` around a pose.
+
+    Parameters
+    ----------
+    client
+        A session with the daemon, or a socket as in `shmmap.connect`: then it has a session of its own.
+    rules
+    prepare
+        Called in the updater's thread with each new map; computes what alignments need of it.
+    name
+        Of its own session, for ``shmmap clients``.
+
+    Raises
+    ------
+    ShmmapError
+        The daemon cannot be reached, or has no such layer.
+    """
+
+    def __init__(
+        self,
+        client: Client | str | os.PathLike[str] | None = None,
+        rules: MapRules | None = None,
+        *,
+        prepare: Callable[[VoxelMap], VoxelMap] = lambda voxel_map: voxel_map,
+        name: str = "shmmap-ndt",
+    ) -> None:
+        self.rules = rules if rules is not None else MapRules()
+        self.updates: list[MapUpdate] = []
+        self.too_slow = 0
+        self._prepare = prepare
+        self._window = MapWindow(
+            client,
+            self.rules.map_radius,
+            layers=self.rules.layer,
+            shape="square",
+            update_distance=0.0,  # when to ask is decided here
+            refresh_interval=_REFRESH_S,
+            background=False,
+            name=name,
+        )
+        self._known: dict[str, tuple[Cell, VoxelCell]] = {}
+        self._latest: tuple[VoxelMap, tuple[float, float]] | None = None
+        self._changed = threading.Condition()
+        self._asked: tuple[float, float, float, float] | None = None
+        self._failed: tuple[float, float, float, float] | None = None
+        self._error: ShmmapError | None = None
+        self._closing = False
+        self._busy = False
+        self._thread = threading.Thread(target=self._run, name="ndt-map", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> MapUpdater:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the thread, and the session if it is its own; a map taken before stays readable."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+        self._window.close()
+
+    @property
+    def error(self) -> ShmmapError | None:
+        """Why the last update failed; None if it did not."""
+        return self._error
+
+    def map_at(self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0) -> tuple[VoxelMap, bool]:
+        """Return the newest map, and whether it had to be waited for.
+
+        Parameters
+        ----------
+        x, y
+            Where the vehicle is, metres, map frame.
+        vx, vy
+            Its velocity, metres per second: what lies ahead is loaded first.
+
+        Raises
+        ------
+        NoAnswer
+            There is still no map that reaches far enough after ``wait_s``.
+        ShmmapError
+            The first map could not be had.
+        """
+        rules = self.rules
+        with self._changed:
+            reached = (
+                self._latest is not None and self._distance(x, y) + rules.lidar_radius <= rules.map_radius
+            )
+            if self._latest is not None and not reached:
+                self.too_slow += 1
+            if self._distance(x, y) > rules.update_distance:
+                self._asked = (x, y, vx, vy)
+                self._changed.notify_all()
+            if not reached:
+                if self._latest is None:
+                    self._error = None  # of an earlier attempt
+                self._wait_for(x, y)
+            assert self._latest is not None  # noqa: S101  # waited for
+            return self._latest[0], not reached
+
+    def wait_until_current(self, timeout_s: float) -> bool:
+        """Wait until everything asked for has been answered; False if it was not in time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._asked is None and not self._busy, timeout_s)
+
+    def _wait_for(self, x: float, y: float) -> None:
+        deadline_s = time.monotonic() + self.rules.wait_s
+        rules = self.rules
+        while self._latest is None or self._distance(x, y) + rules.lidar_radius > rules.map_radius:
+            if self._error is not None and self._latest is None:
+                raise self._error
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                raise NoAnswer(
+                    f"no map around ({x:.1f}, {y:.1f}) within {rules.wait_s:.0f} s",
+                    hint="`shmmap status` tells whether the daemon still loads, or has no budget left",
+                )
+            self._changed.wait(left_s)
+
+    def _distance(self, x: float, y: float) -> float:
+        if self._latest is None:
+            return math.inf
+        at = self._latest[1]
+        return math.hypot(x - at[0], y - at[1])
+
+    # --- the thread -------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._asked is not None or self._closing, _REFRESH_S)
+                if self._closing:
+                    return
+                asked, self._asked = self._asked, None
+                self._busy = True
+                if asked is None and self._failed is not None:
+                    asked = self._failed
+                elif asked is None and self._latest is not None:
+                    asked = (*self._latest[1], 0.0, 0.0)  # has the map itself changed?
+                self._failed = None
+            if asked is not None:
+                self._update(*asked)
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+
+    def _update(self, x: float, y: float, vx: float, vy: float) -> None:
+        try:
+            self._follow(x, y, vx, vy)
+        except Exception as error:  # noqa: BLE001  # a thread that ended would keep all scans waiting
+            with self._changed:
+                if isinstance(error, ShmmapError):
+                    self._error = error
+                else:
+                    self._error = InternalError(f"the map's update failed: {error!r}")
+                self._failed = (x, y, vx, vy)
+                self._changed.notify_all()
+
+    def _follow(self, x: float, y: float, vx: float, vy: float) -> None:
+        begin_s = time.perf_counter()
+        self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
+        cells = self._window.cells
+        if not cells and not self._window.complete:
+            raise NoAnswer("none of the cells could be had", hint="`shmmap status` tells why")
+        request_s = time.perf_counter() - begin_s
+        known = {cell.id: self._voxels(cell) for cell in cells}
+        before = self._latest
+        changed = {key for key in known if self._known.get(key) is not known[key]}
+        gone = self._known.keys() - known.keys()
+        if before is not None and not changed and not gone:
+            voxel_map = before[0]
+        else:
+            begin_s = time.perf_counter()
+            voxel_map = self._prepare(
+                VoxelMap(
+                    {key: voxels for key, (_, voxels) in known.items()},
+                    max_voxels=self.rules.max_voxels,
+                    centre=(x, y),
+                    previous=before[0] if before is not None else None,
+                )
+            )
+            build_s = time.perf_counter() - begin_s
+            self.updates.append(
+                MapUpdate(len(changed), len(gone), request_s, build_s, voxel_map.private_bytes)
+            )
+        with self._changed:
+            self._known = known
+            self._error = None
+            self._latest = (voxel_map, (x, y))
+            if self._asked is not None and self._distance(*self._asked[:2]) <= self.rules.update_distance:
+                self._asked = None  # asked again while this was on its way
+            self._changed.notify_all()
+
+    def _voxels(self, cell: Cell) -> tuple[Cell, VoxelCell]:
+        known = self._known.get(cell.id)
+        if known is not None and known[0].version == cell.version and known[0].segment == cell.segment:
+            return known
+        return cell, cell_from_layer(cell)

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many cells as one map, without copying them: a small private table of where their arrays lie.
+
+A kernel compiled once cannot take 256 mappings as arguments.  It takes the *table* instead: per cell
+the addresses of three arrays and the cell's lattice box, 11 integers.  All cells of one leaf size share
+one global lattice, so that a point's lattice index is right for every cell; the *directory* says, for
+each lattice column (i, j), which cells have it.  A column on a border belongs to both cells, and their
+voxels are never merged: both Gaussians count, as in Autoware.
+
+Private memory: 100 bytes a cell, 4 bytes a lattice column; and 48 bytes a voxel where the covariances
+are not those that the cells hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import BadRequest, voxel_covariances
+from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
+
+__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
+
+Covariance = Literal["autoware", "pclomp", "pcl"]
+
+TABLE_COLUMNS: Final = 11  # addresses of lattice, mean, inverse; i0 j0 k0; nk; strides; voxels
+_MAX_COLUMNS: Final = 1 << 22  # 16 MiB of directory: 2 km x 2 km at 1 m
+
+Inverses = dict[Covariance, NDArray[np.float64]]
+
+
+class VoxelMap:
+    """The cells a scan is matched against; immutable, so that a successor can be made beside it.
+
+    Parameters
+    ----------
+    cells
+        By any key; their order is the order of summation.
+    max_voxels
+        Cells nearest to ``centre`` are taken until the next would exceed this; the others are left
+        out and counted.
+    centre
+        (x, y), metres, map frame; by default the middle of all cells.
+    previous
+        A map whose derived tables are used again for the cells that both have.
+
+    Raises
+    ------
+    BadRequest
+        Cells have different leaf sizes, or lie so far apart that the directory would not be small.
+    """
+
+    def __init__(
+        self,
+        cells: Mapping[str, VoxelCell],
+        *,
+        max_voxels: int | None = None,
+        centre: tuple[float, float] | None = None,
+        previous: VoxelMap | None = None,
+    ) -> None:
+        leaves = {cell.leaf for cell in cells.values()}
+        if len(leaves) > 1:
+            raise BadRequest(f"cells of one map must have one leaf size, these have {sorted(leaves)}")
+        self.leaf: float = leaves.pop() if leaves else 1.0
+        kept, self.voxels_left_out = _within(cells, max_voxels, centre)
+        self.cells: dict[str, VoxelCell] = kept
+        self.voxels = sum(len(cell.count) for cell in kept.values())
+        self.origins = np.array([cell.origin for cell in kept.values()]).reshape(-1, 3)
+        self._derived: dict[str, Inverses] = {}
+        if previous is not None:
+            self._derived = {
+                key: previous._derived[key]
+                for key, cell in kept.items()
+                if previous.cells.get(key) is cell and key in previous._derived
+            }
+        self.box, self.column_start, self.column_cell = _directory(list(kept.values()))
+        self._tables: dict[Covariance, NDArray[np.int64]] = {}
+
+    def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
+        """Return (V, 6) inverse covariances of a cell; its own where it holds them already."""
+        cell = self.cells[key]
+        if covariance == "autoware":
+            return cell.inverse
+        derived = self._derived.setdefault(key, {})
+        if covariance not in derived:
+            derived[covariance] = voxel_covariances(cell.count, cell.scatter, covariance)[1]
+        return derived[covariance]
+
+    def table(self, covariance: Covariance) -> NDArray[np.int64]:
+        """Return the kernel's table, (C, `TABLE_COLUMNS`); valid as long as this map lives."""
+        table = self._tables.get(covariance)
+        if table is None:
+            rows = [_row(cell, self.inverses(key, covariance)) for key, cell in self.cells.items()]
+            table = np.array(rows, np.int64).reshape(-1, TABLE_COLUMNS)
+            self._tables[covariance] = table
+        return table
+
+    @property
+    def private_bytes(self) -> int:
+        """Bytes of this process's own memory that the map takes."""
+        return (
+            self.column_start.nbytes
+            + self.column_cell.nbytes
+            + self.origins.nbytes
+            + sum(table.nbytes for table in self._tables.values())
+            + sum(array.nbytes for derived in self._derived.values() for array in derived.values())
+        )
+
+
+def _within(
+    cells: Mapping[str, VoxelCell], max_voxels: int | None, centre: tuple[float, float] | None
+) -> tuple[dict[str, VoxelCell], int]:
+    total = sum(len(cell.count) for cell in cells.values())
+    if max_voxels is None or total <= max_voxels:
+        return dict(cells), 0
+    keys = list(cells)
+    low = np.array([cell.lattice_origin[:2] for cell in cells.values()], np.float64)
+    size = np.array([cell.lattice.shape[:2] for cell in cells.values()], np.float64)
+    middle = (low + size / 2) * next(iter(cells.values())).leaf
+    target = np.array(centre) if centre is not None else middle.mean(axis=0)
+    chosen: set[str] = set()
+    count = 0
+    for index in np.argsort(((middle - target) ** 2).sum(axis=1), kind="stable"):
+        size_here = len(cells[keys[index]].count)
+        if count + size_here > max_voxels:
+            break
+        count += size_here
+        chosen.add(keys[index])
+    return {key: cell for key, cell in cells.items() if key in chosen}, total - count
+
+
+def _directory(
+    cells: Iterable[VoxelCell],
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
+    """Return (i0, j0, ni, nj), where each column's cells start, and the cells."""
+    boxes = [
+        (index, *map(int, cell.lattice_origin[:2]), *cell.lattice.shape[:2])
+        for index, cell in enumerate(cells)
+        if len(cell.count)
+    ]
+    if not boxes:
+        return np.zeros(4, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
+    i0, j0 = (min(box[axis] for box in boxes) for axis in (1, 2))
+    ni, nj = (max(box[axis] + box[axis + 2] for box in boxes) - low for axis, low in ((1, i0), (2, j0)))
+    if ni * nj > _MAX_COLUMNS:
+        raise BadRequest(
+            f"the cells span {ni} x {nj} voxels, more than a map for matching may have",
+            hint="match against the cells around the pose, not against a whole city",
+        )
+    blocks = [
+        (index, slice(i - i0, i - i0 + di), slice(j - j0, j - j0 + dj)) for index, i, j, di, dj in boxes
+    ]
+    number = np.zeros((ni, nj), np.int32)
+    for _, across, along in blocks:
+        number[across, along] += 1
+    start = np.zeros(ni * nj + 1, np.int32)
+    np.cumsum(number.ravel(), out=start[1:])
+    free = start[:-1].reshape(ni, nj).copy()
+    column_cell = np.zeros(max(1, int(start[-1])), np.int32)
+    for index, across, along in blocks:
+        column_cell[free[across, along]] = index
+        free[across, along] += 1
+    return np.array([i0, j0, ni, nj], np.int64), start, column_cell
+
+
+def _row(cell: VoxelCell, inverse: NDArray[np.float64]) -> list[int]:
+    for array, dtype in ((cell.lattice, np.int32), (cell.mean, np.float64), (inverse, np.float64)):
+        if array.dtype != dtype:
+            raise BadRequest(f"a cell's array has dtype {array.dtype}, not {np.dtype(dtype)}")
+    if not (cell.mean.flags.c_contiguous and inverse.flags.c_contiguous):
+        raise BadRequest("a cell's arrays must be contiguous")
+    return [
+        cell.lattice.ctypes.data,
+        cell.mean.ctypes.data,
+        inverse.ctypes.data,
+        *map(int, cell.lattice_origin),
+        cell.lattice.shape[2],
+        *(stride // cell.lattice.itemsize for stride in cell.lattice.strides),
+        len(cell.count),
+    ]

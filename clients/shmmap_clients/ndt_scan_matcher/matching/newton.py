@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Newton's method on the score: the alignment itself (algorithm 2 of Magnusson 2009)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
+from shmmap_clients.ndt_scan_matcher.matching.more_thuente import search_step
+from shmmap_clients.ndt_scan_matcher.matching.variants import Convention
+
+__all__ = ["Ascent", "StepRule", "ascend"]
+
+# what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
+_SINGULAR: Final = 6 * np.finfo(np.float64).eps
+
+_BACK: Final = 0.5  # negated cosine between steps of which one goes back on the other
+_MAY_LOSE: Final = 0.1  # of the score, by one steady step
+_FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
+
+Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
+
+
+@dataclass(frozen=True, slots=True)
+class StepRule:
+    """How far a step goes, and when to stop.
+
+    Attributes
+    ----------
+    convention
+    epsilon
+        Metres and radians (the 6-norm of a step), as ``transformation_epsilon``; a step is at least half.
+    max_step
+        Longest step, the same norm.
+    max_iterations
+    line_search
+        More-Thuente's instead of a clipped Newton step.
+    steady
+        The originals may swing between two places until iterations are up: where the score is not concave
+        they go back along a step that would lead down, and a step across the peak is answered by the same
+        one back.  Here curvatures count by their magnitude (saddle-free Newton, Dauphin 2014), so that every
+        step sets out upwards.  Steps may end a tenth lower, and so leave small peaks behind, until one goes
+        back on the one before, then no lower; instead of others the longest step is halved.
+    """
+
+    convention: Convention
+    epsilon: float
+    max_step: float
+    max_iterations: int
+    line_search: bool
+    steady: bool = False
+
+
+@dataclass(slots=True)
+class Ascent:
+    """The way from the guess to the peak."""
+
+    pose: NDArray[np.float64]
+    last: Evaluation
+    evaluations: list[Evaluation]
+    transforms: list[NDArray[np.float64]] = field(default_factory=list)
+    iterations: int = 0
+    converged: bool = False
+
+
+def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> Ascent:
+    """Climb from a guess.
+
+    Parameters
+    ----------
+    T_guess : (4, 4) float64
+    evaluate
+        Gives an evaluation for a pose vector and a pitch sign.
+    rule
+    """
+    pose = pose_from_matrix(T_guess)
+    at = evaluate(pose, rule.convention.pitch_sign)
+    ascent = Ascent(pose, at, [at], [T_guess])
+    longest, before, settling = rule.max_step, np.zeros(6), False
+    while True:
+        step = _upward_step(at) if rule.steady else _newton_step(at)
+        wanted = float(np.linalg.norm(step))
+        if wanted == 0.0 or wanted != wanted:
+            ascent.converged = wanted == 0.0 and at.found > 0
+            return ascent
+        direction = step / wanted
+        if rule.steady and not settling and float(direction @ before) < -_BACK:
+            settling, longest = True, longest / 2
+        length, direction, reached = _take_step(ascent, at, wanted, direction, evaluate, rule, longest)
+        may_lose = 0.0 if settling else _MAY_LOSE * abs(at.score)
+        if rule.steady and reached.score < at.score - may_lose:
+            longest = length / 2
+        else:
+            ascent.pose = ascent.pose + direction * length
+            ascent.last = at = reached
+            before = direction
+            longest = min(2 * longest, rule.max_step)
+        ascent.transforms.append(matrix_from_pose(ascent.pose))
+        # a steady step may be short because it was cut short: that is not yet the peak
+        small = _is_small(ascent.iterations, wanted if rule.steady else length, direction, rule)
+        small = small or (rule.steady and longest < rule.epsilon / 2.0)
+        ascent.iterations += 1
+        if small or _is_last(ascent.iterations, rule):
+            ascent.converged = small
+            return ascent
+
+
+def _newton_step(at: Evaluation) -> NDArray[np.float64]:
+    """Solve H step = -gradient in the least-squares sense, as JacobiSVD does."""
+    if not np.isfinite(at.hessian).all():
+        return np.full(6, np.nan)
+    u, s, vt = np.linalg.svd(at.hessian)
+    if not s[0] > 0:
+        return np.zeros(6)
+    usable = s > max(s[0] * _SINGULAR, np.finfo(np.float64).tiny)
+    coefficients = np.zeros(6)
+    coefficients[usable] = (u.T @ -at.gradient)[usable] / s[usable]
+    return np.asarray(vt.T @ coefficients, np.float64)
+
+
+def _upward_step(at: Evaluation) -> NDArray[np.float64]:
+    """Return the step to the peak of a paraboloid that curves down by the Hessian's magnitudes."""
+    if not np.isfinite(at.hessian).all():
+        return np.full(6, np.nan)
+    values, vectors = np.linalg.eigh(at.hessian)
+    curvature = np.abs(values)
+    if not curvature.max() > 0:
+        return np.zeros(6)
+    curvature = np.maximum(curvature, curvature.max() * _FLAT)
+    return np.asarray(vectors @ ((vectors.T @ at.gradient) / curvature), np.float64)
+
+
+def _take_step(
+    ascent: Ascent,
+    at: Evaluation,
+    length: float,
+    direction: NDArray[np.float64],
+    evaluate: Evaluate,
+    rule: StepRule,
+    longest: float,
+) -> tuple[float, NDArray[np.float64], Evaluation]:
+    """Return the step's length and direction, and the evaluation where it ends."""
+    sign = rule.convention.pitch_sign
+    slope = -float(at.gradient @ direction)
+    if slope == 0.0:
+        return 0.0, direction, at
+    if slope > 0.0:  # away from the peak: the Hessian is not negative definite here
+        slope, direction = -slope, -direction
+    shortest = rule.epsilon / 2.0
+    start, latest = ascent.pose, at
+
+    def phi(a: float) -> tuple[float, float]:
+        nonlocal latest
+        latest = evaluate(start + direction * a, sign)
+        ascent.evaluations.append(latest)
+        return -latest.score, -float(latest.gradient @ direction)
+
+    if not rule.line_search:
+        length = max(min(length, longest), shortest)
+        phi(length)
+        return length, direction, latest
+    length, trials = search_step(
+        length, shortest, longest, -at.score, slope, phi, by_upper_end=rule.convention.name == "pcl"
+    )
+    if trials and sign > 0:
+        # ndt_omp computes the Hessian anew after a search, and there with the right sign
+        latest = evaluate(start + direction * length, -1.0)
+    return length, direction, latest
+
+
+def _is_small(iterations_before: int, length: float, direction: NDArray[np.float64], rule: StepRule) -> bool:
+    if rule.convention.stop == "squared_translation":
+        translation = direction[:3] * length
+        return float(translation @ translation) <= rule.epsilon
+    if rule.convention.stop == "step_late" and not iterations_before:
+        return False
+    return abs(length) < rule.epsilon
+
+
+def _is_last(iterations: int, rule: StepRule) -> bool:
+    # ndt_omp compares before it counts, and with "greater than"
+    extra = 2 if rule.convention.stop == "step_late" else 0
+    return iterations >= rule.max_iterations + extra

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an alignment gives, and how Autoware judges it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ndt_scan_matcher.matching.limits import Cut
+
+__all__ = ["NVTL_THRESHOLD", "TP_THRESHOLD", "Result", "covariance_of", "oscillations"]
+
+# ndt_scan_matcher.param.yaml of autoware_core
+TP_THRESHOLD: Final = 3.0
+NVTL_THRESHOLD: Final = 2.3
+MAX_OSCILLATIONS: Final = 10
+_INVERSION: Final = -0.9  # cosine between two steps that counts as going back
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """A scan's pose in the map.
+
+    Attributes
+    ----------
+    T_map_base : (4, 4) float64
+        Metres, map frame.
+    iterations
+        Newton steps, counted as the convention's program counts them.
+    converged
+        The last step was below epsilon, not merely the last one allowed; of the fine part where there is
+        one.
+    transform_probability
+        Score per point of the scan.
+    nvtl
+        Nearest-voxel transformation likelihood.
+    transforms : (k, 4, 4) float64
+        The guess, then the pose after each step.
+    transform_probabilities, nvtls : (m,) float64
+        Of every evaluation, in order: k of them without a line search.
+    hessian : (6, 6) float64
+        Of the score at the last evaluation, after (x, y, z, roll, pitch, yaw).
+    covariance : (6, 6) float64 or None
+        Laplace's approximation, the inverse of the negated Hessian; None where the score has no peak
+        there.
+    oscillations
+        Longest run of steps each of which goes back on the one before.
+    evaluations
+        Passes over the scan.
+    cut
+        What the caps left out.
+    """
+
+    T_map_base: NDArray[np.float64]
+    iterations: int
+    converged: bool
+    transform_probability: float
+    nvtl: float
+    transforms: NDArray[np.float64]
+    transform_probabilities: NDArray[np.float64]
+    nvtls: NDArray[np.float64]
+    hessian: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None
+    oscillations: int
+    evaluations: int
+    cut: Cut
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether Autoware would publish this pose: converged, NVTL of at least 2.3, not swinging.
+
+        No score detects every divergence: a pose metres away may have an NVTL above the threshold.
+        """
+        return self.converged and self.nvtl >= NVTL_THRESHOLD and self.oscillations <= MAX_OSCILLATIONS
+
+
+def covariance_of(hessian: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the inverse of the negated Hessian, or None if that is not positive definite."""
+    try:
+        np.linalg.cholesky(-hessian)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(np.linalg.inv(-hessian), np.float64)
+
+
+def oscillations(transforms: NDArray[np.float64]) -> int:
+    """Count as Autoware's count_oscillation: the longest run of reversed steps."""
+    steps = np.diff(transforms[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
+    units = steps / np.where(lengths > 0, lengths, 1.0)
+    run = longest = 0
+    for cosine in (units[1:] * units[:-1]).sum(axis=1):
+        run = run + 1 if cosine < _INVERSION else 0
+        longest = max(longest, run)
+    return longest

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long an alignment can take at most: evaluations times points times the cost of one, measured here.
+
+The three caps bound the work: no scan, map or guess makes it more.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import pose_from_matrix
+from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
+
+__all__ = ["WorstCase", "predict_worst_case"]
+
+_REPEATS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class WorstCase:
+    """A bound of the time of one alignment on this machine.
+
+    Attributes
+    ----------
+    evaluations
+        Passes over the scan, at most.
+    points
+        Of a scan, at most.
+    point_ns
+        CPU time of one point in one pass, measured on the given scan, scaled up to as many neighbours
+        as the cap allows.
+    """
+
+    evaluations: int
+    points: int
+    point_ns: float
+
+    @property
+    def total_ms(self) -> float:
+        """The bound, milliseconds on one thread that has a processor for itself."""
+        return self.evaluations * self.points * self.point_ns * 1e-6
+
+    def describe(self) -> str:
+        """Return the bound with what it is made of."""
+        return (
+            f"at most {self.total_ms:.0f} ms by the caps"
+            f" ({self.evaluations} evaluations x {self.points} points x {self.point_ns:.0f} ns)"
+        )
+
+
+def predict_worst_case(
+    matcher: NdtMatcher, points: NDArray[np.floating], T: NDArray[np.float64]
+) -> WorstCase:
+    """Predict from the caps and from evaluations of one scan.
+
+    Parameters
+    ----------
+    matcher
+        With a map.
+    points : (N, 3)
+        A typical scan.
+    T : (4, 4)
+        Where it lies.
+    """
+    pose = pose_from_matrix(T)[None, :]
+    costs = []
+    per_point = 1.0
+    for _ in range(_REPEATS):
+        begin = time.thread_time_ns()
+        at = matcher.evaluate(points, pose)[0]
+        costs.append(time.thread_time_ns() - begin)
+        per_point = max(at.neighbours / max(len(points), 1), 1.0)
+    used = max(min(len(points), matcher.caps.source_points), 1)
+    # what a point costs grows no faster than its neighbours
+    ceiling = max(1.0, matcher.most_neighbors / per_point)
+    return WorstCase(matcher.most_evaluations, matcher.caps.source_points, min(costs) / used * ceiling)

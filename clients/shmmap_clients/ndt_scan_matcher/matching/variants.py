@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each of the three NDT programs does its own way: covariances, when to stop, one sign."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from shmmap import BadRequest
+from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
+
+__all__ = ["CONVENTIONS", "Convention", "Stop", "convention_named"]
+
+Stop = Literal["step", "step_late", "squared_translation"]
+
+
+@dataclass(frozen=True, slots=True)
+class Convention:
+    """One program's way to align.
+
+    Attributes
+    ----------
+    name
+    covariance
+        How voxels' covariances come from their moments.
+    stop
+        ``"step"``: the step's 6-norm falls below epsilon, or iterations are up.  ``"step_late"``: the same,
+        but never after the first step, and two iterations later.  ``"squared_translation"``: the step's
+        translation, squared, is at most epsilon.
+    pitch_sign
+        Sign in the second derivative after pitch; ndt_omp has the wrong one, but not in the Hessian that
+        it computes after a line search.
+    line_search
+        Whether More-Thuente's line search is the default; else Newton's step is clipped.
+    neighbors, epsilon, max_iterations
+        Defaults.
+    """
+
+    name: str
+    covariance: Covariance
+    stop: Stop
+    pitch_sign: float
+    line_search: bool
+    neighbors: Neighbors
+    epsilon: float
+    max_iterations: int
+
+
+CONVENTIONS: Final = {
+    convention.name: convention
+    for convention in (
+        # autoware_core 2026-08, multigrid_ndt_omp; defaults of ndt_scan_matcher.param.yaml
+        Convention("autoware", "autoware", "step", -1.0, False, "radius", 0.01, 30),
+        # koide3/ndt_omp
+        Convention("pclomp", "pclomp", "step_late", 1.0, True, "direct7", 0.1, 35),
+        # PCL 1.13, pcl::NormalDistributionsTransform
+        Convention("pcl", "pcl", "squared_translation", -1.0, True, "radius", 0.1, 35),
+    )
+}
+
+
+def convention_named(name: str) -> Convention:
+    """Return one of `CONVENTIONS`; `BadRequest` lists them for another name."""
+    if name not in CONVENTIONS:
+        raise BadRequest(f"unknown convention {name!r}", hint=f"conventions are: {', '.join(CONVENTIONS)}")
+    return CONVENTIONS[name]

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``shmmap map`` draws: cells by state, clients and the areas they follow; and two ways to draw it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.screens.picture import CellSquare, Vehicle, WindowBox, top_view_svg
+
+if TYPE_CHECKING:
+    from shmmap.statistics.cell_rows import CellRow
+    from shmmap.statistics.client_rows import ClientRow
+
+__all__ = ["GLYPHS", "Scene", "html_page", "svg", "terminal_rows"]
+
+BoxTuple: TypeAlias = tuple[float, float, float, float]
+
+GLYPHS: Final = {
+    # state: glyph, style on a terminal
+    "resident": ("#", "green"),
+    "stale": ("s", "yellow"),
+    "zombie": ("z", "magenta"),
+    "disk": (".", "bright_black"),
+    "window": ("o", "red"),
+    "client": ("@", "bold red"),
+    "none": (" ", ""),
+}
+_ORDER: Final = ("zombie", "stale", "resident")  # the last one of a cell's states is what is drawn
+CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wide
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything there is to draw.
+
+    Attributes
+    ----------
+    bounds
+        What is shown, metres, map frame.
+    disk
+        Boxes of all cells of the map, resident or not.
+    rows
+        Segments in memory.
+    clients
+        Who is connected.
+    now_ns
+        CLOCK_MONOTONIC of ``rows`` and ``clients``.
+    title, note
+        Two lines.
+    """
+
+    bounds: BoxTuple
+    disk: Sequence[tuple[str, BoxTuple]]
+    rows: Sequence[CellRow]
+    clients: Sequence[ClientRow]
+    now_ns: int
+    title: str
+    note: str
+
+    def by_cell(self) -> dict[str, list[CellRow]]:
+        """Segments of each cell, the most telling state last."""
+        found: dict[str, list[CellRow]] = {}
+        for row in sorted(self.rows, key=lambda row: _ORDER.index(row.state) if row.state in _ORDER else -1):
+            found.setdefault(row.id, []).append(row)
+        return found
+
+
+# --- on a terminal ------------------------------------------------------------------------------------
+
+
+def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
+    """Return the picture as rows of states, north up; a position is a name in `GLYPHS`."""
+    min_x, min_y, max_x, max_y = scene.bounds
+    span_x, span_y = max(max_x - min_x, 1e-9), max(max_y - min_y, 1e-9)
+    step = max(span_x / columns, span_y / (lines * CHARACTER_ASPECT))
+    width = max(1, min(columns, math.ceil(span_x / step)))
+    height = max(1, min(lines, math.ceil(span_y / (step * CHARACTER_ASPECT))))
+    grid = [["none"] * width for _ in range(height)]
+
+    def column(x: float) -> int:
+        return math.floor((x - min_x) / span_x * width)
+
+    def line(y: float) -> int:
+        return math.floor((max_y - y) / span_y * height)
+
+    def fill(box: BoxTuple, state: str) -> None:
+        # a position belongs to the cell that its middle lies in; a cell too small for one still shows
+        first, last = (
+            math.ceil((box[0] - min_x) / span_x * width - 0.5),
+            math.ceil((box[2] - min_x) / span_x * width - 0.5),
+        )
+        top, bottom = (
+            math.ceil((max_y - box[3]) / span_y * height - 0.5),
+            math.ceil((max_y - box[1]) / span_y * height - 0.5),
+        )
+        for row in range(max(top, 0), min(max(bottom, top + 1), height)):
+            for at in range(max(first, 0), min(max(last, first + 1), width)):
+                grid[row][at] = state
+
+    for _, box in scene.disk:
+        fill(box, "disk")
+    for rows in scene.by_cell().values():
+        fill(rows[-1].box, rows[-1].state)
+    for client in scene.clients:
+        for x, y in _outline(client):
+            if 0 <= line(y) < height and 0 <= column(x) < width:
+                grid[line(y)][column(x)] = "window"
+    for client in scene.clients:
+        if client.pose is not None:
+            row, at = line(client.pose[1]), column(client.pose[0])
+            if 0 <= row < height and 0 <= at < width:
+                grid[row][at] = "client"
+    return grid
+
+
+def _outline(client: ClientRow, points: int = 180) -> list[tuple[float, float]]:
+    window = client.window
+    if window is None:
+        return []
+    if window.shape == "circle":
+        turns = [2 * math.pi * i / points for i in range(points)]
+        return [
+            (window.x + window.half_x * math.cos(t), window.y + window.half_y * math.sin(t)) for t in turns
+        ]
+    steps = [2 * i / (points // 4) - 1 for i in range(points // 4)]
+    sides = [side for s in steps for side in ((s, -1.0), (s, 1.0), (-1.0, s), (1.0, s))] + [(1.0, 1.0)]
+    return [(window.x + a * window.half_x, window.y + b * window.half_y) for a, b in sides]
+
+
+# --- as a file ----------------------------------------------------------------------------------------
+
+
+def svg(scene: Scene) -> str:
+    """Return the picture as SVG, with a tooltip on every cell and client."""
+    known = scene.by_cell()
+    cells = [CellSquare(box, "", f"{name}\non disk") for name, box in scene.disk if name not in known]
+    cells += [
+        CellSquare(rows[-1].box, rows[-1].state, _cell_title(rows, scene.now_ns)) for rows in known.values()
+    ]
+    vehicles, windows = [], []
+    for client in scene.clients:
+        title, window = _client_title(client, scene.now_ns), client.window
+        circle = window is not None and window.shape == "circle"
+        if window is not None and not circle:
+            x, y, half_x, half_y = window[1:]
+            windows.append(WindowBox((x - half_x, y - half_y, x + half_x, y + half_y), title))
+        if client.pose is not None:
+            radius = window.half_x if window is not None and circle else 0.0
+            label = client.client or client.command
+            vehicles.append(Vehicle(*client.pose, client.heading, radius, title, label))
+    return top_view_svg(
+        scene.bounds, cells, title=scene.title, note=scene.note, others=vehicles, windows=windows
+    )
+
+
+def _cell_title(rows: Sequence[CellRow], now_ns: int) -> str:
+    lines = [rows[-1].id]
+    for row in rows:
+        idle_s = max(now_ns - row.last_use_monotonic_ns, 0) * 1e-9
+        lines.append(
+            f"{row.layer}: {row.state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
+            f" used {format_duration(idle_s)} ago, loaded in {format_duration(row.load_ns * 1e-9)}"
+        )
+    return "\n".join(lines)
+
+
+def _client_title(client: ClientRow, now_ns: int) -> str:
+    idle_s = max(now_ns - client.last_request_monotonic_ns, 0) * 1e-9
+    return (
+        f"{client.client or client.command or 'a client'}, pid {client.pid or '?'}\n"
+        f"{client.cells:,} cells, {format_bytes(client.bytes)}, {client.requests:,} requests,"
+        f" the last {format_duration(idle_s)} ago"
+    )
+
+
+_STYLE: Final = """
+  body { font: 14px/1.45 system-ui, sans-serif; color: #1f2933; margin: 1.5em auto; max-width: 1000px; }
+  table { border-collapse: collapse; margin: 1em 0; } td, th { padding: .15em .8em; text-align: right; }
+  th { border-bottom: 1px solid #9aa5b1; } td:first-child, th:first-child { text-align: left; }
+  svg { max-width: 100%; height: auto; }
+  svg rect.cell:hover { stroke: #000; stroke-opacity: 1; stroke-width: 2; }
+"""
+
+
+def html_page(scene: Scene) -> str:
+    """Return a page that needs nothing else: the picture, its tooltips, and the clients as a table."""
+    rows = "".join(
+        f"<tr><td>{escape(c.client or c.command or '?')}</td><td>{c.pid or '?'}</td><td>{c.cells:,}</td>"
+        f"<td>{format_bytes(c.bytes)}</td><td>{c.requests:,}</td>"
+        f"<td>{f'{c.pose[0]:.1f}, {c.pose[1]:.1f}' if c.pose is not None else ''}</td></tr>"
+        for c in scene.clients
+    )
+    table = (
+        "<table><tr><th>client</th><th>pid</th><th>cells</th><th>holds</th><th>requests</th><th>at</th></tr>"
+        f"{rows}</table>"
+        if rows
+        else "<p>Nobody is connected.</p>"
+    )
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(scene.title)}</title>'
+        f"<style>{_STYLE}</style></head>\n<body>\n{svg(scene)}{table}\n</body></html>\n"
+    )

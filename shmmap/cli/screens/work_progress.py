@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a long run is, on stderr: a line redrawn on a terminal, a line now and then in a pipe."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Final, TextIO
+
+from shmmap.cli.screens.output import format_duration
+
+__all__ = ["StageProgress"]
+
+_REDRAW_S: Final = 0.2
+_LINE_S: Final = 10.0  # between lines where each one stays
+_SETTLE_S: Final = 1.0  # before that, no rate is worth showing
+
+
+class StageProgress:
+    """Shows stage, part done, rate and time left; a `shmmap.dividing.progress.Progress`.
+
+    Parameters
+    ----------
+    stream
+        Where to; stderr by default.
+    quiet
+        Show nothing.
+    unit, scale
+        What is counted, and how much of it is shown as 1.
+    """
+
+    def __init__(
+        self,
+        stream: TextIO | None = None,
+        *,
+        quiet: bool = False,
+        unit: str = "M points",
+        scale: float = 1e6,
+    ) -> None:
+        self._stream = stream or sys.stderr
+        self._live = self._stream.isatty()
+        self._quiet = quiet
+        self._unit = unit
+        self._scale = scale
+        self._digits = 1 if scale > 1 else 0
+        self._began_s = time.monotonic()
+        self._name = ""
+        self._total = self._points = self._counted_from = 0
+        self._stage_s = self._shown_s = self._began_s
+
+    def stage(self, name: str, total: int) -> None:
+        """A stage begins."""
+        self._end_line()
+        self._name, self._total, self._points, self._counted_from = name, total, 0, -1
+        self._stage_s = self._shown_s = time.monotonic()
+        if total:
+            self._show()
+
+    def advance(self, points: int) -> None:
+        """So many more points are done."""
+        self._points += points
+        if self._counted_from < 0:
+            self._counted_from = self._points  # what a resumed run finds done says nothing of its rate
+        now = time.monotonic()
+        if now - self._shown_s >= (_REDRAW_S if self._live else _LINE_S):
+            self._shown_s = now
+            self._show()
+
+    def done(self, points: int) -> None:
+        """Everything is done."""
+        del points
+        self._end_line()
+
+    def text(self, now: float) -> str:
+        """The line as it would be shown at ``now``, `time.monotonic`."""
+        part = f"{self._points / self._total:4.0%}  " if self._total else ""
+        text = f"{self._name}  {part}{self._number(self._points)} of {self._number(self._total)} {self._unit}"
+        spent = now - self._stage_s
+        if spent < _SETTLE_S or self._points <= self._counted_from:
+            return text
+        rate = (self._points - max(0, self._counted_from)) / spent
+        left = (self._total - self._points) / rate
+        return (
+            f"{text}  {rate / self._scale:.1f}{' M' if self._digits else ''}/s  {format_duration(left)} left"
+        )
+
+    def _number(self, count: float) -> str:
+        return f"{count / self._scale:,.{self._digits}f}"
+
+    def _show(self) -> None:
+        if self._quiet:
+            return
+        text = self.text(time.monotonic())
+        if self._live:
+            self._stream.write(f"\r{text}\x1b[K")
+        else:
+            self._stream.write(text + "\n")
+        self._stream.flush()
+
+    def _end_line(self) -> None:
+        if self._live and self._name and not self._quiet:
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap config``: check settings, say where each comes from, write a file to start with."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from shmmap.cli.options import Subparsers, add_json_option, add_verb
+from shmmap.cli.screens.output import print_json
+from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapMissing
+
+__all__ = ["add_parser", "run_check", "run_init", "run_show"]
+
+_SHOW_JSON = """\
+  {"file": path or null, "settings": {name: {"value", "origin": FILE:LINE, a variable or "default"}}}"""
+
+_CHECK_JSON = """\
+  {"file": path or null, "good": true}
+Exit code: 0 good, 66 no map there, 78 a mistake; those that the daemon would end with."""
+
+_EPILOG = """\
+`check` and `show` read FILE, or the one that the installed service reads, and SHMMAP_* variables."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "config",
+        run_show,
+        help="check, show or start a configuration",
+        description="Look for mistakes in the settings, show them, or write a file with all of them.",
+        epilog=_EPILOG,
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    check = add_verb(
+        actions,
+        "check",
+        run_check,
+        help="look for mistakes",
+        description="Look for mistakes in the settings.",
+        json=_CHECK_JSON,
+    )
+    show = add_verb(
+        actions,
+        "show",
+        run_show,
+        help="print every setting",
+        description="Print every setting as it counts.",
+        json=_SHOW_JSON,
+    )
+    show.add_argument("--origin", action="store_true", help="say where each setting comes from")
+    for one in (check, show):
+        one.add_argument(
+            "file", metavar="FILE", nargs="?", default="", help="TOML file (default: the installed service's)"
+        )
+        add_json_option(one)
+    init = add_verb(
+        actions,
+        "init",
+        run_init,
+        help="write a file that explains every setting",
+        description="Write a file that explains every setting.  Nothing is overwritten.",
+    )
+    init.add_argument("file", metavar="FILE", nargs="?", default="shmmap.toml", help="default: shmmap.toml")
+    init.add_argument("--map", metavar="DIR", default="", help="the map to serve")
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Look for what would keep the daemon from starting."""
+    from shmmap.daemon.config import load_config
+    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.prerequisites import access_of_segments
+
+    file = args.file or installed_config_file()
+    config = load_config({}, file=file)
+    access_of_segments(config)
+    if not config.map_path:
+        raise ConfigError("no map is named", key="map_path", hint="set map_path, or give `shmmap serve MAP`")
+    if not os.path.exists(config.map_path):
+        raise MapMissing(f"there is no map at {config.map_path}", hint="map_path names it")
+    if args.json:
+        print_json({"file": file or None, "good": True})
+    else:
+        print(f"{file or 'no file'}: good")
+    return 0
+
+
+def run_show(args: argparse.Namespace) -> int:
+    """Print every setting."""
+    from shmmap.daemon.config import trace_settings
+    from shmmap.daemon.config_file import installed_config_file
+
+    file = args.file or installed_config_file()
+    settings = trace_settings({}, file=file)
+    if args.json:
+        shown = {name: {"value": one.value, "origin": one.origin} for name, one in settings.items()}
+        print_json({"file": file or None, "settings": shown})
+        return 0
+    lines = {name: f"{name} = {_toml(one.value)}" for name, one in settings.items()}
+    width = max(map(len, lines.values()))
+    for name, line in lines.items():
+        print(f"{line.ljust(width)}  # {settings[name].origin}" if args.origin else line)
+    return 0
+
+
+def _toml(value: Any) -> str:
+    # settings are strings, numbers and truths, which TOML writes as JSON does
+    return json.dumps(value, ensure_ascii=False)
+
+
+def run_init(args: argparse.Namespace) -> int:
+    """Write a file to start with."""
+    from shmmap.service.installation import configuration
+
+    path = Path(args.file)
+    text = configuration(os.path.abspath(args.map) if args.map else "", group=False)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise BadRequest(f"{path} exists", hint="name another FILE, or move it away") from None
+    except OSError as error:
+        raise CannotWrite(f"cannot write {path}: {error.strerror}") from error
+    print(f"{path}: every setting, explained; `shmmap serve --config {path}` uses it")
+    return 0

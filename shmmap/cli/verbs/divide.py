@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap divide IN... OUT``: clouds of any size into a divided map."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, numbers, size_bytes
+from shmmap.cli.screens.work_result import fields_text, print_result
+
+if TYPE_CHECKING:
+    from shmmap.dividing.frame import Translation
+    from shmmap.dividing.report import DividedMap
+
+__all__ = ["add_parser", "run"]
+
+_EPILOG = """\
+IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb) or a directory
+of files; all together become one map.  PCD, LAS and LAZ may be larger than memory.
+A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite are
+left out and counted.  All fields are kept, with their types.
+OUT appears complete or not at all.  Autoware's map loader reads it.
+JSON (fields may be added, none is removed):
+  {"path", "cells", "points": in the map, "points_read", "dropped": not finite,
+   "origin": [x, y, z] to add to come back to the frame of the inputs, "cell_size", "leaf", "order",
+   "encoding", "fields": [[name, dtype]], "bounds": [[x, y, z], [x, y, z]],
+   "sources": [{"path", "size", "mtime_ns", "ctime_ns", "points"}], "notes": [text],
+   "resumed_points", "seconds", "peak_memory_bytes"}
+Exit code: 0, 2 wrong usage or OUT exists, 65 bad data, 66 no such input, 73 OUT cannot be written,
+75 another run is making OUT."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "divide",
+        run,
+        help="divide clouds into a map of square cells",
+        description="Divide clouds of any size into a map of square cells that `serve` and Autoware read.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("inputs", metavar="IN", nargs="+", help="clouds, or directories of clouds")
+    parser.add_argument("out", metavar="OUT", help="the map directory to make")
+    cells = parser.add_argument_group("cells")
+    cells.add_argument(
+        "--cell-size", metavar="METRES", type=_metres, default=20.0, help="side of a cell (default: 20)"
+    )
+    cells.add_argument(
+        "--origin",
+        metavar="X,Y",
+        type=lambda text: numbers(text, "X,Y"),
+        default=[0.0, 0.0],
+        help="a corner of the lattice of cells, in the frame of the inputs (default: 0,0)",
+    )
+    cells.add_argument("--prefix", default="", help="start of the file names, before _<x>_<y>.pcd")
+    points = parser.add_argument_group("points")
+    points.add_argument(
+        "--translate",
+        metavar="X,Y,Z|auto|none",
+        type=_translation,
+        default="auto",
+        help="added to every point; auto (the default) moves float64 and LAS points near the origin where "
+        "float32 would lose more than 0.5 mm; none keeps their frame, in float64 where needed",
+    )
+    points.add_argument(
+        "--leaf", metavar="METRES", type=_metres, default=0.0, help="one point, the mean, per voxel"
+    )
+    points.add_argument(
+        "--order",
+        choices=("input", "morton"),
+        default="input",
+        help="of the points in a cell (default: input)",
+    )
+    points.add_argument(
+        "--encoding",
+        choices=("binary", "binary_compressed", "ascii"),
+        default="binary",
+        help="of the PCD files (default: binary)",
+    )
+    points.add_argument(
+        "--common-fields", action="store_true", help="keep only the fields that all inputs have"
+    )
+    work = parser.add_argument_group("work")
+    work.add_argument(
+        "--max-memory",
+        metavar="BYTES",
+        type=size_bytes,
+        default="1G",
+        help="most memory of the process (default: 1G)",
+    )
+    work.add_argument("--force", action="store_true", help="replace a divided map that is there")
+    work.add_argument(
+        "--resume", action="store_true", help="go on where a killed run of the same command stopped"
+    )
+    work.add_argument("--check", action="store_true", help="read the map back and prove it before it appears")
+    work.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Divide, and say what came out."""
+    import sys
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.dividing.divide import divide
+    from shmmap.dividing.settings import DivideSettings
+
+    origin_x, origin_y = args.origin
+    settings = DivideSettings(
+        cell_size=args.cell_size,
+        origin=(origin_x, origin_y),
+        translate=args.translate,
+        leaf=args.leaf,
+        prefix=args.prefix,
+        encoding=args.encoding,
+        order=args.order,
+        memory_bytes=args.max_memory,
+        common_fields=args.common_fields,
+        force=args.force,
+        resume=args.resume,
+        check=args.check,
+    )
+    began_s = time.monotonic()
+    try:
+        made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
+    except KeyboardInterrupt:
+        print("shmmap: interrupted\nhint: the same command with --resume goes on", file=sys.stderr)
+        raise
+    seconds = time.monotonic() - began_s
+    print_result(made, _lines(made), seconds=seconds, as_json=args.json)
+    return 0
+
+
+def _metres(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected metres, not {text!r}") from None
+
+
+def _translation(text: str) -> Translation:
+    if text == "auto":
+        return "auto"
+    if text == "none":
+        return "none"
+    x, y, z = numbers(text, "X,Y,Z")
+    return x, y, z
+
+
+def _lines(made: DividedMap) -> list[tuple[str, str]]:
+    left_out = f", {made.dropped:,} not finite" if made.dropped else ""
+    lines = [
+        ("map", made.path),
+        ("cells", f"{made.cells:,} of {made.cell_size:g} m"),
+        ("points", f"{made.points:,} of {made.points_read:,}{left_out}"),
+        ("fields", fields_text(made.fields)),
+    ]
+    if made.resumed_points:
+        lines.append(("resumed", f"after {made.resumed_points:,} points"))
+    return [*lines, *(("note", note) for note in made.notes)]

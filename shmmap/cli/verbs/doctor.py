@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap doctor``: what on this machine hinders the daemon or its clients, and what to do."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
+from shmmap.cli.screens.output import print_json
+
+if TYPE_CHECKING:
+    from shmmap.doctor.finding import Finding
+
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+  {"worst": "ok" | "warn" | "fail",
+   "findings": [{"name", "state": "ok" | "warn" | "fail", "fact", "advice": text, may be empty}]}
+Exit code: 0 nothing failed, 1 something did, 78 the configuration has a mistake."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "doctor",
+        run,
+        help="what hinders the daemon or its clients, and what to do",
+        description="Look at shared memory, limits, groups, the socket, leftovers and the session manager.  "
+        "Nothing is changed.  Run it as the user whose program has a problem.",
+        json=_JSON,
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        default="",
+        help="the daemon's settings (default: the installed service's)",
+    )
+    add_statistics_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print every finding."""
+    from shmmap.cli import daemon_address
+    from shmmap.daemon.config import load_config
+    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.doctor.checks import diagnose
+    from shmmap.doctor.finding import worst
+    from shmmap.doctor.patient import examine
+
+    file = args.config or installed_config_file()
+    flags = {
+        "instance": daemon_address.instance(args) if args.instance or daemon_address.endpoint(args) else None,
+        "endpoint": daemon_address.endpoint(args),
+        "shm_dir": args.shm_dir,
+    }
+    findings = diagnose(examine(load_config(flags, file=file), file))
+    if args.json:
+        print_json({"worst": worst(findings), "findings": [asdict(one) for one in findings]})
+    else:
+        _print(findings)
+    return 1 if worst(findings) == "fail" else 0
+
+
+def _print(findings: list[Finding]) -> None:
+    width = max(len(one.name) for one in findings)
+    for one in findings:
+        print(f"{one.state.ljust(4)}  {one.name.ljust(width)}  {one.fact}")
+        if one.advice:
+            print(f"{' ' * (width + 6)}  -> {one.advice}")

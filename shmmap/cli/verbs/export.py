@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap export``: cells from shared memory to files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from shmmap.cli.options import Subparsers, add_area_options, add_daemon_options, add_verb, area_from, seconds
+from shmmap.cli.screens.output import print_json
+from shmmap.errors import BadRequest
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from shmmap.client.cell import Cell
+
+__all__ = ["add_parser", "run"]
+
+_FORMATS = ("pcd", "npz")
+
+_JSON = """\
+  {"files": [{"path", "points", "cells": [id]}]}
+Exit code: 0, 1 when a cell could not be had (then nothing is written), 73 a file cannot be written."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "export",
+        run,
+        help="write cells to PCD or NPZ files",
+        description="Write cells, as the daemon serves them, to one merged file or to one file per cell.",
+        json=_JSON,
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    add_area_options(parser, what)
+    what.add_argument("--id", metavar="ID", nargs="+", help="cells by id, or by file name where unique")
+    out = parser.add_mutually_exclusive_group(required=True)
+    out.add_argument("-o", "--output", metavar="FILE", help="one merged file, .pcd or .npz")
+    out.add_argument("--output-dir", metavar="DIR", help="one file per cell, named as the cell")
+    parser.add_argument("--format", choices=_FORMATS, help="default: as FILE ends; pcd in a DIR")
+    parser.add_argument(
+        "--encoding",
+        choices=("ascii", "binary", "binary_compressed"),
+        default="binary",
+        help="of PCD files (default: binary)",
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+    parser.add_argument(
+        "--wait", metavar="SECONDS", type=seconds, default=60.0, help="how long loads may take (default: 60)"
+    )
+    add_daemon_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the files."""
+    from shmmap.cli.daemon_address import connect
+
+    area = area_from(args)
+    kind = _format(args)
+    with connect(args) as client:
+        found = client.area(area, wait=args.wait) if area else client.selected(args.id, wait=args.wait)
+        for error in found.failed:
+            print(f"shmmap: {error.message}", file=sys.stderr)
+        for pending in found.pending:
+            print(f"shmmap: {pending.id}: not loaded within {args.wait:g} s", file=sys.stderr)
+        if not found.complete:
+            return 1
+        if not found.cells:
+            raise BadRequest("there is no cell in this area")
+        plan = _plan(args, found.cells, kind)
+        for path, _ in plan:
+            if path.exists() and not args.force:
+                raise _exists(path)
+        written = []
+        for path, cells in plan:
+            columns = _merged_columns(cells)
+            _write(path, columns, kind, args)
+            written.append({"path": str(path), "points": len(columns["xyz"]), "cells": [c.id for c in cells]})
+    if args.json:
+        print_json({"files": written})
+    else:
+        for path, cells in plan:
+            print(f"{path}: {sum(cell.points for cell in cells):,} points of {len(cells):,} cells")
+    return 0
+
+
+def _format(args: argparse.Namespace) -> str:
+    suffix = Path(args.output).suffix.lower().removeprefix(".") if args.output else "pcd"
+    kind: str = args.format or suffix
+    if kind not in _FORMATS:
+        raise BadRequest(
+            f"{args.output}: what format is that?", hint="name it .pcd or .npz, or give --format"
+        )
+    return kind
+
+
+def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tuple[Path, list[Cell]]]:
+    """Which file takes which cells."""
+    unique = list({cell.id: cell for cell in cells}.values())
+    if args.output:
+        return [(Path(args.output), unique)]
+    names = [Path(cell.id).with_suffix(f".{kind}").name for cell in unique]
+    if len(set(names)) != len(names):
+        raise BadRequest("several cells have the same file name", hint="export them merged, with --output")
+    return [(Path(args.output_dir, name), [cell]) for name, cell in zip(names, unique, strict=True)]
+
+
+def _merged_columns(cells: Sequence[Cell]) -> dict[str, NDArray[Any]]:
+    """Put the points of several cells one after the other.
+
+    Raises
+    ------
+    BadRequest
+        The cells have different columns, so that no one table holds all of them.
+    """
+    import numpy as np
+
+    kinds = {
+        tuple((name, view.dtype.str, view.shape[1:]) for name, view in cell.columns.items()) for cell in cells
+    }
+    if len(kinds) > 1:
+        described = " and ".join(
+            ", ".join(f"{name} {dtype}" for name, dtype, _ in kind) for kind in sorted(kinds)
+        )
+        raise BadRequest(
+            f"the cells have different columns: {described}", hint="export them with --output-dir"
+        )
+    return {name: np.concatenate([cell[name] for cell in cells]) for name in cells[0].column_names}
+
+
+def _write_npz(file: IO[bytes], columns: dict[str, NDArray[Any]]) -> None:
+    """Write an archive for `numpy.load`; numpy's own function cannot name a column "file"."""
+    import zipfile
+
+    from numpy.lib import format as npy
+
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, values in columns.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                npy.write_array(member, values, allow_pickle=False)
+
+
+def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argparse.Namespace) -> None:
+    """Write one file; it appears whole or not at all."""
+    from shmmap.formats.durable_file import appearing_file, writing_errors
+    from shmmap.formats.pcd_writer import write_pcd
+
+    with writing_errors(str(path)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with appearing_file(path, replace=args.force) as file:
+                if kind == "npz":
+                    _write_npz(file, columns)
+                else:
+                    write_pcd(file, columns, encoding=args.encoding)
+        except FileExistsError as error:
+            raise _exists(path) from error
+
+
+def _exists(path: Path) -> BadRequest:
+    return BadRequest(f"{path} exists", hint="give another name, or --force to overwrite it")

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap health``: is the daemon well?  For scripts and monitors: the exit code says it."""
+
+from __future__ import annotations
+
+import argparse
+
+from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
+from shmmap.cli.screens.output import format_duration, print_json
+from shmmap.errors import DaemonUnreachable
+
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+  {"state": "healthy" | "stopped" | "hung" | "dead", "beat_age_s", "pid", "instance"}
+Exit code: 0 healthy, 1 stopped or hung, 69 dead or never started."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "health",
+        run,
+        help="is the daemon well? (exit code 0: yes)",
+        description="Say whether the daemon is healthy, stopped, hung or dead.  Asks nobody.",
+        json=_JSON,
+    )
+    add_statistics_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print one word and why; return what the exit code says."""
+    from shmmap.cli.daemon_address import snapshot
+
+    found, identity = snapshot(args)
+    if args.json:
+        print_json(
+            {
+                "state": found.state,
+                "beat_age_s": round(found.beat_age_s, 6),
+                "pid": identity.pid,
+                "instance": identity.instance,
+            }
+        )
+    else:
+        print(f"{found.state}: pid {identity.pid}, last sign of life {format_duration(found.beat_age_s)} ago")
+    return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(found.state, 1)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon computes nothing."""
+
+from __future__ import annotations
+
+import argparse
+
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least, size_bytes
+from shmmap.cli.screens.output import format_bytes, format_duration, print_json, print_pairs
+
+__all__ = ["add_parser", "run"]
+
+_SHOWN_FAILURES = 20
+
+_EPILOG = """\
+What was there before is kept; a stopped run goes on where it was.  After a map was copied or touched,
+its layers are recognised by the files' contents.  Give `serve` the same --cache-dir.
+JSON (fields may be added, none is removed):
+  {"map", "cells", "layers": [spec], "kept", "recognised", "built": layers of cells, "bytes",
+   "cache_dir", "cache_bytes": disk space of the whole cache, "seconds",
+   "failed": [{"id", "layer", "message"}]}
+Exit code: 0, 1 if a layer of some cell could not be prepared, 2 wrong usage, 65 bad map, 66 no map,
+73 nothing can be kept in the cache directory."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "prepare",
+        run,
+        help="compute layers of a map into the disk cache",
+        description="Compute layers of every cell of a map into the disk cache, on all cores.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
+    parser.add_argument(
+        "--layer", metavar="SPEC", nargs="+", action="extend", default=[], dest="layers",
+        help="layers, such as 'ndt(leaf=2.0)' or points",
+    )  # fmt: skip
+    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, where it is not with the map")
+    parser.add_argument(
+        "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
+    )
+    parser.add_argument(
+        "--workers", metavar="N", type=at_least(0), default=0, help="processes (default: all cores)"
+    )
+    parser.add_argument("--cache-dir", metavar="DIR", default="", help="where layers are kept")
+    parser.add_argument(
+        "--cache-size",
+        metavar="SIZE",
+        type=size_bytes,
+        default="8G",
+        help="most disk space of kept layers (default: 8G)",
+    )
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Prepare, with progress on stderr."""
+    import os
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.daemon.config import DaemonConfig
+    from shmmap.dividing.served_cloud import find_origin
+    from shmmap.errors import BadRequest
+    from shmmap.layers.spec import canonical_layers
+    from shmmap.origin.sidecar import default_cache_directory
+    from shmmap.prepare.run import prepare_map
+
+    if not args.layers:
+        raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
+    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    began_s = time.monotonic()
+    origin = find_origin(
+        DaemonConfig(args.map_path, args.metadata or "", strict=args.strict, cache_dir=cache_dir)
+    )
+    layers = canonical_layers(args.layers)
+    catalogue = origin.load(fresh=True)
+    done = prepare_map(
+        catalogue,
+        layers,
+        cache_dir=cache_dir,
+        cache_bytes=args.cache_size,
+        workers=args.workers or len(os.sched_getaffinity(0)),
+        progress=StageProgress(quiet=args.json, unit="cells", scale=1.0),
+    )
+    seconds = time.monotonic() - began_s
+    if args.json:
+        print_json(
+            {
+                "map": origin.path,
+                "cells": done.cells,
+                "layers": list(layers),
+                "kept": done.kept,
+                "recognised": done.recognised,
+                "built": done.built,
+                "bytes": done.bytes,
+                "cache_dir": cache_dir,
+                "cache_bytes": done.cache_bytes,
+                "seconds": seconds,
+                "failed": [
+                    {"id": one.cell_id, "layer": one.layer, "message": one.message} for one in done.failures
+                ],
+            }
+        )
+        return 1 if done.failures else 0
+    for failure in done.failures[:_SHOWN_FAILURES]:
+        print(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
+    if len(done.failures) > _SHOWN_FAILURES:
+        print(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
+    if done.bytes > args.cache_size:
+        print("note: the layers are larger than --cache-size: some had to leave the cache again")
+    print_pairs(
+        [
+            ("map", f"{origin.path}, {done.cells:,} cells"),
+            ("layers", " ".join(layers)),
+            ("built", f"{done.built:,}"),
+            ("there already", f"{done.kept + done.recognised:,}"),
+            ("failed", f"{len(done.failures):,}"),
+            ("size", format_bytes(done.bytes)),
+            ("cache", f"{cache_dir}, {format_bytes(done.cache_bytes)}"),
+            ("took", format_duration(seconds)),
+        ]
+    )
+    return 1 if done.failures else 0

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap serve MAP``: run the daemon in the foreground."""
+
+from __future__ import annotations
+
+import argparse
+
+from shmmap.cli.options import Subparsers, add_verb
+
+__all__ = ["add_parser", "run"]
+
+_EPILOG = """\
+Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.
+MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
+or inside the folder of the files), or one cloud of any format that is read: a PCD file of up to 256 MiB
+is one cell, any other is divided into the cache directory first.
+Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and leaves the memory to its
+next start, which goes on warm, as after a crash (a restart sends it first, then SIGTERM as usual; in
+a container: --stop-signal USR1); SIGHUP reads the map again.
+Exit code: 0 after a signal, 65 bad map, 66 no map there, 75 the instance runs already, 78 bad setting."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "serve",
+        run,
+        help="run the daemon",
+        description="Load map cells into shared memory and answer clients until told to stop.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("map_path", metavar="MAP", nargs="?", help="the map: a directory or a cloud")
+    parser.add_argument("--metadata", metavar="FILE", help="the map's YAML, where it lies elsewhere")
+    parser.add_argument(
+        "--strict", action="store_true", default=None, help="refuse what Autoware's own loader refuses"
+    )
+    parser.add_argument(
+        "--watch",
+        action="store_true",
+        default=None,
+        help="reload when the map's files change (not on NFS)",
+    )
+    parser.add_argument("--config", metavar="FILE", default="", help="TOML file of settings")
+    place = parser.add_argument_group("where it is found")
+    place.add_argument("--instance", metavar="NAME", help="instance name (default: default)")
+    place.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
+    place.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
+    place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
+    place.add_argument("--group", metavar="GROUP", help="group whose members may connect and read")
+    place.add_argument(
+        "--admin-group", metavar="GROUP", help="group whose members may reload, evict, pin and stop it"
+    )
+    limits = parser.add_argument_group("limits")
+    limits.add_argument("--budget", metavar="BYTES", help="most memory for cells, such as 512M or 2G")
+    limits.add_argument(
+        "--session-quota", metavar="PART", help="part of the budget one client may fill (default: 0.9)"
+    )
+    limits.add_argument(
+        "--workers", metavar="N", help="most loader processes (default: processors less one, at most 4)"
+    )
+    limits.add_argument(
+        "--load-timeout", metavar="SECONDS", dest="load_timeout_s", help="deadline of one load (default: 60)"
+    )
+    limits.add_argument("--eviction", metavar="POLICY", help="distance or lru (default: distance)")
+    parser.add_argument(
+        "--cache-dir", metavar="DIR", help="where the map's index and computed layers are kept between starts"
+    )
+    parser.add_argument(
+        "--cache-size",
+        metavar="SIZE",
+        dest="cache_bytes",
+        help="most disk space of kept layers, 0: keep none (default: 8G)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until a signal says stop."""
+    from shmmap.daemon.config import load_config
+    from shmmap.daemon.main import run as serve
+    from shmmap.daemon.service_manager.status import ServiceManager
+    from shmmap.errors import ShmmapError
+
+    settings = {name: value for name, value in vars(args).items() if name not in ("run", "config")}
+    try:
+        return serve(load_config(settings, file=args.config))
+    except ShmmapError as error:
+        ServiceManager().failed(str(error))
+        raise

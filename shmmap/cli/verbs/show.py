@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap show CELL``: everything about one cell, and who holds it."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.screens.accounts import user_name
+from shmmap.cli.screens.output import format_bytes, print_json, print_pairs
+
+if TYPE_CHECKING:
+    from shmmap.protocol.messages import Holder, ShownCell, ShownSegment
+
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+  {"id", "version": hex, "box": [minx, miny, maxx, maxy], "z": [min, max] or null before the first load,
+   "source_bytes", "loading": [layer], "pinned": [layer an operator keeps],
+   "failure": text of the last failure that still stands, or "",
+   "segments": [{"layer", "version": hex, "segment", "state": "resident" | "stale" | "zombie", "bytes",
+                 "points",
+                 "holders": [{"session": hex, "pid", "uid", "user", "client", "command", "bytes"}]}]}
+A holder of session 0 is unknown: it did not open the segment through the library.
+Exit code: 0, or 1 when the map has no such cell."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "show",
+        run,
+        help="one cell: versions, memory, who holds it",
+        description="Show everything the daemon knows about one cell.",
+        json=_JSON,
+    )
+    parser.add_argument("cell", metavar="CELL", help="its id, or the file's name where that is unique")
+    add_daemon_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the cell."""
+    from shmmap.cli.daemon_address import connect
+
+    with connect(args) as client:
+        cell = client.show(args.cell)
+    if args.json:
+        print_json(_as_json(cell))
+    else:
+        print_pairs(_lines(cell))
+    return 0
+
+
+def _heights(cell: ShownCell) -> list[float] | None:
+    return None if cell.z_min is None or cell.z_max is None else [cell.z_min, cell.z_max]
+
+
+def _as_json(cell: ShownCell) -> dict[str, object]:
+    return {
+        "id": cell.id,
+        "version": f"{cell.version:016x}",
+        "box": [cell.min_x, cell.min_y, cell.max_x, cell.max_y],
+        "z": _heights(cell),
+        "source_bytes": cell.source_bytes,
+        "loading": list(cell.loading),
+        "pinned": list(cell.pinned),
+        "failure": cell.failure,
+        "segments": [
+            {
+                "layer": segment.layer,
+                "version": f"{segment.version:016x}",
+                "segment": segment.segment,
+                "state": segment.state,
+                "bytes": segment.bytes,
+                "points": segment.points,
+                "holders": [_holder_as_json(holder) for holder in segment.holders],
+            }
+            for segment in cell.segments
+        ],
+    }
+
+
+def _holder_as_json(holder: Holder) -> dict[str, object]:
+    return {
+        "session": f"{holder.session:016x}",
+        "pid": holder.pid,
+        "uid": holder.uid,
+        "user": user_name(holder.uid),
+        "client": holder.client,
+        "command": holder.command,
+        "bytes": holder.bytes,
+    }
+
+
+def _lines(cell: ShownCell) -> list[tuple[str, str]]:
+    z = _heights(cell)
+    lines = [
+        ("cell", cell.id),
+        ("version", f"{cell.version:016x}"),
+        ("box", f"x {cell.min_x:g} .. {cell.max_x:g} m, y {cell.min_y:g} .. {cell.max_y:g} m"),
+        ("heights", "not known before the first load" if z is None else f"{z[0]:.2f} .. {z[1]:.2f} m"),
+        ("source", format_bytes(cell.source_bytes)),
+    ]
+    lines += [("loading", layer) for layer in cell.loading]
+    lines += [("pinned", layer) for layer in cell.pinned]
+    if cell.failure:
+        lines.append(("failure", cell.failure))
+    if not cell.segments:
+        lines.append(("segments", "none: not in memory"))
+    for segment in cell.segments:
+        lines.append(("segment", _segment_line(segment)))
+        lines += [("  held by", _holder_line(holder)) for holder in segment.holders]
+    return lines
+
+
+def _segment_line(segment: ShownSegment) -> str:
+    return (
+        f"{segment.segment} ({segment.layer}, {segment.state}, version {segment.version:016x},"
+        f" {segment.points:,} points, {format_bytes(segment.bytes)})"
+    )
+
+
+def _holder_line(holder: Holder) -> str:
+    if not holder.session:
+        return "unknown: mapped, but not through the library"
+    command = f" ({holder.command})" if holder.command not in ("", holder.client) else ""
+    who = f"{holder.client or 'client'}{command}, pid {holder.pid}, user {user_name(holder.uid)}"
+    return f"{who}, {format_bytes(holder.bytes)}"

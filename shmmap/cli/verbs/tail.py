@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap tail``: what happened in the daemon, and what happens."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
+from shmmap.cli.screens.output import format_bytes, format_duration
+
+if TYPE_CHECKING:
+    from shmmap.client.event_stream import EventStream, Happening
+
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+  one object a line: {"event": "epoch" | "loaded" | "changed" | "evicted" | "failed" | "retried" |
+  "pressure" | "reload" | "joined" | "left", "seq", "epoch": hex, "time": Unix seconds, and what the
+  protocol's table of events says of that kind; versions and sessions as hex}, or
+  {"event": "missed", "epoch": hex, "first", "last"} for numbers the daemon does not remember any more.
+Live on a terminal or with --follow; else it ends after what the daemon remembers."""
+
+DEFAULT_SINCE_S: Final = 60.0
+SILENT_S: Final = 5.0
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "tail",
+        run,
+        help="what happened, and what happens",
+        description="Tell what happened in the last minute, and go on telling: cells loaded, changed, "
+        "evicted, failed, retried; memory pressure; reloads; clients that come and go; the daemon's start "
+        "and end.",
+        json=_JSON,
+    )
+    parser.add_argument(
+        "--since",
+        metavar="SECONDS",
+        type=seconds,
+        default=DEFAULT_SINCE_S,
+        help="begin so long ago (default: 60; the daemon remembers its last 4096 events)",
+    )
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--follow", action="store_true", default=None, help="go on; the default on a terminal")
+    group.add_argument("--no-follow", action="store_false", dest="follow", help="end after what was")
+    add_daemon_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print event after event."""
+    from shmmap.cli.daemon_address import endpoint
+    from shmmap.client.event_stream import EventStream
+
+    follow = sys.stdout.isatty() if args.follow is None else args.follow
+    show = _print_json if args.json else _print_text
+    deadlines = {} if args.timeout is None else {"timeout": args.timeout}
+    with EventStream(endpoint(args), since=args.since, name="shmmap tail", **deadlines) as stream:
+        while (happening := stream.next(0.0)) is not None:
+            show(happening)
+        sys.stdout.flush()
+        while follow:
+            happening = stream.next(SILENT_S)
+            if happening is not None:
+                show(happening)
+                sys.stdout.flush()
+            elif time.monotonic() - stream.heard_s > SILENT_S:
+                _wait_for_sign_of_life(stream, show)
+    return 0
+
+
+def _wait_for_sign_of_life(stream: EventStream, show: Callable[[Happening | None], None]) -> None:
+    """Say once that the daemon is silent: it beats every second otherwise."""
+    print("shmmap: no sign of life from the daemon: see `shmmap health`", file=sys.stderr, flush=True)
+    show(stream.next(None))
+    sys.stdout.flush()
+
+
+def _is_me(happening: Happening) -> bool:
+    """Whether it only tells that this program came."""
+    return getattr(happening, "pid", 0) == os.getpid()
+
+
+def _fields(happening: Happening) -> dict[str, Any]:
+    import msgspec
+
+    from shmmap.client.event_stream import Missed
+
+    fields = msgspec.structs.asdict(happening)
+    if isinstance(happening, Missed):
+        return {"event": "missed", **fields}
+    kind = happening.__struct_config__.tag
+    return {"event": kind, **fields}
+
+
+def _print_json(happening: Happening | None) -> None:
+    if happening is None or _is_me(happening):
+        return
+    fields = _fields(happening)
+    for name in ("epoch", "version", "map_version", "replaces", "session"):
+        if name in fields:
+            fields[name] = f"{fields[name]:016x}"
+    if "unix_ns" in fields:
+        fields["time"] = fields.pop("unix_ns") / 1e9
+    print(json.dumps(fields, ensure_ascii=False, allow_nan=False))
+
+
+def _print_text(happening: Happening | None) -> None:
+    if happening is None or _is_me(happening):
+        return
+    fields = _fields(happening)
+    kind = fields["event"]
+    at = time.strftime("%H:%M:%S", time.localtime(fields["unix_ns"] // 10**9)) if "unix_ns" in fields else ""
+    millis = f".{fields['unix_ns'] // 10**6 % 1000:03d}" if at else " " * 12
+    print(f"{at}{millis}  {kind:8}  {_SENTENCES[kind](fields)}")
+
+
+def _loaded(f: dict[str, Any]) -> str:
+    took = f"in {format_duration(f['load_ns'] * 1e-9)}" if f["load_ns"] else "from its retirement"
+    why = ", had been evicted to make room" if f["again"] else ""
+    why += ", replaces an older version" if f["replaces"] else ""
+    return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {f['points']:,} points, {took}{why}"
+
+
+def _evicted(f: dict[str, Any]) -> str:
+    why = {"room": "to make room", "request": "on request", "map": "it left the map"}.get(f["why"], f["why"])
+    return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {why}"
+
+
+def _pressure(f: dict[str, Any]) -> str:
+    full = {"over_budget": "the budget is in use", "no_space": "the file system is full"}
+    cause = full.get(f["code"], "a client's quota is used up")
+    return (
+        f"{f['refused']:,} cells refused, {f['id']} among them: {cause}; {format_bytes(f['used_bytes'])} of"
+        f" {format_bytes(f['budget_bytes'])} used, {format_bytes(f['pinned_bytes'])} mapped by clients"
+    )
+
+
+def _reload(f: dict[str, Any]) -> str:
+    if f["error"]:
+        return f"the map could not be read again, the old state stays: {f['error']}"
+    counts = ", ".join(f"{f[how]:,} {how}" for how in ("changed", "added", "removed"))
+    return f"the map was read again: cells {counts}"
+
+
+def _epoch(f: dict[str, Any]) -> str:
+    adopted = f", {f['adopted']:,} segments taken over" if f["adopted"] else ""
+    return f"the daemon is {f['what']}: {f['cells']:,} cells in the map{adopted}"
+
+
+_SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
+    "epoch": _epoch,
+    "loaded": _loaded,
+    "changed": lambda f: f"{f['id']}  {f['how']}",
+    "evicted": _evicted,
+    "failed": lambda f: f"{f['id']} {f['layer']}  {f['code']}: {f['message']}",
+    "retried": lambda f: f"{f['id']} {f['layer']}  failed before with {f['code']}",
+    "pressure": _pressure,
+    "reload": _reload,
+    "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",
+    "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, held {format_bytes(f['bytes'])}",
+    "missed": lambda f: f"events {f['first']:,} to {f['last']:,}: the daemon does not remember them any more",
+}

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap top``: how the daemon fares, live; read from its statistics, so that watching costs it nothing."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shutil
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final
+
+from shmmap.cli.options import Subparsers, add_statistics_options, add_verb, seconds
+from shmmap.cli.screens.output import print_json
+from shmmap.errors import DaemonUnreachable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from shmmap.cli.screens.top_screen import Line
+    from shmmap.statistics.reader import Snapshot, StatisticsReader
+
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+  {"state": as in `shmmap status`, "beat_age_s",
+   "budget": {"pinned", "idle", "zombie", "reserved", "free"} in bytes,
+   "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
+   "latency_s": {"request", "wait", "load": {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
+   "evictions", "refused_over_budget", "refused_quota",
+   "clients": [{"client", "command", "pid", "uid", "cells", "bytes", "requests", "idle_s", "pose"}]}
+Exit code: 0, or 69 when the daemon is dead or was never started."""
+
+_TOLD_AS_THEY_ARE: Final = (
+    "load_queue",
+    "waiting_requests",
+    "evictions",
+    "refused_over_budget",
+    "refused_quota",
+)
+DEFAULT_INTERVAL_S: Final = 1.0
+LATENCY_SPAN_S: Final = 10.0
+PIPE_WIDTH: Final = 100
+SHORTEST_S: Final = 0.05
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "top",
+        run,
+        help="how it fares, live",
+        description="Show the budget (mapped by clients, idle, zombie, free), hit ratios, latencies, loads, "
+        "evictions, refusals and clients.  Live on a terminal, once in a pipe.  Asks nobody.",
+        json=_JSON,
+    )
+    parser.add_argument(
+        "--interval",
+        metavar="SECONDS",
+        type=seconds,
+        default=DEFAULT_INTERVAL_S,
+        help="between looks (1)",
+    )
+    parser.add_argument("--once", action="store_true", help="once, also on a terminal")
+    add_statistics_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show one screen, or one after the other."""
+    from shmmap.cli.daemon_address import instance, shm_dir, snapshot
+    from shmmap.cli.screens.top_screen import screen
+    from shmmap.statistics.reader import StatisticsReader
+
+    found, identity = snapshot(args)
+    if args.json:
+        print_json(_as_json(found))
+    elif args.once or not sys.stdout.isatty():
+        width = shutil.get_terminal_size((PIPE_WIDTH, 40)).columns
+        for line in screen(found, identity, width=width, max_clients=256):
+            print("".join(text for text, _style in line).rstrip())
+    else:
+        with StatisticsReader(instance(args), shm_dir(args)) as reader:
+            return _live(reader, max(args.interval, SHORTEST_S))
+    return DaemonUnreachable.exit_code if found.state == "dead" else 0
+
+
+class _Ended(BaseException):
+    """A signal asks the program to end; raised so that the terminal is put right on the way out."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    def end(number: int, frame: FrameType | None) -> None:
+        del frame
+        raise _Ended(number)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _live(reader: StatisticsReader, interval_s: float) -> int:
+    """Show it until somebody has seen enough; the terminal is then as it was."""
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(highlight=False)
+    earlier: deque[Snapshot] = deque()
+    try:
+        with (
+            _ended_by_signals(),
+            Live(console=console, screen=True, auto_refresh=False, transient=True) as live,
+        ):
+            while True:
+                found = reader.snapshot(cells=False)
+                live.update(_render(found, earlier, console), refresh=True)
+                time.sleep(interval_s)
+    except KeyboardInterrupt:
+        return 0
+    except _Ended as ended:
+        return 128 + ended.number
+
+
+def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
+    from rich.console import Group
+    from rich.text import Text
+
+    from shmmap.cli.screens.top_screen import screen
+
+    if found.identity is None:
+        earlier.clear()
+        return Text("no daemon runs; waiting for one (Ctrl-C ends)", style="bold yellow")
+    while len(earlier) > 1 and found.beat_monotonic_ns - earlier[1].beat_monotonic_ns > LATENCY_SPAN_S * 1e9:
+        earlier.popleft()
+    width, height = console.size
+    lines = screen(
+        found,
+        found.identity,
+        width=width,
+        max_clients=max(height - 18, 1),
+        earlier=earlier[0] if earlier else None,
+    )
+    if not earlier or found.beat_monotonic_ns - earlier[-1].beat_monotonic_ns > 1e9:
+        earlier.append(found)
+    return Group(*(_styled(line) for line in lines[: height - 1]))
+
+
+def _styled(line: Line) -> Any:
+    from rich.text import Text
+
+    return Text.assemble(*line, no_wrap=True, overflow="ellipsis")
+
+
+def _as_json(found: Snapshot) -> dict[str, object]:
+    from shmmap.cli.screens.cache_verdict import cache_verdict
+    from shmmap.cli.screens.top_screen import budget_parts
+    from shmmap.statistics.counters import SPANS
+
+    count = found.counters
+    verdict = cache_verdict(count)
+    ratios = {}
+    for span in SPANS:
+        hits, asked = count[f"hits_{span}"], count[f"hits_{span}"] + count[f"misses_{span}"]
+        ratios[span] = hits / asked if asked else None
+    return {
+        "state": found.state,
+        "beat_age_s": round(found.beat_age_s, 6),
+        "budget": budget_parts(count),
+        "hit_ratio": ratios,
+        "cache_too_small": verdict.too_small,
+        "cache": verdict.why,
+        "hint": verdict.hint,
+        "latency_s": {
+            name: {"p50": h.quantile_s(0.5), "p99": h.quantile_s(0.99), "count": h.total}
+            for name, h in found.histograms.items()
+        },
+        **{
+            name: count[name]
+            for name in (
+                "load_queue",
+                "waiting_requests",
+                "evictions",
+                "refused_over_budget",
+                "refused_quota",
+            )
+        },
+        "clients": [
+            {
+                "client": client.client,
+                "command": client.command,
+                "pid": client.pid,
+                "uid": client.uid,
+                "cells": client.cells,
+                "bytes": client.bytes,
+                "requests": client.requests,
+                "idle_s": round(max(found.beat_monotonic_ns - client.last_request_monotonic_ns, 0) * 1e-9, 3),
+                "pose": None if client.pose is None else list(client.pose),
+            }
+            for client in found.clients
+        ],
+    }

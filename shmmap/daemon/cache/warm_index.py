@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cells that are in memory at their current version: what is answered without a load."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.daemon.cache.ledger import Resident
+
+__all__ = ["WarmCells"]
+
+
+class WarmCells:
+    """The same twice: to be looked up one by one, and a whole area at once.
+
+    Parameters
+    ----------
+    count_cells
+        Returns how many cells the map has.
+
+    Attributes
+    ----------
+    layers : dict
+        Per layer, catalogue index to resident segment.
+    versions : dict
+        Per layer, (cells,) uint64: the version, 0 where the cell is not in memory.
+    """
+
+    def __init__(self, count_cells: Callable[[], int]) -> None:
+        self._count_cells = count_cells
+        self.layers: dict[str, dict[int, Resident]] = {}
+        self.versions: dict[str, NDArray[np.uint64]] = {}
+
+    def __len__(self) -> int:
+        return sum(map(len, self.layers.values()))
+
+    def get(self, index: int, layer: str) -> Resident | None:
+        """The segment of a cell, if it is warm."""
+        found = self.layers.get(layer)
+        return found.get(index) if found is not None else None
+
+    def enter(self, resident: Resident, index: int) -> None:
+        """A segment has the current version of its cell."""
+        layer = resident.key.layer
+        self.layers.setdefault(layer, {})[index] = resident
+        versions = self.versions.get(layer)
+        if versions is None:
+            versions = self.versions[layer] = np.zeros(self._count_cells(), np.uint64)
+        versions[index] = resident.version
+
+    def leave(self, index: int, layer: str) -> None:
+        """The cell has another version now, or its segment is retired."""
+        found = self.layers.get(layer)
+        if found is None or found.pop(index, None) is None:
+            return
+        self.versions[layer][index] = 0
+        if not found:  # whoever asks for ever new layers must not fill the daemon's memory
+            del self.layers[layer], self.versions[layer]
+
+    def clear(self) -> None:
+        """Indices mean other cells from now on."""
+        self.layers.clear()
+        self.versions.clear()

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Telling what happens to cells: as events, and whether the cache is large enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from shmmap.daemon.cache.ledger import Failure, Key, Residency, Resident
+from shmmap.daemon.events.eviction_history import Ghosts
+from shmmap.daemon.events.log import EventLog, PressureEvents
+from shmmap.daemon.loading.scheduler import SPACE_CODES
+from shmmap.protocol import events
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["CellEvents"]
+
+
+class CellEvents:
+    """Hears of cells and tells of them.
+
+    Parameters
+    ----------
+    wire_id
+        Makes of a cell id what replies and events carry.
+
+    Attributes
+    ----------
+    pressure
+        Tells of cells that were refused for want of memory.
+    """
+
+    def __init__(
+        self,
+        log: EventLog,
+        books: Residency,
+        statistics: StatisticsWriter,
+        wire_id: Callable[[str], str],
+    ) -> None:
+        self._log = log
+        self._books = books
+        self._statistics = statistics
+        self._wire_id = wire_id
+        self._ghosts = Ghosts()
+        self.pressure = PressureEvents(log, self._memory)
+
+    def _memory(self) -> tuple[int, int, int, int]:
+        books = self._books
+        pinned = self._statistics.values["bytes_pinned"]
+        return books.budget_bytes, books.used_bytes, pinned, books.zombie_bytes
+
+    def loaded(self, resident: Resident, took_ns: int, *, replaces: int = 0) -> None:
+        """A segment was loaded and published; ``took_ns`` from handing the load to a worker."""
+        again = self._ghosts.loaded(resident.key, resident.version)
+        self._statistics.add("loads_finished")
+        self._statistics.add("bytes_loaded", resident.nbytes)
+        self._statistics.add("loads_after_eviction", again)
+        self._statistics.add_duration("load", took_ns)
+        self._tell_loaded(resident, resident.load_ns, again, replaces)
+
+    def revived(self, resident: Resident) -> None:
+        """A retired segment is in service again, without a load."""
+        again = self._ghosts.loaded(resident.key, resident.version)
+        self._tell_loaded(resident, 0, again, 0)
+
+    def _tell_loaded(self, resident: Resident, load_ns: int, again: bool, replaces: int) -> None:
+        self._log.publish(
+            events.Loaded, self._wire_id(resident.key.cell_id), resident.key.layer, resident.version,
+            resident.nbytes, resident.points, load_ns, again, replaces,
+        )  # fmt: skip
+
+    def changed(self, cell_id: str, version: int) -> None:
+        """A load found that a cell's file is not the one the catalogue knows."""
+        self._log.publish(events.Changed, self._wire_id(cell_id), version, "changed")
+
+    def retired(self, resident: Resident, why: str) -> None:
+        """A segment left service; of superseded ones their successor's event tells."""
+        if why == "room":
+            self._ghosts.evicted(resident.key, resident.version)
+        if why != "superseded":
+            self._log.publish(
+                events.Evicted, self._wire_id(resident.key.cell_id), resident.key.layer,
+                resident.version, resident.nbytes, why,
+            )  # fmt: skip
+
+    def failed(self, key: Key, failure: Failure, now_s: float) -> None:
+        """A load ended without a segment."""
+        wire_id = self._wire_id(key.cell_id)
+        if failure.code in SPACE_CODES:
+            self.pressure.refused(wire_id, key.layer, failure.code, now_s)
+        else:
+            self._log.publish(
+                events.Failed, wire_id, key.layer, failure.code, failure.message, failure.delay_s
+            )
+
+    def retried(self, key: Key, failure: Failure) -> None:
+        """A cell that failed is about to be loaded again."""
+        if failure.code not in SPACE_CODES:
+            self._log.publish(events.Retried, self._wire_id(key.cell_id), key.layer, failure.code)

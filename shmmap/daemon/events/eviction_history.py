@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was evicted to make room, remembered for a while: is it loaded again, the cache was too small.
+
+The same idea as the ghost lists of ARC (Megiddo and Modha, FAST 2003), used for telling only.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from shmmap.daemon.cache.ledger import Key
+
+__all__ = ["Ghosts"]
+
+LIMIT: Final = 1 << 14
+
+
+class Ghosts:
+    """The last keys that were evicted to make room, at most 16384 of them."""
+
+    def __init__(self, limit: int = LIMIT) -> None:
+        self._limit = limit
+        self._versions: dict[Key, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._versions)
+
+    def evicted(self, key: Key, version: int) -> None:
+        """Note that this version made room for others."""
+        self._versions.pop(key, None)
+        self._versions[key] = version
+        if len(self._versions) > self._limit:
+            del self._versions[next(iter(self._versions))]
+
+    def loaded(self, key: Key, version: int) -> bool:
+        """Whether a load brought back just what had been evicted to make room."""
+        return self._versions.pop(key, None) == version

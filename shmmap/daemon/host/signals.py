@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals: what each means to the daemon, and how it hears them while it starts and while it serves."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import socket
+from collections.abc import Iterator
+from typing import Final
+
+__all__ = [
+    "KEEP_SIGNAL",
+    "RELOAD_SIGNAL",
+    "STOP_SIGNALS",
+    "ServingSignals",
+    "StartSignals",
+    "ignore_signals",
+]
+
+_log = logging.getLogger(__name__)
+
+STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
+KEEP_SIGNAL: Final = signal.SIGUSR1
+"""Ends the daemon and leaves the segments to its next life: see `shmmap.daemon.main`."""
+RELOAD_SIGNAL: Final = signal.SIGHUP
+
+
+class StartSignals:
+    """Signals while the daemon starts: stop means unwinding at once, a reload waits until it serves.
+
+    Masks would not do: they are a thread's, and libraries have threads of their own.
+    """
+
+    def __init__(self) -> None:
+        self.reload_wanted = False
+        self.keep = False
+        self._held = False
+        self._stop = False
+        for number in STOP_SIGNALS:
+            signal.signal(number, self._on_stop)
+        signal.signal(KEEP_SIGNAL, self._on_keep)
+        signal.signal(RELOAD_SIGNAL, self._on_reload)
+
+    def _on_reload(self, number: int, frame: object) -> None:
+        del number, frame
+        self.reload_wanted = True
+
+    def _on_keep(self, number: int, frame: object) -> None:
+        self.keep = True
+        self._on_stop(number, frame)
+
+    def _on_stop(self, number: int, frame: object) -> None:
+        del frame
+        if not self._stop:
+            _log.info("stopping on %s, before serving", signal.Signals(number).name)
+        self._stop = True
+        if not self._held:
+            raise SystemExit(0)
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep a stop for later while something takes a name and has nobody yet to take it away."""
+        self._held = True
+        try:
+            yield
+        finally:
+            self._held = False
+        if self._stop:
+            raise SystemExit(0)
+
+
+class ServingSignals:
+    """Signals while the daemon serves: its loop hears them through a descriptor, handlers do nothing.
+
+    Attributes
+    ----------
+    fd
+        Readable when a signal has come: call `take` then.
+    """
+
+    def __init__(self) -> None:
+        self._ours, self._theirs = socket.socketpair()
+        self._ours.setblocking(False)
+        self._theirs.setblocking(False)
+        self.fd = self._ours.fileno()
+        for number in (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL):
+            signal.signal(number, lambda *_: None)
+        self._before = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
+
+    def take(self) -> list[signal.Signals]:
+        """Return what came since, the announcement of a restart first.
+
+        Of signals that were pending together the kernel runs the last one's handler first: what came
+        with the announcement came after it.
+        """
+        try:
+            numbers = self._ours.recv(64)
+        except BlockingIOError:
+            return []
+        return [signal.Signals(number) for number in sorted(numbers, key=lambda n: n != KEEP_SIGNAL)]
+
+    def close(self) -> None:
+        """Hear no more."""
+        signal.set_wakeup_fd(self._before)
+        self._ours.close()
+        self._theirs.close()
+
+
+def ignore_signals() -> None:
+    """From here on nothing stops the process but its own end."""
+    for number in (*STOP_SIGNALS, KEEP_SIGNAL):
+        signal.signal(number, signal.SIG_IGN)

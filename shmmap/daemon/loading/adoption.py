@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an earlier life of the daemon left in the shared-memory directory: taken over, watched or removed.
+
+Every name of the instance is looked at once, before anything is served:
+
+- a segment that is published, ours, whole by its header, and of the version its cell has in the map
+  now is *adopted*: it serves again as soon as a worker has compared its bytes with their checksums;
+- any other segment that somebody still maps becomes a zombie, known by name and cell, and is freed
+  when its last reader lets go;
+- the rest is removed.  What this user may not remove (a stranger's file that squats one of our
+  names) is left alone and never served.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import stat
+from typing import NamedTuple
+
+from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
+from shmmap.errors import BadRequest, SegmentCorrupt
+from shmmap.failpoints import step
+from shmmap.layers.spec import layer_spec
+from shmmap.segment.directory import ShmDirectory, measured_bytes
+from shmmap.segment.layout import PublishBlock, SegmentHeader
+from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
+from shmmap.segment.verify import read_header
+
+__all__ = ["Leftovers", "TakenOver"]
+
+_log = logging.getLogger(__name__)
+
+
+class TakenOver(NamedTuple):
+    """How many segments were adopted, kept as zombies, and removed or refused."""
+
+    adopted: int
+    zombies: int
+    dropped: int
+
+
+class _Found(NamedTuple):
+    """A leftover as its header describes it, and why it cannot serve (empty: it can)."""
+
+    header: SegmentHeader | None
+    block: PublishBlock | None
+    why_not: str
+
+
+class Leftovers:
+    """Takes over what is in the directory under an instance's name.
+
+    Parameters
+    ----------
+    mode, gid
+        Access that published segments are to have from now on; ``gid`` -1 leaves the group alone.
+    """
+
+    def __init__(
+        self,
+        directory: ShmDirectory,
+        instance: str,
+        store: Store,
+        reclaimer: Reclaimer,
+        *,
+        mode: int,
+        gid: int,
+    ) -> None:
+        self._directory = directory
+        self._prefix = segment_prefix(instance)
+        self._not_segments = (statistics_name(instance), self._prefix + "lock")
+        self._store = store
+        self._reclaimer = reclaimer
+        self._mode = mode
+        self._gid = gid
+
+    def take_over(self, now_s: float) -> TakenOver:
+        """Look at every name once."""
+        adopted = zombies = dropped = 0
+        for name in self._directory.names(self._prefix):
+            if name.startswith(self._not_segments):
+                continue
+            try:
+                fd = self._directory.open(name)
+            except OSError as error:
+                self._remove(name, str(error.strerror))
+                dropped += 1
+                continue
+            try:
+                found = self._look(fd, name)
+                if not found.why_not:
+                    self._adopt(fd, name, found, now_s)
+                    adopted += 1
+                elif self._keep_for_readers(fd, name, found, now_s):
+                    zombies += 1
+                else:
+                    dropped += 1
+            finally:
+                os.close(fd)
+        step("daemon.adopted")
+        if adopted or zombies or dropped:
+            _log.info(
+                "of an earlier daemon: %d segments taken over, %d still in use, %d dropped",
+                adopted, zombies, dropped,
+            )  # fmt: skip
+        return TakenOver(adopted, zombies, dropped)
+
+    # --- judging ------------------------------------------------------------------------------
+
+    def _look(self, fd: int, name: str) -> _Found:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode):
+            return _Found(None, None, "it is no regular file")
+        if status.st_uid != os.geteuid():
+            return _Found(None, None, f"it belongs to user {status.st_uid}")
+        try:
+            header, block = read_header(fd)
+        except (SegmentCorrupt, OSError, UnicodeDecodeError) as error:
+            return _Found(None, None, str(error))
+        return _Found(header, block, self._why_not(name, status, header, block))
+
+    def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, block: PublishBlock) -> str:
+        """Why a whole segment cannot serve; empty if it can."""
+        store, catalogue = self._store, self._store.catalogue
+        if is_zombie(name):
+            return "it was retired"
+        if status.st_mode & 0o222 or status.st_nlink != 1:
+            return "others may have changed it"
+        try:
+            spec = layer_spec(header.layer)
+        except BadRequest:
+            return f"there is no layer {header.layer} any more"
+        if str(spec) != header.layer or spec.builder_version != header.builder_version:
+            return f"layer {header.layer} is built otherwise now"
+        index = catalogue.find(header.cell_id)
+        if index is None:
+            return "its cell is not in the map"
+        known = store.books.slots.get(Key(header.cell_id, header.layer))
+        if known is not None and known.resident is not None:
+            return "there is another one"
+        if (block.version, header.source) != (
+            store.layers.version(index, header.layer),
+            catalogue.stamp(index),
+        ):
+            return "its source has changed"
+        if header.box != catalogue.box(index) or header.frame_id != catalogue.frame_id:
+            return "its cell has moved"
+        if store.books.shortage(status.st_blocks * 512) > 0:
+            return "it does not fit in the budget"
+        return ""
+
+    # --- acting -------------------------------------------------------------------------------
+
+    def _adopt(self, fd: int, name: str, found: _Found, now_s: float) -> None:
+        step("daemon.adopt")
+        assert found.header is not None  # noqa: S101  _look gives a reason where there is none
+        if self._gid >= 0:
+            os.fchown(fd, -1, self._gid)
+        os.fchmod(fd, self._mode)
+        index = self._store.catalogue.find(found.header.cell_id)
+        assert index is not None  # noqa: S101
+        self._store.adopt(self._resident(fd, name, found, now_s), index)
+
+    def _keep_for_readers(self, fd: int, name: str, found: _Found, now_s: float) -> bool:
+        """Watch it as a zombie if somebody uses it, else remove it; True if it is used."""
+        try:
+            used = os.fstat(fd).st_uid == os.geteuid() and self._reclaimer.pins.told(fd)
+        except OSError:  # nothing that has leases
+            used = False
+        if not used:
+            self._remove(name, found.why_not)
+            return False
+        if not is_zombie(name):
+            hidden = zombie_name(name)
+            try:
+                self._directory.rename(name, hidden)
+            except OSError:  # somebody else has taken that name
+                hidden = zombie_name(another_name(name))
+                self._directory.rename(name, hidden)
+            name = hidden
+        self._reclaimer.adopt(self._resident(fd, name, found, now_s), now_s)
+        return True
+
+    def _resident(self, fd: int, name: str, found: _Found, now_s: float) -> Resident:
+        live_name = name.removesuffix(zombie_name(""))
+        nbytes, used_s = measured_bytes(fd), now_s - HAND_OUT_GRACE_S
+        header, block = found.header, found.block
+        if header is None or block is None:
+            return Resident(
+                live_name, Key("", ""), 0, nbytes, 0, (0.0, 0.0, 0.0, 0.0), 0.0, 0.0, checked=False
+            )
+        return Resident(
+            live_name,
+            Key(header.cell_id, header.layer),
+            block.version,
+            nbytes,
+            header.rows,
+            header.box,
+            header.z_min,
+            header.z_max,
+            last_use_s=used_s,
+            checked=False,
+        )
+
+    def _remove(self, name: str, why: str) -> None:
+        try:
+            self._directory.unlink(name)
+        except OSError as error:
+            # sticky directories let only a file's owner remove it; a directory is nobody's segment
+            level = logging.INFO if error.errno == errno.EISDIR else logging.WARNING
+            _log.log(
+                level, "leftover %s is refused (%s) and cannot be removed: %s", name, why, error.strerror
+            )
+            return
+        _log.debug("leftover %s is removed: %s", name, why)

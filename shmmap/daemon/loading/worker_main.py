@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A loader worker: a process of its own that reads files and fills segments, one job after another.
+
+It is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish: it passes
+the finished, unnamed segment to the daemon, so that an orphan leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from shmmap.daemon.host.scheduling import take_slices
+from shmmap.daemon.loading import worker_messages
+from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
+from shmmap.failpoints import step
+from shmmap.layers.derive import CellJob
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.making import Made, make_layer
+from shmmap.layers.points import LAYER
+from shmmap.layers.sources import CellSource, read_segment
+from shmmap.layers.spec import LayerSpec, layer_spec
+from shmmap.layers.versions import MAX_NEIGHBOURS
+from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.segment.directory import ShmDirectory, is_full
+from shmmap.segment.layout import SourceStamp
+from shmmap.segment.pins import LOADER_SLOT, lock_slot
+from shmmap.segment.verify import verify_file
+
+__all__ = ["main"]
+
+_NICENESS: Final = 10  # a warm request never waits for a load
+_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a worker, not the daemon
+_PAGE_BYTES: Final = 4096
+
+
+class _Refused(Exception):
+    """The daemon has no room for the segment."""
+
+
+class _Worker:
+    def __init__(
+        self, channel: socket.socket, directory: ShmDirectory, cache: LayerCache | None = None
+    ) -> None:
+        self._channel = channel
+        self._directory = directory
+        self._cache = cache
+        self._waiting: list[worker_messages.Job | worker_messages.Check] = []
+
+    def run(self) -> None:
+        """Work until the daemon closes the channel."""
+        self._send(worker_messages.Ready())
+        while True:
+            job = self._waiting.pop(0) if self._waiting else self._receive()
+            if job is None:
+                return
+            if isinstance(job, worker_messages.Job):
+                self._load(job)
+            elif isinstance(job, worker_messages.Check):
+                self._check(job)
+
+    def _receive(self) -> worker_messages.ToWorker | None:
+        data = self._channel.recv(MAX_PACKET_BYTES)
+        return worker_messages.decode_to_worker(data) if data else None
+
+    def _send(self, message: worker_messages.FromWorker, fd: int | None = None) -> None:
+        packet = worker_messages.encode(message)
+        if fd is None:
+            self._channel.send(packet)
+        else:
+            socket.send_fds(self._channel, [packet], [fd])
+
+    def _reserve(self, job: worker_messages.Job, nbytes: int) -> None:
+        """Ask for more room where the segment needs more than was reserved for it."""
+        nbytes = -(-nbytes // _PAGE_BYTES) * _PAGE_BYTES
+        if nbytes > job.granted:
+            self._send(worker_messages.Need(job.number, nbytes))
+            while True:
+                answer = self._receive()
+                if answer is None:
+                    sys.exit(0)
+                if isinstance(answer, worker_messages.Job | worker_messages.Check):
+                    self._waiting.append(answer)
+                elif isinstance(answer, worker_messages.Grant):
+                    job.granted = nbytes
+                    break
+                else:
+                    raise _Refused
+
+    def _load(self, job: worker_messages.Job) -> None:
+        started_ns = time.monotonic_ns()
+        _test_hook(job.path)
+        try:
+            fd = self._directory.create()
+            try:
+                step("worker.alloc")
+                made = self._make(job, fd)
+                header = made.header
+                done = worker_messages.Done(
+                    job.number,
+                    header.header_bytes,
+                    header.rows,
+                    header.dropped_points,
+                    header.z_min,
+                    header.z_max,
+                    header.source,
+                    time.monotonic_ns() - started_ns,
+                    tuple(warning[:500] for warning in made.warnings[:20]),
+                    made.neighbours,
+                    made.cached,
+                )
+                step("worker.pass")
+                self._send(worker_messages.Segment(), fd)
+                step("worker.passed")
+            finally:
+                os.close(fd)
+            self._send(done)
+            step("worker.done")
+        except _Refused:
+            self._fail(job, "over_budget", "it does not fit in the budget")
+        except ShmmapError as error:
+            self._fail(job, "load_failed", str(error))
+        except OSError as error:
+            code = "no_space" if is_full(error) else "load_failed"
+            self._fail(job, code, f"{job.path}: {error.strerror or error}")
+        except MemoryError:
+            self._fail(job, "load_failed", f"{job.path}: loading it ran out of memory")
+        except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one cell
+            self._fail(job, "load_failed", f"{job.path}: building {job.layer} failed: {error!r}")
+
+    def _make(self, job: worker_messages.Job, fd: int) -> Made:
+        """Fill the segment."""
+        if len(job.neighbours) > MAX_NEIGHBOURS:
+            raise MapDataError(
+                f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one", path=job.path,
+                cause="unsupported_format", hint="use a smaller radius, or larger cells",
+            )  # fmt: skip
+        spec = layer_spec(job.layer)
+        return make_layer(
+            spec,
+            CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
+            fd,
+            cache=self._cache,
+            keep=job.layer != LAYER,  # the source itself is as quick to read, and on this disk already
+            source=lambda: self._points_in_memory(job, spec),
+            reserve=lambda nbytes: self._reserve(job, nbytes),
+        )
+
+    def _points_in_memory(self, job: worker_messages.Job, spec: LayerSpec) -> CellSource | None:
+        """The cell's points out of their segment, if that is still there and of this state of the file."""
+        if not job.points:
+            return None
+        try:
+            fd = self._directory.open(job.points)
+        except OSError:
+            return None
+        try:
+            lock_slot(fd, LOADER_SLOT)
+            source = read_segment(fd, job.box, spec.source_columns)
+            return source if source.stamp == SourceStamp.of(os.stat(job.path)) else None
+        except (OSError, SegmentCorrupt):
+            return None
+        finally:
+            os.close(fd)
+
+    def _check(self, job: worker_messages.Check) -> None:
+        wrong = ""
+        try:
+            if SourceStamp.of(os.stat(job.path)) != job.stamp:
+                wrong = "its source has changed"
+            else:
+                fd = self._directory.open(job.segment)
+                try:
+                    step("worker.check")
+                    lock_slot(fd, LOADER_SLOT)
+                    verify_file(fd)
+                finally:
+                    os.close(fd)
+        except (OSError, SegmentCorrupt) as error:
+            wrong = str(error)
+        self._send(worker_messages.Checked(job.number, wrong[:500]))
+
+    def _fail(self, job: worker_messages.Job, code: str, message: str) -> None:
+        stamp = None
+        with contextlib.suppress(OSError):
+            stamp = SourceStamp.of(os.stat(job.path))
+        self._send(worker_messages.Failed(job.number, code, message[:4000], stamp))
+
+
+def _test_hook(path: str) -> None:
+    """Crash or hang on a named file, for the tests of exactly that (``SHMMAP_TEST_WORKER``)."""
+    what, _, name = os.environ.get("SHMMAP_TEST_WORKER", "").partition(":")
+    if name and Path(path).name == name:
+        if what == "crash":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        elif what == "hang":
+            signal.pause()
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR [CACHE_DIR CACHE_BYTES]``."""
+    channel_fd, parent, shm_dir = int(arguments[0]), int(arguments[1]), arguments[2]
+    die_with(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    signal.signal(signal.SIGIO, signal.SIG_IGN)
+    os.nice(_NICENESS)
+    take_slices(0)  # the short ones are for those who serve
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
+        score.write(_OOM_SCORE)
+    channel = socket.socket(fileno=channel_fd)
+    try:
+        cache = LayerCache(arguments[3], limit_bytes=int(arguments[4])) if len(arguments) > 4 else None
+        _Worker(channel, ShmDirectory(shm_dir), cache).run()
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ECONNRESET):
+            raise
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

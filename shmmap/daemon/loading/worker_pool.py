@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pool of loader workers: started on demand, fed several jobs ahead, killed at a deadline."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import socket
+import subprocess
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import msgspec
+
+from shmmap.daemon.loading import worker_messages
+from shmmap.processes.start_child import MAX_PACKET_BYTES, start_worker
+
+__all__ = ["Worker", "WorkerPool"]
+
+_log = logging.getLogger(__name__)
+
+JOBS_AHEAD = 4
+"""Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
+
+END_PATIENCE_S = 0.1
+"""How long the loop waits for a killed worker to end; one that hangs in the kernel may take for ever."""
+
+START_DEADLINE_S = 60.0
+"""How long a worker may take from its first job until it is ready: an interpreter and its imports."""
+
+
+@dataclass(eq=False, slots=True)
+class Worker:
+    """One worker process; ``queue`` holds its jobs, the first is the one it works on.
+
+    ``segment_fd`` is the segment whose `worker_messages.Done` has yet to come.
+    """
+
+    process: subprocess.Popen[bytes]
+    channel: socket.socket
+    queue: OrderedDict[int, worker_messages.Job | worker_messages.Check] = field(default_factory=OrderedDict)
+    head_since_s: float = 0.0
+    ready: bool = False
+    segment_fd: int = -1
+
+    @property
+    def fd(self) -> int:
+        """Descriptor to poll."""
+        return self.channel.fileno()
+
+
+class WorkerPool:
+    """Up to ``limit`` worker processes.
+
+    Parameters
+    ----------
+    limit
+        Most workers at a time.
+    shm_dir
+        Where they make segments.
+    deadline_s
+        How long one load may take; then its worker is killed.
+    cache_dir, cache_bytes
+        Where finished layers are kept, and at most how much of them; empty or 0: nowhere.
+    watch, unwatch
+        Called with a worker's descriptor when it comes and goes, for the caller's poller.
+
+    Attributes
+    ----------
+    failed_starts
+        Workers in a row that ended before they were ready: not their job's fault.
+    """
+
+    def __init__(
+        self,
+        limit: int,
+        shm_dir: str,
+        deadline_s: float,
+        *,
+        watch: Callable[[int], None],
+        unwatch: Callable[[int], None],
+        cache_dir: str = "",
+        cache_bytes: int = 0,
+    ) -> None:
+        self._limit = limit
+        self._shm_dir = shm_dir
+        self._deadline_s = deadline_s
+        self._watch = watch
+        self._unwatch = unwatch
+        self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
+        self._workers: dict[int, Worker] = {}
+        self._ending: list[subprocess.Popen[bytes]] = []
+        self.failed_starts = 0
+
+    def __len__(self) -> int:
+        return len(self._workers)
+
+    def __iter__(self) -> Iterator[Worker]:
+        return iter(list(self._workers.values()))
+
+    def by_fd(self, fd: int) -> Worker | None:
+        """The worker whose channel has this descriptor."""
+        return self._workers.get(fd)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a job can be given to somebody.
+
+        Workers that were killed and have not ended count: on a file system that hangs they would pile up.
+        """
+        self._ending = [process for process in self._ending if process.poll() is None]
+        return self._may_start or any(len(worker.queue) <= JOBS_AHEAD for worker in self._workers.values())
+
+    @property
+    def _may_start(self) -> bool:
+        return len(self._workers) + len(self._ending) < self._limit
+
+    def start_one(self) -> Worker:
+        """Start a worker process."""
+        process, ours = start_worker(
+            "shmmap.daemon.loading.worker_main", self._shm_dir, *self._cache, new_session=True
+        )
+        ours.setblocking(False)
+        worker = Worker(process, ours)
+        self._workers[worker.fd] = worker
+        self._watch(worker.fd)
+        return worker
+
+    def submit(self, job: worker_messages.Job | worker_messages.Check, now_s: float) -> bool:
+        """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
+        worker = min(self._workers.values(), key=lambda w: len(w.queue), default=None)
+        if worker is None or (worker.queue and self._may_start):
+            try:
+                worker = self.start_one()
+            except OSError as error:  # no more processes, memory or descriptors just now
+                _log.error("cannot start a loader: %s", error)
+                if worker is None or len(worker.queue) > JOBS_AHEAD:
+                    return False
+        try:
+            worker.channel.send(worker_messages.encode(job))
+        except OSError:
+            return False  # full or dying: its end is reported by its channel
+        if not worker.queue:
+            worker.head_since_s = now_s
+        worker.queue[job.number] = job
+        return True
+
+    def answer(self, worker: Worker, message: worker_messages.Grant | worker_messages.Refuse) -> None:
+        """Answer a worker's `worker_messages.Need`."""
+        with contextlib.suppress(OSError):
+            worker.channel.send(worker_messages.encode(message))
+
+    def receive(self, worker: Worker) -> tuple[worker_messages.FromWorker, int] | None:
+        """Next message of a worker and the descriptor that came with it (-1: none).
+
+        None when there is nothing more to read now.
+
+        Raises
+        ------
+        EOFError
+            When the worker is gone, or has lost its mind.
+        """
+        while True:
+            try:
+                data, fds, _flags, _address = socket.recv_fds(worker.channel, MAX_PACKET_BYTES, 1)
+                break
+            except ConnectionResetError:
+                continue  # told once, before what the dead worker had still said
+            except BlockingIOError:
+                return None
+            except OSError as error:
+                raise EOFError from error
+        if not data:
+            raise EOFError
+        fd = fds[0] if fds else -1
+        try:
+            if fd >= 0:
+                os.set_inheritable(fd, False)
+            return worker_messages.decode_from_worker(data), fd
+        except msgspec.MsgspecError as error:
+            _log.error("a loader sends nonsense and is ended: %s", error)
+            if fd >= 0:
+                os.close(fd)
+            raise EOFError from error
+
+    def finished(self, worker: Worker, number: int, now_s: float) -> None:
+        """The worker is done with a job; its next one begins now."""
+        worker.queue.pop(number, None)
+        worker.head_since_s = now_s
+
+    def remove(self, worker: Worker) -> tuple[list[worker_messages.Job | worker_messages.Check], str]:
+        """Forget a dead worker; returns its unfinished jobs, and how it ended, for people."""
+        self._unwatch(worker.fd)
+        self._workers.pop(worker.fd, None)
+        worker.channel.close()
+        if worker.segment_fd >= 0:
+            os.close(worker.segment_fd)
+        worker.process.kill()
+        try:
+            how = _how(worker.process.wait(END_PATIENCE_S))
+        except subprocess.TimeoutExpired:
+            self._ending.append(worker.process)
+            how = "killed, and has not ended yet"
+        return list(worker.queue.values()), how
+
+    def overdue(self, now_s: float) -> list[Worker]:
+        """Workers whose current load, or whose start, is past its deadline."""
+        return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
+
+    def _due_s(self, worker: Worker) -> float:
+        return worker.head_since_s + (self._deadline_s if worker.ready else START_DEADLINE_S)
+
+    def next_deadline_s(self) -> float:
+        """When the next load becomes overdue; infinity when nothing loads."""
+        return min((self._due_s(w) for w in self._workers.values() if w.queue), default=float("inf"))
+
+    def close(self) -> None:
+        """End every worker."""
+        for worker in self:
+            self.remove(worker)
+
+
+def _how(code: int) -> str:
+    """What an exit code says, for people."""
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return f"signal {signal.Signals(-code).name}"
+    except ValueError:  # those between SIGRTMIN and SIGRTMAX have no names
+        return f"signal {-code}"

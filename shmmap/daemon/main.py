@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One life of the daemon: lock, open the map, serve, stop.
+
+The order matters.  The lock comes first, because binding would steal a live socket; leftovers are
+taken over before anything is published; READY is said when requests are answered.  On the way out
+every name is taken away before the lock is.
+
+**Stopping empties, restarting keeps warm.**  SIGTERM and SIGINT stop the daemon and free all
+memory.  SIGUSR1 stops it and leaves the segments to its next life, which adopts them
+(`shmmap.daemon.loading.adoption`), as it does after a crash; whoever waits for an answer gets it from the
+next life, too.  A SIGTERM that follows a SIGUSR1 changes nothing about that, so a service manager
+that sends SIGTERM anyway can announce a restart beforehand.  systemd ends a unit in the same way
+for ``restart`` and ``stop``, but while it does so its job list says which it is; ``+`` gives the
+line the right to ask and to send, in a unit for one user ``systemctl --user`` has it anyway::
+
+    ExecStop=-+/bin/sh -c 'systemctl list-jobs --plain --no-legend | \
+        grep -Eq "^ *[0-9]+ +%n +restart " && kill -USR1 $MAINPID'
+
+Elsewhere: ``kill -USR1`` before starting anew, ``docker run --stop-signal USR1``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import time
+from functools import partial
+from pathlib import Path
+
+from shmmap.daemon.assembly import Life
+from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.host.instance_lock import InstanceLock
+from shmmap.daemon.host.instance_names import lock_name, lock_path, stopped_early
+from shmmap.daemon.host.logs import set_up_logging
+from shmmap.daemon.host.signals import StartSignals, ignore_signals
+from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.prerequisites import (
+    access_of_segments,
+    choose_pins,
+    make_runtime_dir,
+    raise_descriptor_limit,
+)
+from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
+from shmmap.daemon.service_manager.status import ServiceManager
+from shmmap.dividing.served_cloud import find_origin
+from shmmap.errors import ConfigError
+from shmmap.failpoints import step
+from shmmap.origin.map_layout import absolute_path
+from shmmap.origin.sidecar import default_cache_directory
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import prepare_process
+
+__all__ = ["run"]
+
+_log = logging.getLogger(__name__)
+
+
+def run(config: DaemonConfig) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code.
+
+    Raises
+    ------
+    MapMissing, MapDataError
+        There is no map, or none that can be served.
+    ConfigError
+        No map is named, or a setting cannot work on this machine.
+    InstanceBusy
+        Another daemon has this instance.
+    """
+    set_up_logging()
+    if not config.map_path:
+        raise ConfigError("no map is named", key="map_path", hint="give `shmmap serve MAP`, or set map_path")
+    prepare_process()
+    raise_descriptor_limit()
+    activated = take_activated_socket()
+    with contextlib.ExitStack() as stack:
+        signals = StartSignals()
+        path = _socket_path(config, activated)
+        gid, mode = access_of_segments(config)
+        make_runtime_dir(Path(path).parent, gid)
+        directory = ShmDirectory(config.shm_dir)
+        stack.callback(directory.close)
+        pins = choose_pins(directory)
+        origin = find_origin(config)
+        config = dataclasses.replace(  # loaders and clients run elsewhere
+            config,
+            map_path=origin.path,
+            shm_dir=directory.path,
+            cache_dir=absolute_path(config.cache_dir or default_cache_directory()),
+        )
+        with signals.held():
+            lock = InstanceLock(lock_path(path))
+            stack.callback(lock.release)
+            # a second one beside the segments: two runtime directories may share a directory of segments
+            # empty: a single byte would take a page that the budget does not know
+            shm_lock = InstanceLock(directory.path + lock_name(config.instance), says_who=False)
+            stack.callback(shm_lock.release)
+            stack.callback(ignore_signals)  # without the locks no name is ours to take away
+            step("daemon.lock")
+            stack.push(partial(stopped_early, signals, directory, config.instance))
+        started_s = time.monotonic()
+        catalogue = origin.load()
+        for problem in catalogue.problems:
+            _log.warning("%s", problem)
+        with signals.held():
+            life = Life(config, catalogue, directory, pins, path, mode, gid)
+            stack.callback(lambda: life.close(keep=signals.keep))
+        life.serve(Reloader(origin), started_s, signals, ServiceManager(), activated)
+    return 0
+
+
+def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:
+    """Where this daemon listens: a socket that was passed to it decides."""
+    if activated is None:
+        return config.socket()
+    if config.endpoint and config.socket() != activated.path:
+        raise ConfigError(
+            f"endpoint is {config.socket()}, but the service manager listens at {activated.path}",
+            key="endpoint",
+            hint="remove the setting, or change ListenStream= of the .socket unit",
+        )
+    return activated.path

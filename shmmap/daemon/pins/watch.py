@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asking the kernel who uses a segment, and hearing from it when somebody let go.
+
+A retired segment that is still mapped stays open here (our own descriptor is the one that the lease
+is asked for, so it does not count), and the kernel is asked to tell when anybody else closes or
+unmaps it.  So nothing of ours ever looks like a close, and nobody has to look now and then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+from collections.abc import Iterator
+from typing import Final
+
+from shmmap.daemon.host.inotify import CLOSED, OVERFLOW, Inotify
+from shmmap.daemon.pins.probe import Rung
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import holders, is_pinned
+
+__all__ = ["PinWatch"]
+
+KEPT_OPEN: Final = 1024
+"""Most retired segments that are kept open; further ones are looked at now and then."""
+KEPT_SHARE: Final = 8
+"""Of the descriptors this process may have, one in so many at most: clients need them more."""
+
+
+class PinWatch:
+    """What the kernel says about the files of one directory.
+
+    Parameters
+    ----------
+    rung
+        Whose word is taken; for `Rung.SESSIONS` the caller asks the sessions.
+    events
+        Whether to have closes reported.
+
+    Attributes
+    ----------
+    fd
+        Readable when `closed` has something to tell; -1 where nothing is reported.
+    """
+
+    def __init__(self, directory: ShmDirectory, rung: Rung = Rung.LEASES, *, events: bool = False) -> None:
+        self.rung = rung
+        self._directory = directory
+        self._kept: dict[str, tuple[int, int]] = {}
+        self._names: dict[int, str] = {}
+        self._most_kept = min(KEPT_OPEN, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // KEPT_SHARE)
+        self._inotify: Inotify | None = None
+        if events:
+            with contextlib.suppress(OSError):
+                self._inotify = Inotify()
+        self.fd = self._inotify.fd if self._inotify is not None else -1
+
+    def close(self) -> None:
+        """Let go of everything."""
+        for name in list(self._kept):
+            self.release(name)
+        if self._inotify is not None:
+            self._inotify.close()
+            self._inotify, self.fd = None, -1
+
+    @contextlib.contextmanager
+    def opened(self, name: str) -> Iterator[int]:
+        """Give a descriptor of a segment, the kept one or one for the moment; OSError as from opening."""
+        kept = self._kept.get(name)
+        if kept is not None:
+            yield kept[0]
+            return
+        fd = self._directory.open(name)
+        try:
+            yield fd
+        finally:
+            os.close(fd)
+
+    def told(self, fd: int) -> bool:
+        """Whether anybody else uses an open segment, by the kernel's word; False where it gives none."""
+        if self.rung is Rung.LEASES:
+            return is_pinned(fd)
+        return self.rung is Rung.LOCKS and bool(holders(fd, limit=1))
+
+    def is_used(self, name: str) -> bool | None:
+        """Whether anybody uses a segment; None if its name is gone."""
+        try:
+            with self.opened(name) as fd:
+                return self.told(fd)
+        except FileNotFoundError:
+            return None
+        except OSError:
+            return True  # out of descriptors, say: who cannot look must not take it for free
+
+    def keep(self, name: str) -> bool:
+        """Keep a retired segment open and hear when others let go of it; False if that cannot be."""
+        if self._inotify is None or len(self._kept) >= self._most_kept:
+            return False
+        try:
+            fd = self._directory.open(name)
+        except OSError:
+            return False
+        try:
+            watch = self._inotify.add(f"/proc/self/fd/{fd}", CLOSED)
+        except OSError:
+            os.close(fd)
+            return False
+        self._kept[name] = fd, watch
+        self._names[watch] = name
+        return True
+
+    def keeps(self, name: str) -> bool:
+        """Whether closes of this segment are reported for as long as it is kept."""
+        return name in self._kept
+
+    def release(self, name: str) -> None:
+        """End `keep`."""
+        kept = self._kept.pop(name, None)
+        if kept is not None and self._inotify is not None:
+            fd, watch = kept
+            self._inotify.remove(watch)
+            self._names.pop(watch, None)
+            os.close(fd)
+
+    def tell_once(self, name: str) -> None:
+        """Hear when somebody next lets go of a segment in service."""
+        if self._inotify is not None:
+            with contextlib.suppress(OSError):
+                watch = self._inotify.add(self._directory.path + name, CLOSED, once=True)
+                self._names[watch] = name
+
+    def closed(self) -> set[str] | None:
+        """Names that somebody let go of since the last call; None: any of them, too many to tell."""
+        if self._inotify is None:
+            return set()
+        names: set[str] = set()
+        for event in self._inotify.read():
+            if event.mask & OVERFLOW:
+                return None
+            name = self._names.get(event.watch)
+            if name is not None:
+                names.add(name)
+                if name not in self._kept:
+                    del self._names[event.watch]
+        return names

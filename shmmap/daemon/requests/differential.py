@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a client lacks, and what it should drop: the set arithmetic of a differential request.
+
+Versions do the work: one names a cell *and* its state, so that a client that holds exactly the
+current versions of an area lacks nothing.  `warm_difference` is the way of nearly every request of
+a moving vehicle and is kept short; `difference` covers everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.ledger import Resident
+from shmmap.layers.spec import canonical_layers
+from shmmap.protocol.codec import pack_versions, unpack_versions
+from shmmap.protocol.messages import Differential, HeldCell
+
+__all__ = ["Difference", "WarmDifference", "difference", "warm_difference"]
+
+
+@dataclass(eq=False, slots=True)
+class WarmDifference:
+    """The difference where all of the area is in memory; ``held`` are the versions the client has."""
+
+    residents: list[Resident]
+    removed: tuple[str, ...]
+    removed_packed: bytes
+    held: set[int]
+
+
+def warm_difference(
+    store: Store, message: Differential, found: NDArray[np.intp], layer: str
+) -> WarmDifference | None:
+    """Return the difference if it takes versions only and every cell of the area is warm, else None.
+
+    ``found`` are the catalogue indices of the area's cells, ascending.
+    """
+    known = store.warm.versions.get(layer)
+    if known is None:
+        return None
+    versions = known[found].tolist()
+    packed = unpack_versions(message.packed)
+    named = message.held
+    current, held = set(versions), set(packed)
+    if named:
+        given = [cell.version for cell in named]
+        if None in given or [cell for cell in named if cell.layers is not None]:
+            return None
+        held.update(cast("list[int]", given))
+    if 0 in current:
+        return None  # 0 stands for "not in memory"
+    warm, index_of = store.warm.layers[layer], store.index_of_version
+    missing = [index_of[version] for version in current - held]
+    missing.sort()
+    removed: tuple[str, ...] = ()
+    removed_packed = b""
+    gone = held - current
+    if gone:
+        # an old version of a cell inside the area is replaced, not removed
+        replaced = [v for v in gone if (i := index_of.get(v)) in warm and warm[i].version in current]
+        gone.difference_update(replaced)
+        if named:
+            removed = _removed_names(store, named, gone, current, layer)
+        if message.packed:
+            removed_packed = pack_versions(gone if not named else gone.intersection(packed))
+    return WarmDifference([warm[index] for index in missing], removed, removed_packed, held)
+
+
+def _removed_names(
+    store: Store, named: Sequence[HeldCell], gone: set[int], current: set[int], layer: str
+) -> tuple[str, ...]:
+    """Held ids to drop, in the order given; one whose cell is in the area at another version stays."""
+    removed: dict[str, None] = {}
+    for cell_id in [cell.id for cell in named if cell.version in gone]:
+        index = store.index_of(cell_id)
+        resident = store.warm.get(index, layer) if index is not None else None
+        if resident is None or resident.version not in current:
+            removed[cell_id] = None
+    return tuple(removed)
+
+
+@dataclass(eq=False, slots=True)
+class Difference:
+    """The difference of any request.
+
+    Attributes
+    ----------
+    cells
+        Catalogue index and layer of everything to send, in reply order.
+    removed, removed_packed
+        What to drop, as the reply says it.
+    old
+        Ids of cells in the area that the client holds in an older version.
+    held
+        Versions the client says it has.
+    """
+
+    cells: list[tuple[int, str]] = field(default_factory=list)
+    removed: tuple[str, ...] = ()
+    removed_packed: bytes = b""
+    old: set[str] = field(default_factory=set)
+    held: set[int] = field(default_factory=set)
+
+
+def difference(
+    store: Store, message: Differential, indices: Sequence[int], layers: tuple[str, ...]
+) -> Difference:
+    """Return what the client lacks of the area's cells ``indices``, whether in memory or not."""
+    version_of, id_of = store.layers.version, store.catalogue.id
+    packed = set(unpack_versions(message.packed))
+    inside = set(indices)
+    result = Difference(held=set(packed))
+    has: dict[int, set[str]] = {}
+    removed: dict[str, None] = {}
+    for cell in message.held:
+        index = store.index_of(cell.id)
+        if cell.version is not None:
+            result.held.add(cell.version)
+        if index is None or index not in inside:
+            removed[cell.id] = None
+            continue
+        for layer in layers if cell.layers is None else canonical_layers(cell.layers):
+            if cell.version is None:
+                result.held.add(version_of(index, layer))
+            elif cell.version != version_of(index, layer):
+                result.old.add(id_of(index))
+                continue
+            has.setdefault(index, set()).add(layer)
+    current: set[int] = set()
+    for index in indices:
+        for layer in layers:
+            version = version_of(index, layer)
+            current.add(version)
+            if version not in packed and layer not in has.get(index, ()):
+                result.cells.append((index, layer))
+    gone = packed - current
+    for version in [*gone]:
+        known = store.index_of_version.get(version)
+        if known in inside and known is not None:
+            gone.discard(version)
+            result.old.add(id_of(known))
+    result.removed = tuple(removed)
+    result.removed_packed = pack_versions(gone)
+    return result

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clients come and go: a hello opens a session, a goodbye or the end of the client's process ends it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import zmq
+
+from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.transport.inbox import peer_of
+from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.errors import BadRequest, ProtocolMismatch
+from shmmap.protocol import events
+from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["Reception"]
+
+_SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
+
+
+class Reception:
+    """Opens and ends sessions.
+
+    Parameters
+    ----------
+    watch, unwatch
+        Have a callback called when a descriptor is readable, and no longer.
+    on_left
+        Called with a session that has ended.
+    """
+
+    def __init__(
+        self,
+        sessions: Sessions,
+        cells: CellRequests,
+        statistics: StatisticsWriter,
+        event_log: EventLog,
+        *,
+        watch: Callable[[int, Callable[[], None]], None],
+        unwatch: Callable[[int], None],
+        on_left: Callable[[Session], None],
+    ) -> None:
+        self._sessions = sessions
+        self._cells = cells
+        self._statistics = statistics
+        self._event_log = event_log
+        self._watch = watch
+        self._unwatch = unwatch
+        self._on_left = on_left
+
+    def enter(self, identity: bytes, frame: zmq.Frame, message: Hello, now_s: float) -> Session:
+        """Return the session of who says hello.
+
+        Raises
+        ------
+        ProtocolMismatch
+            The client speaks another major version of the protocol.
+        BadRequest
+            There are too many sessions.
+        """
+        if message.major != PROTOCOL_VERSION[0]:
+            raise ProtocolMismatch(
+                f"client speaks protocol {message.major}.{message.minor},"
+                f" daemon {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
+                hint="update the older of the two",
+            )
+        peer = peer_of(frame)
+        old = self._sessions.get(identity)
+        if old is not None:
+            if old.peer == peer:
+                return old  # a repeated hello: its answer was late or lost
+            self.leave(old)
+        spare = self._sessions.spare() if self._sessions.full else None
+        if spare is not None:
+            self.leave(spare)
+        if self._sessions.full:
+            raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
+        session = self._sessions.open(identity, peer, message.client, now_s, slot=message.session)
+        session.fd = _descriptor(frame)
+        self._statistics.add("sessions_opened")
+        self._event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
+        if session.pidfd >= 0:
+            self._watch(session.pidfd, lambda: self.leave(session))
+        return session
+
+    def leave(self, session: Session) -> None:
+        """A client's process ended, or it said goodbye: what it held may be free now."""
+        held = session.residents()
+        self._event_log.publish(
+            events.Left, session.slot, session.peer.pid, session.client, session.held_bytes
+        )
+        self._cells.forget(session)
+        if session.pidfd >= 0:
+            self._unwatch(session.pidfd)
+        self._sessions.close(session)
+        self._cells.let_go(held)
+        self._on_left(session)
+
+
+def _descriptor(frame: zmq.Frame) -> int:
+    """Descriptor of the connection that a message came on; -1 where libzmq does not tell."""
+    try:
+        return int(frame.get(_SOURCE))
+    except zmq.ZMQError:
+        return -1

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may change what the daemon serves: reload, evict, pin, shut down.
+
+Asked of the kernel's word on the peer (`Peer`), never of anything a client says.  Root and the
+daemon's own user always may; so may members of the configured administrators' group.
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+from typing import Final
+
+from shmmap.daemon.transport.sessions import Peer
+from shmmap.errors import ConfigError, NotPermitted
+
+__all__ = ["Privileges", "group_id"]
+
+MEMORY_S: Final = 10.0
+"""How long a user's groups are remembered: asking may mean asking a server far away."""
+
+
+def group_id(name: str, key: str) -> int:
+    """Return the id of a group given by name or number; ``key`` is the setting it comes from.
+
+    Raises
+    ------
+    ConfigError
+        There is no such group.
+    """
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError:
+        if name.isdigit():
+            return int(name)
+        raise ConfigError(f"there is no group {name!r}", key=key, hint=f"groupadd --system {name}") from None
+
+
+class Privileges:
+    """Decides who may administer the daemon.
+
+    Parameters
+    ----------
+    admin_group
+        Group (name or number) whose members may, besides root and the daemon's user; empty: nobody.
+
+    Raises
+    ------
+    ConfigError
+        There is no such group.
+    """
+
+    def __init__(self, admin_group: str = "") -> None:
+        self._name = admin_group
+        self._gid = group_id(admin_group, "admin_group") if admin_group else -1
+        self._groups: dict[int, tuple[float, frozenset[int]]] = {}
+
+    def allow(self, peer: Peer, now_s: float) -> bool:
+        """Whether a connected process may administer the daemon."""
+        if peer.uid in (0, os.geteuid()):
+            return True
+        if self._gid < 0 or peer.uid < 0:
+            return False
+        return peer.gid == self._gid or self._gid in self._groups_of(peer.uid, now_s)
+
+    def require(self, peer: Peer, now_s: float) -> None:
+        """Refuse a process that may not.
+
+        Raises
+        ------
+        NotPermitted
+            It belongs to somebody else.
+        """
+        if not self.allow(peer, now_s):
+            members = f", and members of group {self._name}" if self._name else ""
+            raise NotPermitted(
+                f"only root and the daemon's own user{members} may do this", hint="run it with sudo"
+            )
+
+    def _groups_of(self, uid: int, now_s: float) -> frozenset[int]:
+        known = self._groups.get(uid)
+        if known is not None and now_s < known[0]:
+            return known[1]
+        try:
+            account = pwd.getpwuid(uid)
+            groups = frozenset(os.getgrouplist(account.pw_name, account.pw_gid))
+        except (KeyError, OSError):
+            groups = frozenset()  # a user this machine has no account of: only its own group counts
+        if len(self._groups) >= 1024:
+            self._groups.clear()
+        self._groups[uid] = (now_s + MEMORY_S, groups)
+        return groups

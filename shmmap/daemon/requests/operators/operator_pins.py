@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells that an operator wants resident, asked for or not: they are loaded, and never make room.
+
+A pin is on a cell and a layer, not on a version: a cell that changes is loaded anew, one that
+cannot be loaded is tried again.  Pins end with `unpin` or with the daemon.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
+
+from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.loading.load_queue import BACKGROUND
+from shmmap.errors import OverBudget
+from shmmap.layers.spec import canonical_layers
+from shmmap.protocol import messages
+from shmmap.protocol.messages import PinnedCell
+
+__all__ = ["OperatorPins"]
+
+LOOKS_AT_ONCE: Final = 64
+"""Pins looked at per beat: about a fifth of a millisecond."""
+
+
+class OperatorPins:
+    """The pinned cells of one map.
+
+    A pin counts in the books as one more request that waits for the cell: that is what keeps it out
+    of the candidates for eviction.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._keys: set[Key] = set()
+        self._round: deque[Key] = deque()
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._keys
+
+    def layers_of(self, cell_id: str) -> tuple[str, ...]:
+        """Layers in which a cell is pinned."""
+        return tuple(sorted(key.layer for key in self._keys if key.cell_id == cell_id))
+
+    def pin(self, message: messages.Pin, now_s: float) -> messages.Pinned:
+        """Pin cells; without ids, say what is pinned.
+
+        Raises
+        ------
+        OverBudget
+            All pins together would take more than the budget.
+        """
+        wanted, unknown = self._keys_of(message.ids, canonical_layers(message.layers))
+        total = sum(map(self._size, self._keys | wanted))
+        budget = self._store.books.budget_bytes
+        if wanted and total + self._store.books.overhead_bytes > budget:
+            raise OverBudget(
+                f"with these cells {total} bytes would be pinned; the budget is {budget} bytes",
+                hint="unpin others, or serve with a larger --budget",
+            )
+        for key in wanted - self._keys:
+            self._store.books.slot(key).waiting += 1
+            self._keys.add(key)
+            self._round.append(key)
+        for key in wanted:
+            self._keep(key, now_s)
+        shown = wanted if message.ids else self._keys
+        return self._answer(message.request, shown, unknown)
+
+    def unpin(self, message: messages.Unpin) -> messages.Pinned:
+        """Let cells go, all without ids; answers with what stays pinned."""
+        gone = set(self._keys)
+        unknown: list[str] = []
+        if message.ids is not None:
+            gone, unknown = self._keys_of(message.ids, None)
+        for key in gone & self._keys:
+            self._keys.remove(key)
+            self._store.books.unwait(key)
+        self._round = deque(key for key in self._round if key in self._keys)
+        return self._answer(message.request, self._keys, unknown)
+
+    def keep(self, now_s: float) -> None:
+        """Look at some pins: what is not in memory at its current version is loaded."""
+        for _ in range(min(LOOKS_AT_ONCE, len(self._round))):
+            key = self._round.popleft()
+            self._round.append(key)
+            self._keep(key, now_s)
+
+    def _keep(self, key: Key, now_s: float) -> None:
+        store = self._store
+        index = store.index_of(key.cell_id)
+        if index is not None and store.find_warm(index, key.layer, now_s) is None:
+            store.want(index, key.layer, BACKGROUND, now_s)
+
+    def _keys_of(self, ids: Iterable[str], layers: tuple[str, ...] | None) -> tuple[set[Key], list[str]]:
+        """Keys of cells by id, in these layers (None: in those that are pinned), and ids unknown."""
+        keys: set[Key] = set()
+        unknown: list[str] = []
+        for cell in ids:
+            index = self._store.index_of(cell)
+            if index is None:
+                unknown.append(cell)
+                continue
+            cell_id = self._store.catalogue.id(index)
+            names = self.layers_of(cell_id) if layers is None else layers
+            keys |= {Key(cell_id, layer) for layer in names}
+        return keys, unknown
+
+    def _size(self, key: Key) -> int:
+        slot = self._store.books.slots.get(key)
+        if slot is not None and slot.resident is not None:
+            return slot.resident.nbytes
+        index = self._store.index_of(key.cell_id)
+        return 0 if index is None else self._store.estimate(index, key.layer)
+
+    def _answer(self, request: int, keys: Iterable[Key], unknown: list[str]) -> messages.Pinned:
+        rows = [self._row(key) for key in sorted(keys)]
+        return messages.Pinned(request, tuple(rows), tuple(unknown))
+
+    def _row(self, key: Key) -> PinnedCell:
+        slot = self._store.books.slot(key)
+        resident = slot.resident
+        if resident is not None:
+            state = "resident" if self._store.is_current(resident) else "stale"
+        elif slot.load is not None:
+            state = "loading"
+        else:
+            state = slot.failure.code if slot.failure is not None else "absent"
+        nbytes = resident.nbytes if resident is not None else 0
+        return PinnedCell(self._store.wire_id(key.cell_id), key.layer, state, nbytes)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon's pulse: a few times a second what it keeps is measured and written to the statistics.
+
+It beats from the serving loop itself, so that whoever is hung does not beat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sized
+from itertools import islice
+from typing import Final
+
+from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.pin_census import PinCensus
+from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.telemetry.recent_counts import RecentCounts
+from shmmap.daemon.telemetry.session_rows import client_row
+from shmmap.daemon.transport.sessions import Sessions
+from shmmap.statistics.client_rows import MAX_CLIENTS
+from shmmap.statistics.counters import SPANS, WINDOWED
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["BEAT_S", "Heartbeat"]
+
+BEAT_S: Final = 0.25
+CHANGE_BEAT_S: Final = 0.02
+PROBES_A_BEAT: Final = 16
+"""Segments whose pins are looked at: about half a millisecond."""
+EVENT_BEAT_S: Final = 1.0
+"""How often listeners are told the last event's number, so that a missed one does not stay unnoticed."""
+USED_ROWS_A_BEAT: Final = 64
+"""Rows of the statistics whose hits are brought up to date at a beat: about half a millisecond."""
+
+
+class Heartbeat:
+    """Measures and beats.
+
+    Parameters
+    ----------
+    sessions
+        The clients.
+    waiting
+        Whose length is the number of requests that wait for loads.
+    on_beat
+        Called after each beat.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        statistics: StatisticsWriter,
+        event_log: EventLog,
+        *,
+        sessions: Sessions,
+        waiting: Sized,
+        on_beat: Callable[[], None],
+    ) -> None:
+        self._store = store
+        self._statistics = statistics
+        self._sessions = sessions
+        self._waiting = waiting
+        self._on_beat = on_beat
+        self._event_log = event_log
+        self._pins = PinCensus(store.reclaimer.everything, store.reclaimer.is_pinned)
+        self._recent = RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
+        self._looked_s = self._told_s = float("-inf")
+        self._last_s = 0.0
+        self.next_s = 0.0
+
+    def turn(self, now_s: float) -> None:
+        """Beat if it is time to, soon after cells came, went or changed."""
+        if self._statistics.outdated:
+            # whoever asks right after a change sees it, yet a stream of changes costs little
+            self.next_s = min(self.next_s, self._last_s + CHANGE_BEAT_S)
+        if now_s >= self.next_s:
+            self._last_s, self.next_s = now_s, now_s + BEAT_S
+            self._beat(now_s)
+
+    def measure(self) -> None:
+        """Bring the gauges up to date."""
+        books, set_value = self._store.books, self._statistics.set
+        set_value("sessions", len(self._sessions))
+        set_value("waiting_requests", len(self._waiting))
+        set_value("workers", len(self._store.loads.pool))
+        set_value("load_queue", books.queued)
+        set_value("cells_resident", books.resident_count)
+        set_value("stale_cells", books.resident_count - books.unchecked_count - len(self._store.warm))
+        set_value("bytes_resident", books.resident_bytes)
+        set_value("zombies", len(books.zombies))
+        set_value("bytes_zombie", books.zombie_bytes)
+        set_value("bytes_reserved", books.reserved_bytes)
+        set_value("bytes_statistics", self._statistics.size_bytes)
+        set_value("budget_bytes", books.budget_bytes)
+        set_value("evictions", self._store.reclaimer.evicted_count)
+        set_value("map_cells", len(self._store.catalogue))
+        set_value("events_published", self._event_log.last)
+
+    def _look_around(self, now_s: float) -> None:
+        """What takes longer, and need not be done at each of many beats while cells load."""
+        self._looked_s = now_s
+        self._pins.look(PROBES_A_BEAT)
+        self._statistics.set("bytes_pinned", self._pins.pinned_bytes)
+        self._statistics.set("segments_pinned", self._pins.pinned_count)
+        values = self._statistics.values
+        self._recent.look(values, now_s)
+        for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
+            for name, count in zip(WINDOWED, growth, strict=True):
+                values[f"{name}_{span}"] = count
+        clients = islice(self._sessions, MAX_CLIENTS)
+        self._statistics.show_clients([client_row(session) for session in clients])
+        self._store.events.pressure.turn(now_s)
+        if now_s - self._told_s >= EVENT_BEAT_S:
+            self._told_s = now_s
+            self._event_log.beat()
+
+    def _beat(self, now_s: float) -> None:
+        self.measure()
+        if now_s - self._looked_s >= BEAT_S:
+            self._look_around(now_s)
+        self._store.books.overhead_bytes = self._statistics.size_bytes
+        self._store.show_used(USED_ROWS_A_BEAT)
+        self._statistics.beat()
+        self._on_beat()

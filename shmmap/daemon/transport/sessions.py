@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who is connected, by the kernel's word, and what each of them holds."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from shmmap.daemon.cache.ledger import Resident
+from shmmap.errors import NoSession
+from shmmap.geometry import Area
+from shmmap.protocol.messages import Holder, Intent
+from shmmap.segment.pins import MAX_SLOT
+
+__all__ = ["Peer", "Session", "Sessions", "predicted_path"]
+
+LOOK_AHEAD_S: Final = 5
+ROUTE_VERTICES: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Credentials of a connected process; -1 and 0 where the kernel does not tell."""
+
+    uid: int = -1
+    gid: int = -1
+    pid: int = 0
+
+    @classmethod
+    def parse(cls, address: str) -> Peer:
+        """Read libzmq's ``Peer-Address`` of an ipc connection, ``localhost:uid:gid:pid``."""
+        try:
+            uid, gid, pid = (int(part) for part in address.rsplit(":", 3)[-3:])
+        except ValueError:
+            return cls()
+        return cls(uid, gid, pid)
+
+
+@dataclass(eq=False, slots=True)
+class Session:
+    """One client.
+
+    ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
+    naming holders.  Safety never depends on it, pins are the kernel's word.  ``says_where`` tells
+    an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
+    asked for.  ``fd`` is the connection's descriptor (libzmq's own: never closed here),
+    ``unread_bytes`` what was sent since the client is known to have read everything.
+    """
+
+    slot: int
+    identity: bytes
+    peer: Peer
+    client: str
+    command: str
+    pidfd: int
+    held: dict[int, list[Resident]] = field(default_factory=dict)
+    held_bytes: int = 0
+    intent: Intent | None = None
+    says_where: bool = False
+    area: Area | None = None
+    requests: int = 0
+    last_request_s: float = 0.0
+    fd: int = -1
+    unread_bytes: int = 0
+
+    @property
+    def asker(self) -> int:
+        """Whose turn its requests and loads count for: the process's, else the session's own."""
+        return self.peer.pid or -self.slot
+
+    def asked_about(self, area: Area) -> None:
+        """The session asked for an area: in the middle of it is where it is, unless it says."""
+        self.area = area
+        if not self.says_where:
+            self.intent = Intent(*area.center)
+
+    def hold(self, residents: Iterable[Resident]) -> None:
+        """The session was handed these segments."""
+        held = self.held
+        for resident in residents:
+            known = held.get(resident.version)
+            if known is None:
+                held[resident.version] = [resident]
+            elif resident in known:
+                continue
+            else:
+                known.append(resident)
+            self.held_bytes += resident.nbytes
+            resident.sessions.add(self.slot)
+
+    def drop(self, versions: Iterable[int]) -> list[Resident]:
+        """The session does not have these versions any more; returns what it had of them."""
+        dropped = [resident for version in versions for resident in self.held.pop(version, ())]
+        for resident in dropped:
+            self.held_bytes -= resident.nbytes
+            resident.sessions.discard(self.slot)
+        return dropped
+
+    def drop_segment(self, resident: Resident) -> None:
+        """The session cannot have this one segment any more."""
+        known = self.held.get(resident.version, [])
+        if resident in known:
+            known.remove(resident)
+            self.held_bytes -= resident.nbytes
+            resident.sessions.discard(self.slot)
+            if not known:
+                del self.held[resident.version]
+
+    def residents(self) -> list[Resident]:
+        """Everything the session holds."""
+        return [resident for known in self.held.values() for resident in known]
+
+    def exclusive_bytes(self) -> int:
+        """Bytes that nobody but this session holds."""
+        return sum(resident.nbytes for resident in self.residents() if len(resident.sessions) == 1)
+
+    def as_holder(self, nbytes: int, cells: int) -> Holder:
+        """This session as a line in a reply."""
+        return Holder(
+            self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells, self.command
+        )
+
+
+def predicted_path(intent: Intent) -> list[tuple[float, float]]:
+    """Where a client is, and where it says it will be: along its route, else straight on.
+
+    Positions every second of the next five; of a route its first vertices, as long as it may be.
+    """
+    path = [(intent.x, intent.y)]
+    if intent.route:
+        path += intent.route[:ROUTE_VERTICES]
+    elif intent.vx or intent.vy:
+        path += [(intent.x + s * intent.vx, intent.y + s * intent.vy) for s in range(1, LOOK_AHEAD_S + 1)]
+    return path
+
+
+def command_of(pid: int) -> str:
+    """Command name of a process, empty where it cannot be read."""
+    if pid <= 0:
+        return ""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    return ""
+
+
+class Sessions:
+    """All sessions of this epoch, by routing identity and slot.
+
+    Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
+    it maps is locked under its slot, also when a later life of the daemon asks whose that is.
+    """
+
+    LIMIT = 4096
+
+    def __init__(self) -> None:
+        self._by_identity: dict[bytes, Session] = {}
+        self._by_slot: dict[int, Session] = {}
+
+    def __len__(self) -> int:
+        return len(self._by_slot)
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter(self._by_slot.values())
+
+    def get(self, identity: bytes) -> Session | None:
+        """The session of a connection."""
+        return self._by_identity.get(identity)
+
+    def by_slot(self, slot: int) -> Session | None:
+        """The session whose lock byte is ``slot``."""
+        return self._by_slot.get(slot)
+
+    @property
+    def full(self) -> bool:
+        """Whether no more sessions are accepted."""
+        return len(self._by_slot) >= self.LIMIT
+
+    def spare(self) -> Session | None:
+        """The session to give up when there are too many; None when everybody has just one.
+
+        It belongs to whoever has most: a process, or all those together whose end nobody tells us.
+        Should it still be alive, it is told ``no_session`` and opens another.
+        """
+        sessions_of = Counter(session.peer.pid if session.pidfd >= 0 else 0 for session in self)
+        owner, count = max(sessions_of.items(), key=lambda item: item[1], default=(0, 0))
+        if owner and count < 2:
+            return None
+        mine = [session for session in self if (session.peer.pid if session.pidfd >= 0 else 0) == owner]
+        return min(mine, key=lambda session: session.last_request_s, default=None)
+
+    def open(self, identity: bytes, peer: Peer, client: str, now_s: float, *, slot: int = 0) -> Session:
+        """Begin a session; ``pidfd`` is -1 where the process cannot be watched.
+
+        ``slot`` is the one that the client had in an earlier life of the daemon and keeps, 0 for none.
+
+        Raises
+        ------
+        NoSession
+            The process has ended already: nobody would ever end its session.
+        """
+        if not 0 < slot <= MAX_SLOT or slot in self._by_slot:
+            slot = secrets.randbelow(MAX_SLOT) + 1
+        pidfd = -1
+        if peer.pid > 0:
+            try:
+                pidfd = os.pidfd_open(peer.pid)
+            except ProcessLookupError:
+                raise NoSession(f"process {peer.pid} has ended") from None
+            except OSError:
+                pidfd = -1  # a kernel without pidfds, or no descriptor left
+        session = Session(
+            slot, identity, peer, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s
+        )
+        self._by_identity[identity] = session
+        self._by_slot[slot] = session
+        return session
+
+    def close(self, session: Session) -> None:
+        """End a session and its bookkeeping."""
+        session.drop(list(session.held))
+        if self._by_identity.get(session.identity) is session:
+            del self._by_identity[session.identity]
+        self._by_slot.pop(session.slot, None)
+        if session.pidfd >= 0:
+            os.close(session.pidfd)
+            session.pidfd = -1
+
+    def poses(self) -> list[tuple[float, float]]:
+        """Where the clients are and are going to be, metres, map frame."""
+        return [pose for s in self if s.intent is not None for pose in predicted_path(s.intent)]

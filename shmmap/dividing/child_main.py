@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process that divides a cloud for the daemon: ``python -m shmmap.dividing.child_main``.
+
+It says what it does on stdout, one JSON document a line: ``{"stage", "done", "total"}`` now and then, and
+``{"error", "message", "hint"}`` before it ends with that error.  It dies with the daemon, and a later one
+goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from typing import Any, Final
+
+from shmmap.dividing.divide import divide
+from shmmap.dividing.settings import DivideSettings
+from shmmap.errors import ShmmapError
+from shmmap.processes.end_with_parent import die_with
+
+__all__ = ["main"]
+
+_NICENESS: Final = 10  # whoever is being served goes first
+_TELL_EVERY_S: Final = 1.0
+
+
+class _Lines:
+    """Progress as lines for the daemon."""
+
+    def __init__(self) -> None:
+        self._name = ""
+        self._done = self._total = 0
+        self._told_s = 0.0
+
+    def stage(self, name: str, total: int) -> None:
+        self._name, self._total, self._done = name, total, 0
+        self._tell()
+
+    def advance(self, points: int) -> None:
+        self._done += points
+        if time.monotonic() - self._told_s >= _TELL_EVERY_S:
+            self._tell()
+
+    def done(self, points: int) -> None:
+        del points
+
+    def _tell(self) -> None:
+        self._told_s = time.monotonic()
+        _say({"stage": self._name, "done": self._done, "total": self._total})
+
+
+def _say(line: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(line) + "\n")
+    sys.stdout.flush()
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CLOUD OUT PARENT_PID``; returns the error's exit code."""
+    cloud, out, parent = arguments[0], arguments[1], int(arguments[2])
+    die_with(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    os.nice(_NICENESS)
+    # clients ask in the cloud's own coordinates, so it keeps its frame
+    settings = DivideSettings(translate="none", resume=True)
+    try:
+        divide([cloud], out, settings, progress=_Lines())
+    except ShmmapError as error:
+        _say({"error": error.code, "message": error.message, "hint": error.hint})
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A large cloud as a map: divided into the cache first, and again whenever it changes.
+
+::
+
+    <cache>/divided/<name>-<key of the path>/map -> <key of the stamp>
+                                             <key of the stamp>/         the divided map
+
+A cloud that did not change is served at once.  Cells are named through the link, so that after a change
+they are new versions of the same cells, not other cells.  A process of its own divides: a hostile file
+costs no daemon, and a stop ends it at once; what was done until then is kept, and gone on from.  The cache
+keeps one division of each cloud, and the clouds used last; those that a daemon serves are not touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from xxhash import xxh3_64_hexdigest
+
+from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.service_manager.notify import notify
+from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
+from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.map_directory import MapDirectory, open_map
+from shmmap.origin.map_layout import absolute_path
+from shmmap.origin.map_origin import MapOrigin
+from shmmap.origin.sidecar import default_cache_directory
+from shmmap.origin.single_pcd import is_served_whole
+from shmmap.origin.stamp import Stamp
+
+__all__ = ["DividedCloud", "find_origin"]
+
+_log = logging.getLogger(__name__)
+
+_RECIPE: Final = "cells of 20 m, frame kept, 1"  # changes whenever the same cloud would be divided otherwise
+_KEPT_CLOUDS: Final = 8
+_MORE_TIME_USEC: Final = 60_000_000
+_LINK: Final = "map"
+_USE_LOCK: Final = ".use"  # held shared by every daemon that serves the cloud
+_MAKING_LOCK: Final = ".making"  # held by the one that divides it
+
+
+def find_origin(config: DaemonConfig) -> MapOrigin:
+    """Return the origin of the map that a daemon is to serve.
+
+    Raises
+    ------
+    MapMissing
+        There is nothing at the path.
+    """
+    path = absolute_path(config.map_path)
+    suffix = os.path.splitext(path)[1].lower()
+    is_cloud = os.path.isfile(path) and suffix in CLOUD_SUFFIXES and not config.metadata
+    if is_cloud and not (suffix == ".pcd" and is_served_whole(path)):
+        cache_dir = absolute_path(config.cache_dir or default_cache_directory())
+        return DividedCloud(path, cache_dir, strict=config.strict)
+    return open_map(
+        path,
+        metadata=config.metadata or None,
+        strict=config.strict,
+        cache_dir=config.cache_dir or None,
+    )
+
+
+class DividedCloud:
+    """The map of one cloud file.
+
+    Parameters
+    ----------
+    path
+        The cloud, absolute.
+    cache_dir
+        Where divided clouds are kept, and indexes of large maps; absolute.
+    strict
+        As in `open_map`.
+    tell
+        Sends ``KEY=value`` lines to the service manager.
+    """
+
+    def __init__(
+        self, path: str, cache_dir: str, *, strict: bool = False, tell: Callable[..., None] = notify
+    ) -> None:
+        self.path = path
+        self._cache_dir = cache_dir
+        stem = os.path.basename(path).rpartition(".")[0][:64]
+        self._clouds = os.path.join(cache_dir, "divided")
+        self._directory = os.path.join(self._clouds, f"{stem}-{xxh3_64_hexdigest(os.fsencode(path))}")
+        self._strict = strict
+        self._tell = tell
+        self._use_lock = -1
+
+    def load(self, *, fresh: bool = False) -> Catalogue:
+        """Divide the cloud unless that is done, and return the catalogue of its cells.
+
+        Raises
+        ------
+        MapMissing, MapDataError, CannotWrite
+            The cloud is not there, cannot be read, or does not fit in the cache.
+        """
+        try:
+            stamp = Stamp.of(os.stat(self.path))
+        except OSError as error:
+            raise MapMissing(f"cannot read {self.path}: {error.strerror}") from error
+        name = xxh3_64_hexdigest(json.dumps([_RECIPE, *stamp]).encode())
+        out = os.path.join(self._directory, name)
+        link = os.path.join(self._directory, _LINK)
+        try:
+            self._hold()
+            with self._alone():
+                if not os.path.isdir(out):  # another daemon may have divided it
+                    self._divide(out)
+                _point(link, name)
+                self._remove_others(name)
+            self._sweep()
+        except OSError as error:
+            raise CannotWrite(
+                f"{error.filename or self._directory}: {error.strerror}", hint="name another --cache-dir"
+            ) from error
+        return MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
+
+    def _divide(self, out: str) -> None:
+        _log.info("dividing %s into %s", self.path, out)
+        command = [sys.executable, "-m", "shmmap.dividing.child_main", self.path, out, str(os.getpid())]
+        failure: dict[str, Any] = {}
+        with subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+            errors="replace",  # libraries may write there, too
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            cwd="/",  # nothing is imported from where the daemon happens to run
+        ) as process:
+            try:
+                stage = ""
+                for line in process.stdout or ():
+                    told = _told(line)
+                    if "error" in told:
+                        failure = told
+                    if "stage" not in told:
+                        continue
+                    if told["stage"] != stage:
+                        stage = told["stage"]
+                        _log.info("%s: %s", os.path.basename(self.path), stage)
+                    part = f" {told['done'] / told['total']:.0%}" if told["total"] else ""
+                    self._tell(f"STATUS={stage} {self.path}{part}", f"EXTEND_TIMEOUT_USEC={_MORE_TIME_USEC}")
+                code = process.wait()
+            except BaseException:
+                process.kill()
+                raise
+        if failure:
+            raise error_from_wire(failure["error"], failure["message"], failure["hint"])
+        if code or not os.path.isdir(out):
+            raise InternalError(f"dividing {self.path} ended with {code}", hint="shmmap divide says more")
+
+    # --- the cache ------------------------------------------------------------------------------
+
+    def _hold(self) -> None:
+        """Say that this process serves the cloud, for as long as it lives."""
+        if self._use_lock >= 0:
+            return
+        while True:
+            os.makedirs(self._directory, mode=0o700, exist_ok=True)
+            path = os.path.join(self._directory, _USE_LOCK)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fcntl.flock(fd, fcntl.LOCK_SH)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(fd), os.stat(path)):
+                    os.utime(fd)
+                    self._use_lock = fd
+                    return
+            os.close(fd)  # another daemon has just removed it
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Wait until no other daemon is dividing the cloud."""
+        path = os.path.join(self._directory, _MAKING_LOCK)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(fd)
+
+    def _remove_others(self, present: str) -> None:
+        """Remove divisions of what the cloud was before, and what was begun of them."""
+        for entry in os.scandir(self._directory):
+            if entry.is_dir(follow_symlinks=False) and entry.name != present:
+                shutil.rmtree(entry.path, ignore_errors=True)
+
+    def _sweep(self) -> None:
+        """Remove the clouds that were used longest ago, if there are too many and nobody serves them."""
+        used: list[tuple[int, str]] = []
+        for entry in os.scandir(self._clouds):
+            with contextlib.suppress(OSError):
+                used.append((os.stat(os.path.join(entry.path, _USE_LOCK)).st_mtime_ns, entry.path))
+        for _, path in sorted(used, reverse=True)[_KEPT_CLOUDS:]:
+            with contextlib.suppress(OSError):
+                fd = os.open(os.path.join(path, _USE_LOCK), os.O_RDWR | os.O_CLOEXEC)
+                try:
+                    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    _log.info("removing %s from the cache", path)
+                    shutil.rmtree(path)
+                finally:
+                    os.close(fd)
+
+
+def _point(link: str, name: str) -> None:
+    """Let ``link`` lead to ``name``, in one step."""
+    if os.path.islink(link) and os.readlink(link) == name:
+        return
+    interim = f"{link}.{os.getpid()}"
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(interim)
+    os.symlink(name, interim)
+    os.replace(interim, link)
+
+
+def _told(line: str) -> dict[str, Any]:
+    """What a line of the divider says, empty if it is not its own."""
+    try:
+        told = json.loads(line)
+    except ValueError:
+        return {}
+    return told if isinstance(told, dict) else {}

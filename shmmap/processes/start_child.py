@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starting a worker: a process of its own, with a channel of packets to it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from typing import Final
+
+__all__ = ["MAX_PACKET_BYTES", "channel", "start_worker"]
+
+MAX_PACKET_BYTES: Final = 1 << 19
+"""A job may name its cell and 65 neighbours by paths of 4095 bytes each."""
+
+
+def channel() -> tuple[socket.socket, socket.socket]:
+    """Return both ends of a channel, the parent's first, which takes the longest job there is."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_PACKET_BYTES)
+    return ours, theirs
+
+
+def start_worker(
+    module: str, *arguments: str, new_session: bool
+) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    """Start ``python -m MODULE CHANNEL_FD PARENT_PID ARGUMENT...``.
+
+    Parameters
+    ----------
+    module
+        It has the kernel end it with its parent, see `shmmap.processes.end_with_parent`.
+    *arguments
+        What else it is told.
+    new_session
+        Whether keys pressed at the parent's terminal are kept from it.
+
+    Returns
+    -------
+    The process, and our end of the channel.
+    """
+    ours, theirs = channel()
+    try:
+        with theirs:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, str(theirs.fileno()), str(os.getpid()), *arguments],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                # one worker, one core: Open3D would start a thread for each
+                env={
+                    "OMP_NUM_THREADS": "1",
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+                },
+                cwd="/",  # nothing is imported from where the parent happens to run
+                start_new_session=new_session,
+            )
+    except BaseException:
+        ours.close()
+        raise
+    return process, ours

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `top` and `map` draw, and how the cache is judged, from numbers made up here."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+
+import pytest
+
+from shmmap.cli.screens.cache_verdict import cache_verdict
+from shmmap.cli.screens.map_scene import GLYPHS, Scene, html_page, svg, terminal_rows
+from shmmap.cli.screens.top_screen import budget_parts, screen
+from shmmap.statistics.cell_rows import CellRow
+from shmmap.statistics.client_rows import ClientRow, Window
+from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
+from shmmap.statistics.histogram import BUCKETS
+from shmmap.statistics.identity import DaemonIdentity
+from shmmap.statistics.layout import State, plan
+from shmmap.statistics.reader import Snapshot
+
+MIB = 1 << 20
+IDENTITY = DaemonIdentity(
+    77, 1, 1, 5, "unit", "/run/x.sock", "/maps/city", 7, "/dev/shm", "/maps/", "1.2.3", 5 * 10**9
+)
+CLIENT = ClientRow(
+    3, 4242, 1000, 12, 5 * MIB, 1234, 9 * 10**9, "localization", "python3",
+    (50.0, 30.0), 0.5, Window("circle", 50.0, 30.0, 25.0, 25.0),
+)  # fmt: skip
+
+
+def counters(**values: int) -> dict[str, int]:
+    assert set(values) <= {c.name for c in COUNTERS}
+    return {c.name: values.get(c.name, 0) for c in COUNTERS}
+
+
+def snapshot(values: dict[str, int], clients: list[ClientRow], *, state: str = "healthy") -> Snapshot:
+    durations = [0] * (len(HISTOGRAMS) * (1 + BUCKETS))
+    durations[1 + 40] = 99  # of the first histogram
+    durations[1 + 60] = 1
+    beat = State(1, 10 * 10**9, 0, 0, 0, tuple(values.values()), len(clients), durations)
+    found = Snapshot(state, IDENTITY, plan(COUNTERS, HISTOGRAMS), beat, beat_age_s=0.1)  # type: ignore[arg-type]
+    found.__dict__["clients"] = clients
+    return found
+
+
+def text(found: Snapshot, *, width: int = 100, max_clients: int = 10) -> str:
+    lines = screen(found, IDENTITY, width=width, max_clients=max_clients)
+    return "\n".join("".join(piece for piece, _ in line) for line in lines)
+
+
+FULL = counters(
+    budget_bytes=100 * MIB, bytes_resident=60 * MIB, bytes_pinned=50 * MIB, bytes_zombie=10 * MIB,
+    bytes_reserved=5 * MIB, hits=90, misses=10, hits_10s=3, misses_10s=1, map_cells=1234, sessions=1,
+)  # fmt: skip
+
+
+def test_the_budget_is_split_without_a_rest() -> None:
+    parts = budget_parts(FULL)
+    assert parts == {
+        "pinned": 40 * MIB, "idle": 20 * MIB, "zombie": 10 * MIB, "reserved": 5 * MIB, "free": 25 * MIB,
+    }  # fmt: skip
+    crowded = counters(budget_bytes=MIB, bytes_resident=MIB, bytes_pinned=5 * MIB, bytes_statistics=MIB)
+    assert budget_parts(crowded)["free"] == 0
+
+
+@pytest.mark.parametrize("width", [40, 80, 100, 250])
+def test_the_bar_is_as_long_as_there_is_room(width: int) -> None:
+    lines = text(snapshot(FULL, []), width=width).splitlines()
+    bar = next(line for line in lines if "██" in line).strip()
+    assert len(bar) == width - 14
+    assert [bar.count(glyph) for glyph in "█▓▒░·"] == pytest.approx(
+        [share * len(bar) for share in (0.4, 0.2, 0.1, 0.05, 0.25)], abs=1.0
+    )
+
+
+def test_the_screen_tells_what_an_operator_asks() -> None:
+    shown = text(snapshot(FULL, [CLIENT]))
+    for piece in (
+        "healthy", "pid 77", "1,234 cells", "10 s: 75.0 %", "1 min: –", "large enough", "p50", "p99",
+        "localization", "4242", "5.0 MiB", "50.0,30.0", "1.0 s",
+    ):  # fmt: skip
+        assert piece in shown, piece
+
+
+def test_a_daemon_that_does_not_beat_says_so() -> None:
+    assert "STOPPED  not beating" in text(snapshot(FULL, [], state="stopped"))
+    assert "nobody is connected" in text(snapshot(counters(), []))
+    assert "HUNG" in text(snapshot(FULL, [], state="hung"))
+
+
+def test_more_clients_than_lines_are_counted() -> None:
+    many = [CLIENT._replace(session=n) for n in range(30)]
+    shown = text(snapshot(FULL | {"sessions": 300}, many), max_clients=5)
+    assert shown.count("localization") == 5
+    assert "and 295 more" in shown
+
+
+@pytest.mark.parametrize(
+    ("values", "too_small", "word"),
+    [
+        ({}, False, "nothing had to be evicted"),
+        ({"evictions_10min": 50, "misses_10min": 500, "loads_after_eviction_10min": 5}, False, "hardly any"),
+        ({"evictions_10min": 50, "misses_10min": 50, "loads_after_eviction_10min": 30}, True, "60 %"),
+        ({"refused_over_budget_10min": 2, "bytes_pinned": MIB, "budget_bytes": MIB}, True, "2 cells refused"),
+    ],
+)
+def test_the_cache_is_judged(values: dict[str, int], too_small: bool, word: str) -> None:
+    verdict = cache_verdict(counters(**values))
+    assert verdict.too_small == too_small
+    assert word in verdict.why
+
+
+def cell(name: str, x: float, y: float, state: str) -> CellRow:
+    return CellRow(name, "points", 1, "0" * 16, state, 4096, 10, (x, y, x + 20, y + 20), 3, 5, 7)
+
+
+SCENE = Scene(
+    bounds=(0.0, 0.0, 100.0, 60.0),
+    disk=[(f"{x}_{y}.pcd", (x, y, x + 20.0, y + 20.0)) for x in range(0, 100, 20) for y in range(0, 60, 20)],
+    rows=[cell("0_0.pcd", 0, 0, "resident"), cell("80_40.pcd", 80, 40, "zombie"),
+          cell("80_0.pcd", 80, 0, "zombie"), cell("80_0.pcd", 80, 0, "resident")],
+    clients=[CLIENT],
+    now_ns=10 * 10**9,
+    title="<city> & more",
+    note="a note",
+)  # fmt: skip
+
+
+def test_the_terminal_picture_has_north_on_top() -> None:
+    grid = terminal_rows(SCENE, 50, 30)
+    assert (len(grid[0]), len(grid)) == (50, 15)  # characters are twice as high as wide
+    assert grid[-1][0] == "resident"
+    assert grid[0][-1] == "zombie"
+    assert grid[-1][-1] == "resident"  # of a cell's segments the one that can be handed out is shown
+    assert grid[0][0] == "disk"
+    assert grid[7][25] == "client"
+    assert sum(row.count("window") for row in grid) > 20
+    assert {state for row in grid for state in row} <= set(GLYPHS)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 3), (200, 100)])
+def test_any_terminal_will_do(size: tuple[int, int]) -> None:
+    grid = terminal_rows(SCENE, *size)
+    assert len(grid) <= size[1]
+    assert all(len(row) == len(grid[0]) <= size[0] for row in grid)
+    square = CLIENT._replace(window=Window("box", 1e6, 0.0, 5.0, 900.0), pose=(1e9, 0.0))
+    empty = Scene((0.0, 0.0, 1.0, 1.0), [], [], [square], 0, "", "")
+    assert terminal_rows(empty, *size)
+
+
+def test_the_picture_is_xml_with_tooltips() -> None:
+    root = ElementTree.fromstring(svg(SCENE))
+    titles = [node.text or "" for node in root.iter("{http://www.w3.org/2000/svg}title")]
+    assert titles[0] == "<city> & more"
+    assert any("0_0.pcd" in title and "3 hits" in title for title in titles)
+    assert any("80_0.pcd" in title and "zombie" in title and "resident" in title for title in titles)
+    assert any("localization, pid 4242" in title for title in titles)
+    assert sum("on disk" in title for title in titles) == 15 - 3
+    boxed = CLIENT._replace(window=Window("square", 50.0, 30.0, 25.0, 25.0), heading=None)
+    assert 'rect class="window"' in svg(Scene(**{**vars(SCENE), "clients": [boxed]}))
+
+
+def test_names_of_clients_on_one_another_stand_side_by_side() -> None:
+    beside = CLIENT._replace(client="perception")
+    far = CLIENT._replace(client="planning", pose=(10.0, 30.0))
+    root = ElementTree.fromstring(svg(Scene(**{**vars(SCENE), "clients": [CLIENT, beside, far]})))
+    texts = root.iter("{http://www.w3.org/2000/svg}text")
+    labels = [node.text for node in texts if node.get("class") == "label"]
+    assert labels == ["localization, perception", "planning"]
+
+
+class Tags(HTMLParser):
+    """Notes what a page refers to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.references: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        del tag
+        self.references += [value or "" for name, value in attrs if name in ("src", "href")]
+
+
+def test_the_page_needs_nothing_else() -> None:
+    page = html_page(SCENE)
+    tags = Tags()
+    tags.feed(page)
+    assert tags.references == []
+    assert "&lt;city&gt; &amp; more" in page
+    assert "<td>localization</td><td>4242</td>" in page
+    assert "Nobody is connected" in html_page(Scene(**{**vars(SCENE), "clients": []}))

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text for people, JSON for programs."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+
+from shmmap.cli.screens.output import (
+    Column,
+    columns_that_fit,
+    format_bytes,
+    format_duration,
+    print_json,
+    print_pairs,
+    print_table,
+)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+COLUMNS = (Column("CELL"), Column("POINTS", "right"))
+ROWS = [["0_0.pcd", "7"], ["[red]20_0.pcd", "1,234"]]
+
+
+def test_plain_table_is_aligned(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(COLUMNS, ROWS)
+    assert capsys.readouterr().out == (
+        "CELL           POINTS\n"
+        "0_0.pcd             7\n"
+        "[red]20_0.pcd   1,234\n"
+    )  # fmt: skip
+
+
+def test_table_on_a_terminal_is_styled_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    print_table(COLUMNS, ROWS)
+    assert "\x1b[1m" in terminal.getvalue()
+    assert "[red]20_0.pcd" in terminal.getvalue(), "names are no markup"
+    for name, value in (("NO_COLOR", "1"), ("TERM", "dumb")):
+        with monkeypatch.context() as changed:
+            changed.setenv(name, value)
+            changed.setattr("sys.stdout", terminal := Terminal())
+            print_table(COLUMNS, ROWS)
+            assert "\x1b" not in terminal.getvalue()
+
+
+WIDE = (Column("CELL"), Column("X", "right", spare=1), Column("Y", "right", spare=1), Column("ID", spare=2))
+WIDE_ROWS = [["town_0_0.pcd", "100", "200", "0123456789abcdef"]]
+
+
+@pytest.mark.parametrize(
+    ("columns", "names"),
+    [(43, ["CELL", "X", "Y", "ID"]), (42, ["CELL", "X", "Y"]), (24, ["CELL", "X", "Y"]), (23, ["CELL"])],
+)
+def test_a_narrow_terminal_goes_without_spare_columns(columns: int, names: list[str]) -> None:
+    assert [WIDE[index].name for index in columns_that_fit(WIDE, WIDE_ROWS, columns)] == names
+
+
+def test_a_narrow_terminal_is_told_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("COLUMNS", "23")
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    print_table(WIDE, WIDE_ROWS)
+    assert "town_0_0.pcd" in terminal.getvalue()
+    assert "no room for X, Y, ID" in terminal.getvalue()
+    assert "100" not in terminal.getvalue()
+
+
+def test_long_pairs_go_on_below_themselves_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    print_pairs([("loads", "16 done, 0 queued, 0 failed"), ("map", "/a/path/longer/than/the/line")])
+    assert terminal.getvalue() == (
+        "loads  16 done, 0 queued, 0\n"
+        "       failed\n"
+        "map    /a/path/longer/than/the/line\n"
+    )  # fmt: skip
+
+
+def test_pairs(capsys: pytest.CaptureFixture[str]) -> None:
+    print_pairs([("map", "town"), ("cells", "300"), ("note", "")])
+    assert capsys.readouterr().out == "map    town\ncells  300\nnote\n"
+
+
+def test_json_is_one_document_and_refuses_nan(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"a": [1, 2.5], "b": "ü"})
+    text = capsys.readouterr().out
+    assert json.loads(text) == {"a": [1, 2.5], "b": "ü"}
+    assert text.count("\n") == 1
+    with pytest.raises(ValueError, match="JSON"):
+        print_json(float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (0, "0 B"), (1023, "1023 B"), (1024, "1.0 KiB"), (99.9 * 1024, "99.9 KiB"), (99.96 * 1024, "100 KiB"),
+        (1023.4 * 1024, "1023 KiB"), (1023.6 * 1024, "1.0 MiB"), (200 << 20, "200 MiB"), (3 << 29, "1.5 GiB"),
+        (7 << 40, "7168 GiB"),
+    ],
+)  # fmt: skip
+def test_bytes(count: float, text: str) -> None:
+    assert format_bytes(count) == text
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "text"),
+    [
+        (0.0, "0 us"), (12e-6, "12 us"), (3.4e-3, "3.4 ms"), (0.9996, "1.0 s"), (5, "5.0 s"), (180, "3 min"),
+        (7200, "2 h"), (3 * 86400, "3 d"),
+    ],
+)  # fmt: skip
+def test_durations(duration_s: float, text: str) -> None:
+    assert format_duration(duration_s) == text

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads that fail, loaders that lose their mind, descriptors that run out."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from shmmap.daemon.cache import ledger
+from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading.worker_pool import Worker
+from shmmap.layers.versions import MAX_NEIGHBOURS
+from shmmap.processes.start_child import MAX_PACKET_BYTES, channel
+from shmmap.protocol.messages import Area, CircleMessage, Selected
+from tests.support.daemon_process import wait_readable
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon
+
+
+def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: DividedMap) -> None:
+    """After 1, 2, 4, ... and at most 30 seconds, however often somebody asks; at once when it changed."""
+    path = small_map.pcd_dir / "0_0.pcd"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3])
+    one = inner(small_map.root)
+    session, request = one.session(), 0
+    one.stop_clock()
+
+    def tries() -> int:
+        nonlocal request
+        before = one.statistics.values["loads_started"]
+        for _ in range(3):
+            request += 1
+            one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+            assert [failure.code for failure in one.cells_of(request).failed] == ["load_failed"]
+        return one.statistics.values["loads_started"] - before
+
+    assert tries() == 1
+    for delay_s in (1, 2, 4, 8, 16, 30, 30):
+        one.offset_s += delay_s - 0.01
+        assert tries() == 0
+        one.offset_s += 0.02
+        assert tries() == 1
+    path.write_bytes(whole)
+    one.cells.selected(session, Selected(999, ("0_0.pcd",), wait=30.0), one.now_s())
+    assert len(one.cells_of(999).cells) == 1
+
+
+def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each try costs a loader: that somebody asks again is no reason for another one."""
+    monkeypatch.setenv("SHMMAP_TEST_WORKER", "crash:0_0.pcd")
+    one = inner(small_map.root)
+    session = one.session()
+    one.stop_clock()
+    for request, (passed_s, crashes) in enumerate([(0.0, 1), (0.99, 1), (0.02, 2), (1.98, 2), (0.03, 3)]):
+        one.offset_s += passed_s
+        one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+        assert [failure.code for failure in one.cells_of(request).failed] == ["load_failed"]
+        assert one.statistics.values["worker_crashes"] == crashes
+    path = small_map.pcd_dir / "0_0.pcd"
+    path.write_bytes(path.read_bytes())
+    one.cells.selected(session, Selected(99, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.cells_of(99)
+    assert one.statistics.values["worker_crashes"] == 4, "another state of the file is tried at once"
+
+
+def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last ones of each kind; of those forgotten nothing stays."""
+    monkeypatch.setattr(ledger, "MOST_FAILURES", 3)
+    books = ledger.Residency(1 << 20)
+
+    def fail(number: int, code: str) -> Key:
+        key = Key(f"/{number}.pcd", "points")
+        load = books.want(key, 0, 1.0)
+        books.start(load, 0.0)
+        books.failed(load, ledger.Failure(code, "", None, 0.0, 0.0))
+        return key
+
+    broken = [fail(number, "load_failed") for number in (0, 1, 2, 0, 3, 4)]
+    full = [fail(number, "no_space") for number in (5, 6)]
+    assert set(books.slots) == {broken[0], broken[4], broken[5], *full}
+    books.clear_failures(frozenset({"no_space"}))
+    assert set(books.slots) == {broken[0], broken[4], broken[5]}
+
+
+class Puppet:
+    """A loader whose part the test plays: a process that only sleeps, and the other end of its channel."""
+
+    def __init__(self, one: InnerDaemon) -> None:
+        self.one = one
+        ours, self.channel = channel()
+        ours.setblocking(False)
+        process = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
+        self.worker = Worker(process, ours, ready=True)
+        one.pool._workers[self.worker.fd] = self.worker
+        one.pool._watch(self.worker.fd)
+
+    def queue(self, count: int) -> list[worker_messages.Job]:
+        """Run the daemon until it has handed out this many jobs."""
+        self.one.run_until(lambda: len(self.worker.queue) == count)
+        return [job for job in self.worker.queue.values() if isinstance(job, worker_messages.Job)]
+
+    def say(self, message: object, fd: int | None = None) -> None:
+        socket.send_fds(self.channel, [worker_messages.encode(message)], [] if fd is None else [fd])
+
+    def done(self, job: worker_messages.Job) -> worker_messages.Done:
+        status = os.stat(job.path)
+        stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+        return worker_messages.Done(job.number, 4096, 1, 0, 0.0, 1.0, stamp, 1)
+
+    def segment(self) -> int:
+        fd = self.one.directory.create()
+        os.posix_fallocate(fd, 0, 4096)
+        return fd
+
+
+@pytest.fixture
+def puppet(inner: Inner, small_map: DividedMap) -> Puppet:
+    return Puppet(inner(small_map.root))
+
+
+def ask(one: InnerDaemon, request: int) -> None:
+    one.cells.area(one.session(), Area(request, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+
+
+@pytest.mark.parametrize(
+    "nonsense", [b"\xc1", b"\x91\xa4what", b"\x90", b"\xff" * 1000, b"\x92\xa4done\xc0", b"\x91\xc4\x01x"]
+)
+def test_a_loader_that_sends_nonsense_is_ended(puppet: Puppet, nonsense: bytes) -> None:
+    """A file may have had its way with the loader's memory: it costs the cell it was at."""
+    one = puppet.one
+    ask(one, 1)
+    first = puppet.queue(4)[0]
+    puppet.channel.send(nonsense)
+    reply = one.cells_of(1)
+    assert puppet.worker.process.returncode == -signal.SIGKILL
+    assert [failure.code for failure in reply.failed] == ["load_failed"]
+    assert first.path in reply.failed[0].message
+    assert len(reply.cells) == 3
+    assert one.books.reserved_bytes == 0
+    puppet.channel.close()
+
+
+def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
+    """It dies with jobs unread: the kernel reports that before what it said last."""
+    one = puppet.one
+    ask(one, 1)
+    first, second = puppet.queue(4)[:2]
+    fd = puppet.segment()
+    puppet.say(worker_messages.Segment(), fd)
+    puppet.say(puppet.done(first))
+    os.close(fd)
+    puppet.channel.close()
+    puppet.worker.process.kill()
+    reply = one.cells_of(1)
+    (failure,) = reply.failed
+    assert second.path in failure.message, "the second is what it died of"
+    assert one.store.wire_id(first.cell_id) in [cell.id for cell in reply.cells]
+    assert len(reply.cells) == 3
+
+
+def test_a_load_that_took_too_long_is_not_tried_again_at_once(
+    puppet: Puppet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is its file looked at: the file system may be what hangs, and would take the loop with it."""
+    one = puppet.one
+    one.stop_clock()
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
+    puppet.queue(1)
+    monkeypatch.setattr(
+        "shmmap.daemon.loading.scheduler._stamp_of", lambda path: pytest.fail(f"looks at {path}")
+    )
+    one.offset_s += 31.0
+    for request in (1, 2):
+        one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=300.0), one.now_s())
+        assert [failure.code for failure in one.cells_of(request).failed] == ["load_timeout"]
+    one.offset_s += 1.01
+    one.cells.selected(session, Selected(3, ("0_0.pcd",), wait=300.0), one.now_s())
+    assert len(one.cells_of(3).cells) == 1
+    puppet.channel.close()
+
+
+class Unkillable:
+    """A process that SIGKILL does not end: it waits in the kernel for a disk that never answers."""
+
+    def __init__(self) -> None:
+        self.code: int | None = None
+        self.killed = False
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def poll(self) -> int | None:
+        return self.code
+
+    def wait(self, timeout: float | None = None) -> int:
+        assert timeout is not None, "this would be for ever"
+        raise subprocess.TimeoutExpired("loader", timeout)
+
+
+def test_a_loader_that_cannot_be_killed(puppet: Puppet) -> None:
+    """The loop goes on without it, and starts no other in its place until it has ended."""
+    one, sleeper = puppet.one, puppet.worker.process
+    stuck = Unkillable()
+    puppet.worker.process = stuck  # type: ignore[assignment]
+    session = one.session()
+    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
+    puppet.queue(1)
+    one.offset_s += 31.0
+    assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
+    assert stuck.killed
+    assert not one.pool.has_room
+    stuck.code = -signal.SIGKILL
+    one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=300.0), one.now_s())
+    assert len(one.cells_of(2).cells) == 1
+    sleeper.kill()
+    sleeper.wait()
+    puppet.channel.close()
+
+
+def test_the_longest_job_there_is(puppet: Puppet) -> None:
+    """All neighbours that a layer may look at, on the longest paths that a file system has."""
+    path = "/" + "p" * 4094
+    job = worker_messages.Job(
+        1, path, path, "denoise", (0.0,) * 4, "map", 1 << 20, "", (path,) * (MAX_NEIGHBOURS + 1)
+    )
+    assert puppet.one.pool.submit(job, 0.0)
+    assert worker_messages.decode_to_worker(puppet.channel.recv(MAX_PACKET_BYTES)) == job
+    puppet.channel.close()
+
+
+def test_a_signal_without_a_name(puppet: Puppet) -> None:
+    one = puppet.one
+    ask(one, 1)
+    puppet.queue(4)
+    puppet.worker.process.send_signal(signal.SIGRTMIN + 5)
+    puppet.worker.process.wait()
+    puppet.channel.close()
+    assert ["signal 39" in failure.message for failure in one.cells_of(1).failed] == [True]
+
+
+def test_done_without_a_segment(puppet: Puppet) -> None:
+    """As when this process has no descriptor left: the load fails, nothing stays reserved for it."""
+    one = puppet.one
+    one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    (job,) = puppet.queue(1)
+    puppet.say(puppet.done(job))
+    assert [failure.code for failure in one.cells_of(1).failed] == ["load_failed"]
+    assert one.books.reserved_bytes == 0
+    assert one.books.slots[Key(job.cell_id, "points")].load is None
+    puppet.channel.close()
+
+
+def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
+    """Numbers that were never given, needs of nothing: no harm."""
+    one = puppet.one
+    ask(one, 1)
+    queue = puppet.queue(4)
+    puppet.say(worker_messages.Failed(12345, "load_failed", "no such job"))
+    puppet.say(worker_messages.Need(12346, 1 << 20))
+    puppet.say(worker_messages.Need(queue[0].number, -5))
+    for job in queue:
+        fd = puppet.segment()
+        puppet.say(worker_messages.Segment(), fd)
+        puppet.say(puppet.done(job))
+        os.close(fd)
+    assert len(one.cells_of(1).cells) == 4
+    granted = worker_messages.decode_to_worker(
+        next(d for d in iter(lambda: puppet.channel.recv(65536), b"") if b"grant" in d)
+    )
+    assert granted == worker_messages.Grant(queue[0].number)
+    assert (one.books.reserved_bytes, one.store.loads.hungry) == (0, {})
+    puppet.channel.close()
+
+
+def test_more_needed_than_there_will_ever_be(puppet: Puppet) -> None:
+    one = puppet.one
+    one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    (job,) = puppet.queue(1)
+    assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == job
+    puppet.say(worker_messages.Need(job.number, one.books.budget_bytes))
+    one.run_until(lambda: wait_readable([puppet.channel.fileno()], 0.0))
+    assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == worker_messages.Refuse(job.number)
+    puppet.say(worker_messages.Failed(job.number, "over_budget", "it does not fit"))
+    assert [failure.code for failure in one.cells_of(1).failed] == ["over_budget"]
+    puppet.channel.close()
+
+
+def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
+    """What cannot be looked at is taken for pinned."""
+    one = inner(small_map.root)
+    one.cells.area(one.session(), Area(1, EVERYWHERE, wait=30.0), one.now_s())
+    assert len(one.cells_of(1).cells) == 16
+    for resident in list(one.books.residents()):
+        one.store.evict(resident, one.now_s())
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest = os.dup(0)
+    os.close(lowest)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, limits[1]))
+    try:
+        one.offset_s += 5.0
+        one.turn()
+        assert len(one.books.zombies) == 16, "freed without a look"
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    one.offset_s += 5.0
+    one.run_until(lambda: not one.books.zombies)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One daemon per instance, whatever becomes of the lock's file."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.host.instance_lock import InstanceLock
+from shmmap.errors import ConfigError, InstanceBusy
+
+HOLDER = """
+import sys
+from shmmap.daemon.host.instance_lock import InstanceLock
+lock = InstanceLock(sys.argv[1])
+print("locked", flush=True)
+sys.stdin.readline()
+lock.release()
+print("released", flush=True)
+"""
+
+
+def holder(path: Path) -> subprocess.Popen[str]:
+    """Start another process that takes the lock."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "locked\n"
+    return process
+
+
+def end(process: subprocess.Popen[str], number: signal.Signals = signal.SIGKILL) -> None:
+    process.send_signal(number)
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            pipe.close()
+
+
+def test_another_process_holds_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.lock"
+    process = holder(path)
+    try:
+        with pytest.raises(InstanceBusy) as failure:
+            InstanceLock(str(path))
+        assert f"pid {process.pid}" in failure.value.message
+        assert failure.value.exit_code == 75
+        assert path.exists(), "a refused one takes nothing away"
+    finally:
+        end(process)
+
+
+def test_a_file_left_by_a_killed_process_is_no_hindrance(tmp_path: Path) -> None:
+    path = tmp_path / "a.lock"
+    end(holder(path))
+    assert path.exists()
+    lock = InstanceLock(str(path))
+    assert path.read_text() == f"{os.getpid()}\n"
+    assert path.stat().st_mode & 0o777 == 0o600
+    lock.release()
+    assert not path.exists()
+    InstanceLock(str(path)).release()
+
+
+def test_a_file_with_anything_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.lock"
+    path.write_bytes(b"\xff" * 1000)
+    lock = InstanceLock(str(path))
+    assert path.read_text() == f"{os.getpid()}\n"
+    lock.release()
+
+
+def test_a_predecessor_whose_file_was_removed_leaves_its_successor_s_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.lock"
+    first = InstanceLock(str(path))
+    path.unlink()
+    second = holder(path)
+    try:
+        first.release()
+        assert path.exists()
+        with pytest.raises(InstanceBusy):
+            InstanceLock(str(path))
+        assert second.stdin is not None
+        assert second.stdout is not None
+        second.stdin.write("\n")
+        second.stdin.flush()
+        assert second.stdout.readline() == "released\n"
+        assert not path.exists()
+    finally:
+        end(second)
+
+
+def test_released_though_the_file_is_gone(tmp_path: Path) -> None:
+    lock = InstanceLock(str(tmp_path / "a.lock"))
+    (tmp_path / "a.lock").unlink()
+    lock.release()
+    assert os.listdir(tmp_path) == []
+
+
+def test_where_no_file_can_be(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").write_text("precious")
+    (tmp_path / "link.lock").symlink_to(tmp_path / "elsewhere")
+    for path in (tmp_path / "missing" / "a.lock", tmp_path / "link.lock", tmp_path):
+        with pytest.raises(ConfigError) as failure:
+            InstanceLock(str(path))
+        assert failure.value.key == "runtime_dir"
+    assert (tmp_path / "elsewhere").read_text() == "precious"

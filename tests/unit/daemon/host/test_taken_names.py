@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""In /dev/shm everybody may make files, also under the names that the daemon is about to need.
+
+A directory stands for a stranger's file here: it cannot be replaced by renaming either, not even by root.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from shmmap.daemon.cache.ledger import Resident
+from shmmap.protocol.messages import Selected
+from shmmap.segment.names import zombie_name
+from shmmap.statistics.reader import read_statistics
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import InnerDaemon
+
+Inner = Callable[..., InnerDaemon]
+
+
+def load(one: InnerDaemon, request: int) -> Resident:
+    one.cells.selected(one.session(), Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+    assert len(one.cells_of(request).cells) == 1
+    return one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+
+
+@contextmanager
+def taken(one: InnerDaemon, name: str) -> Iterator[None]:
+    os.mkdir(f"{one.shm_dir}{name}")
+    yield
+    os.rmdir(f"{one.shm_dir}{name}")
+
+
+def shown(one: InnerDaemon) -> dict[str, str]:
+    """Segments and their states as the statistics tell."""
+    one.statistics.beat()
+    return {cell.segment: cell.state for cell in read_statistics("inner", one.shm_dir).cells}
+
+
+def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> None:
+    """It retires under another one, is told of under that, comes back, and is freed in the end."""
+    one = inner(small_map.root)
+    first = load(one, 1)
+    old = first.name
+    with taken(one, zombie_name(old)), open(f"{one.shm_dir}{old}", "rb"):
+        one.store.evict(first, one.now_s())
+        assert first.name != old
+        assert Path(f"{one.shm_dir}{zombie_name(first.name)}").exists()
+        assert shown(one) == {first.name.rpartition(".")[2]: "zombie"}
+        assert load(one, 2) is first
+        assert shown(one) == {first.name.rpartition(".")[2]: "resident"}
+        assert Path(f"{one.shm_dir}{first.name}").exists()
+    one.store.evict(first, one.now_s())
+    one.run_until(lambda: not one.books.zombies)
+    assert (one.books.zombie_bytes, one.books.resident_bytes, shown(one)) == (0, 0, {})
+    assert [name for name in os.listdir(one.shm_dir) if not name.endswith("statistics")] == []
+
+
+def test_the_name_it_had_before(inner: Inner, small_map: DividedMap) -> None:
+    """It cannot come back, so that the cell is loaded anew; the retired one goes when its reader does."""
+    one = inner(small_map.root)
+    first = load(one, 1)
+    with open(f"{one.shm_dir}{first.name}", "rb"):
+        one.store.evict(first, one.now_s())
+        with taken(one, first.name):
+            assert load(one, 2) is not first
+        assert one.books.zombies
+    one.run_until(lambda: not one.books.zombies)

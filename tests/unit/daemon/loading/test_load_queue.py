@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads in fair turns: nearest first for each, and nobody waits for all that another one asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import count
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap.daemon.loading.load_queue import BACKGROUND, LoadQueue
+
+_numbers = count()
+
+
+@dataclass(eq=False)
+class Load:
+    number: int
+    estimate: int = 1 << 20
+
+
+def load(nbytes: int = 1 << 20) -> Load:
+    return Load(next(_numbers), nbytes)
+
+
+def test_who_waits_for_how_many() -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    shared, own = load(), load()
+    for one, asker in ((shared, "a"), (shared, "b"), (own, "a"), (own, "a")):
+        queue.push(one, 1.0, asker)
+    assert [queue.count(asker) for asker in "abc"] == [2, 1, 0]
+    queue.discard(shared)
+    assert [queue.count(asker) for asker in "abc"] == [1, 0, 0]
+
+
+def start(queue: LoadQueue[Load]) -> Load | None:
+    one = queue.next()
+    if one is not None:
+        queue.started(one)
+    return one
+
+
+def test_a_newcomer_waits_for_one_of_anothers() -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    greedy = [load() for _ in range(100)]
+    for one in greedy:
+        queue.push(one, 0.0, "greedy")
+    assert [start(queue) for _ in range(5)] == greedy[:5]
+    far = [load(), load()]
+    for one in far:
+        queue.push(one, 500.0, "modest")
+    served = [start(queue) for _ in range(4)]
+    assert set(far) < set(served)
+
+
+def test_turns_are_by_bytes() -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    large = [load(32 << 20) for _ in range(10)]
+    small = [load(1 << 20) for _ in range(200)]
+    for one in large:
+        queue.push(one, 0.0, "large")
+    for one in small:
+        queue.push(one, 0.0, "small")
+    served = [start(queue) for _ in range(100)]
+    assert 3 <= sum(one in large for one in served) <= 5
+
+
+def test_wanted_by_two_it_counts_once() -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    shared, own = load(), load()
+    queue.push(shared, 9.0, "a")
+    queue.push(own, 1.0, "b")
+    queue.push(shared, 0.0, "b")
+    assert len(queue) == 2
+    assert {start(queue), start(queue)} == {shared, own}
+    assert start(queue) is None
+    queue.push(shared, 1.0, "a")  # its worker died: again
+    assert start(queue) is shared
+
+
+def test_what_nobody_waits_for_comes_last() -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    check, asked = load(0), load()
+    queue.push(check, float("inf"), None)
+    queue.push(asked, BACKGROUND / 2, "a")
+    assert start(queue) is asked
+    assert start(queue) is check
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["push", "again", "start", "discard"]), st.integers(0, 3), st.integers(0, 99)
+        )
+    )
+)
+def test_everything_comes_once_and_nearest_first_of_each(steps: list[tuple[str, int, int]]) -> None:
+    queue: LoadQueue[Load] = LoadQueue()
+    waiting: dict[Load, dict[int, int]] = {}
+    for what, asker, number in steps:
+        chosen = list(waiting)[number % len(waiting)] if waiting else None
+        if what == "push" or chosen is None:
+            one = load()
+            queue.push(one, number, asker)
+            waiting[one] = {asker: number}
+        elif what == "again":
+            queue.push(chosen, number, asker)
+            waiting[chosen][asker] = min(number, waiting[chosen].get(asker, number))
+        elif what == "discard":
+            queue.discard(chosen)
+            del waiting[chosen]
+        else:
+            started = start(queue)
+            assert started in waiting
+            mine = waiting.pop(started)
+            assert any(
+                all(priority <= other[who] for other in waiting.values() if who in other)
+                for who, priority in mine.items()
+            ), "somebody's nearest"
+        assert len(queue) == len(waiting)

@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A loader process alone, spoken to over its socket pair."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from shmmap.daemon.loading import worker_messages
+from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.layout import PublishBlock
+from shmmap.segment.pins import is_pinned, prepare_process
+from tests.support.daemon_process import wait_ended, wait_readable
+from tests.support.divided_map import random_points
+from tests.support.pcd_files import write_ascii, write_pcd
+
+BOX = (0.0, 0.0, 20.0, 20.0)
+PATIENCE_S = 60.0
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
+COMMAND = [sys.executable, "-m", "shmmap.daemon.loading.worker_main"]
+
+
+PARENT = """
+import os, subprocess, sys
+program, channel, shm_dir = sys.argv[1:]
+command = [program, "-m", "shmmap.daemon.loading.worker_main", channel, str(os.getpid()), shm_dir]
+child = subprocess.Popen(command, pass_fds=[int(channel)])
+print(child.pid, flush=True)
+child.wait()
+"""
+
+
+class Loader:
+    """One loader process and our end of its channel."""
+
+    def __init__(self, shm_dir: str, **environment: str) -> None:
+        self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.channel.settimeout(PATIENCE_S)
+        self.process = subprocess.Popen(
+            [*COMMAND, str(theirs.fileno()), str(os.getpid()), shm_dir],
+            pass_fds=(theirs.fileno(),),
+            env={**ENVIRONMENT, **environment},
+            stderr=subprocess.DEVNULL,
+        )
+        theirs.close()
+        assert isinstance(self.receive()[0], worker_messages.Ready)
+
+    def send(self, message: msgspec.Struct) -> None:
+        self.channel.send(worker_messages.encode(message))
+
+    def receive(self) -> tuple[worker_messages.FromWorker, int]:
+        """Return the next message; with `worker_messages.Done`, the descriptor that came before it."""
+        kept = -1
+        while True:
+            data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
+            assert data, "the loader closed its channel"
+            message = worker_messages.decode_from_worker(data)
+            assert bool(fds) is isinstance(message, worker_messages.Segment)
+            if not isinstance(message, worker_messages.Segment):
+                return message, kept
+            (kept,) = fds
+
+    def load(self, number: int, path: Path, granted: int = 1 << 30) -> None:
+        self.send(worker_messages.Job(number, str(path), str(path), "points", BOX, "map", granted))
+
+    def peak_bytes(self) -> int:
+        for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+        raise AssertionError("no VmHWM")
+
+    def end(self) -> int:
+        self.channel.close()
+        try:
+            return self.process.wait(PATIENCE_S)
+        finally:
+            self.process.kill()
+            self.process.wait()
+
+
+@pytest.fixture
+def shm_dir() -> Iterator[str]:
+    prepare_process()
+    path = tempfile.mkdtemp(prefix="shmmap-worker-", dir="/dev/shm")
+    yield path
+    assert os.listdir(path) == [], "a loader publishes nothing"
+    os.rmdir(path)
+
+
+@pytest.fixture
+def loader(shm_dir: str) -> Iterator[Loader]:
+    one = Loader(shm_dir)
+    yield one
+    one.end()
+
+
+def cell(path: Path, points: int) -> Path:
+    write_pcd(path, random_points(np.random.default_rng(points), (0, 0), points))
+    return path
+
+
+def test_a_good_file(loader: Loader, tmp_path: Path) -> None:
+    path = cell(tmp_path / "a.pcd", 1000)
+    loader.load(5, path)
+    done, fd = loader.receive()
+    assert isinstance(done, worker_messages.Done)
+    status = path.stat()
+    assert (done.number, done.points, done.dropped) == (5, 1000, 0)
+    assert done.stamp == (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    expected = random_points(np.random.default_rng(1000), (0, 0), 1000)
+    assert (done.z_min, done.z_max) == (float(expected["z"].min()), float(expected["z"].max()))
+    try:
+        size = os.fstat(fd).st_size
+        data = os.pread(fd, size, 0)
+        xyz = np.stack([expected[axis] for axis in "xyz"], axis=1)
+        assert xyz.tobytes() in data
+        assert expected["intensity"].tobytes() in data
+        assert done.header_bytes % 4096 == 0
+        assert os.fstat(fd).st_nlink == 0
+    finally:
+        os.close(fd)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"VERSION .7\nFIELDS x y z\n", b"version https://git-lfs"])
+def test_a_bad_file_and_then_a_good_one(loader: Loader, tmp_path: Path, content: bytes | None) -> None:
+    bad = tmp_path / "bad.pcd"
+    if content is not None:
+        bad.write_bytes(content)
+    loader.load(1, bad)
+    loader.load(2, cell(tmp_path / "good.pcd", 10))
+    failed, fd = loader.receive()
+    assert isinstance(failed, worker_messages.Failed)
+    assert (failed.number, failed.code, fd) == (1, "load_failed", -1)
+    assert str(bad) in failed.message
+    assert (failed.stamp is None) is (content is None)
+    done, fd = loader.receive()
+    os.close(fd)
+    assert isinstance(done, worker_messages.Done)
+    assert done.number == 2
+
+
+@pytest.mark.parametrize("answer", [worker_messages.Grant, worker_messages.Refuse])
+def test_more_bytes_than_granted(
+    loader: Loader, tmp_path: Path, answer: type[worker_messages.Grant] | type[worker_messages.Refuse]
+) -> None:
+    """It asks, and waits for the answer though other jobs come first; those are done afterwards, in order."""
+    loader.load(1, write_ascii(tmp_path / "a.pcd", 5000), 8192)
+    need, _ = loader.receive()
+    assert isinstance(need, worker_messages.Need)
+    assert need.number == 1
+    assert need.bytes % 4096 == 0
+    assert 5000 * 12 < need.bytes <= 5000 * 12 + 2 * 4096
+    for number in (2, 3):
+        loader.load(number, cell(tmp_path / f"{number}.pcd", 10))
+    assert wait_readable([loader.channel.fileno()], 0.0) == []
+    loader.send(answer(1))
+    first, fd = loader.receive()
+    if answer is worker_messages.Grant:
+        assert isinstance(first, worker_messages.Done)
+        assert os.fstat(fd).st_blocks * 512 <= need.bytes
+        os.close(fd)
+    else:
+        assert isinstance(first, worker_messages.Failed)
+        assert (first.number, first.code, fd) == (1, "over_budget", -1)
+    for number in (2, 3):
+        done, fd = loader.receive()
+        os.close(fd)
+        assert isinstance(done, worker_messages.Done)
+        assert done.number == number
+
+
+def test_the_channel_closes_while_it_waits_for_room(loader: Loader, tmp_path: Path) -> None:
+    loader.load(1, write_ascii(tmp_path / "a.pcd", 5000), 8192)
+    assert isinstance(loader.receive()[0], worker_messages.Need)
+    assert loader.end() == 0
+
+
+def test_it_ends_with_its_channel(shm_dir: str) -> None:
+    assert Loader(shm_dir).end() == 0
+
+
+def test_it_ignores_the_keyboard(loader: Loader, tmp_path: Path) -> None:
+    """Ctrl-C reaches the whole foreground group; what to do about it is the daemon's business."""
+    loader.process.send_signal(signal.SIGINT)
+    loader.load(1, cell(tmp_path / "a.pcd", 10))
+    done, fd = loader.receive()
+    os.close(fd)
+    assert isinstance(done, worker_messages.Done)
+
+
+def test_the_crash_hook(shm_dir: str, tmp_path: Path) -> None:
+    one = Loader(shm_dir, SHMMAP_TEST_WORKER="crash:a.pcd")
+    try:
+        one.load(1, cell(tmp_path / "b.pcd", 10))
+        done, fd = one.receive()
+        os.close(fd)
+        assert isinstance(done, worker_messages.Done)
+        one.load(2, cell(tmp_path / "a.pcd", 10))
+        assert one.process.wait(PATIENCE_S) == -signal.SIGSEGV
+    finally:
+        one.end()
+
+
+def test_it_dies_with_its_parent(shm_dir: str) -> None:
+    """Killed, the parent can close nothing; and we still hold the other end of the channel open."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.settimeout(PATIENCE_S)
+    parent = subprocess.Popen(
+        [
+            sys.executable, "-c", PARENT, sys.executable, str(theirs.fileno()), shm_dir,
+        ],
+        pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, text=True, env=ENVIRONMENT,
+    )  # fmt: skip
+    theirs.close()
+    try:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        assert isinstance(worker_messages.decode_from_worker(ours.recv(1000)), worker_messages.Ready)
+        parent.kill()
+        parent.wait()
+        assert wait_ended(child, PATIENCE_S)
+    finally:
+        parent.kill()
+        parent.wait()
+        if parent.stdout is not None:
+            parent.stdout.close()
+        ours.close()
+
+
+def test_one_that_started_too_late_ends_at_once(shm_dir: str) -> None:
+    """Its parent is not who should be: the daemon died before the kernel knew that the loader cares."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        code = subprocess.run(
+            [*COMMAND, str(theirs.fileno()), "1", shm_dir],
+            pass_fds=(theirs.fileno(),),
+            env=ENVIRONMENT,
+            check=False,
+        ).returncode
+    assert code == 0
+
+
+def test_idle_it_is_small_and_polite(loader: Loader) -> None:
+    """A loader stays for ever once started; numpy alone is some 30 MB."""
+    pid = loader.process.pid
+    assert loader.peak_bytes() < 100 << 20
+    assert os.getpriority(os.PRIO_PROCESS, pid) >= os.getpriority(os.PRIO_PROCESS, 0) + 1
+    maps = Path(f"/proc/{pid}/maps").read_text()
+    assert not [name for name in ("/open3d/", "/numba/", "/scipy/", "libzmq") if name in maps]
+
+
+def test_it_does_not_keep_what_it_passed_on(loader: Loader, tmp_path: Path) -> None:
+    """An open file would look like a reader's pin: once it says "done" ours is the only one."""
+    for number in range(20):
+        loader.load(number, cell(tmp_path / f"{number}.pcd", 10))
+        done, fd = loader.receive()
+        try:
+            assert isinstance(done, worker_messages.Done)
+            again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY)
+        finally:
+            os.close(fd)
+        assert not is_pinned(again)
+        os.close(again)
+
+
+def test_a_layer_is_made_of_points_in_memory_while_they_are_of_the_file_s_state(
+    loader: Loader, shm_dir: str, tmp_path: Path
+) -> None:
+    path = cell(tmp_path / "cell.pcd", 400)
+    loader.load(1, path)
+    done, fd = loader.receive()
+    assert isinstance(done, worker_messages.Done)
+    directory = ShmDirectory(shm_dir)
+    segment = "/shmmap.test.0123456789abcdef"
+    block = PublishBlock(1, 2)
+    directory.publish(fd, segment, block=block, header_bytes=done.header_bytes, mode=0o600, gid=-1)
+    os.close(fd)
+    with open(f"{shm_dir}{segment}", "r+b") as file:  # other points than the file's: what is read shows
+        file.seek(done.header_bytes)
+        file.write(np.full((400, 3), 0.25, "<f4").tobytes())
+
+    def voxels(number: int) -> int:
+        loader.send(
+            worker_messages.Job(number, str(path), str(path), "voxel(leaf=1.0)", BOX, "map", 1 << 30, segment)
+        )
+        made, made_fd = loader.receive()
+        assert isinstance(made, worker_messages.Done)
+        os.close(made_fd)
+        return made.points
+
+    try:
+        assert voxels(2) == 1
+        cell(path, 401)
+        assert voxels(3) > 300
+    finally:
+        directory.unlink(segment)
+        directory.close()
+    cell(path, 400)
+    assert voxels(4) > 300

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What counts as a change of the map, and when it is time to act on it."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.map import file_watch
+from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, MapWatch
+from shmmap.errors import ConfigError
+
+
+@pytest.fixture
+def watch(tmp_path: Path) -> Iterator[MapWatch]:
+    one = MapWatch([str(tmp_path)])
+    yield one
+    one.close()
+
+
+def test_it_is_due_once_the_files_were_left_alone(watch: MapWatch, tmp_path: Path) -> None:
+    assert not watch.due(100.0)
+    (tmp_path / "a.pcd").write_bytes(b"a")
+    watch.drain(100.0)
+    assert not watch.due(100.0 + SETTLE_S / 2)
+    (tmp_path / "b.pcd").write_bytes(b"b")
+    watch.drain(100.0 + SETTLE_S / 2)
+    assert not watch.due(100.0 + SETTLE_S)
+    assert watch.due(100.0 + 1.5 * SETTLE_S)
+    assert not watch.due(200.0)  # once
+
+
+def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: MapWatch, tmp_path: Path) -> None:
+    now_s = 100.0
+    while now_s < 100.0 + MOST_S:
+        (tmp_path / "a.pcd").write_bytes(b"a")
+        watch.drain(now_s)
+        assert not watch.due(now_s)
+        now_s += SETTLE_S / 2
+    assert watch.due(now_s)
+
+
+def changes(tmp_path: Path) -> dict[str, object]:
+    """Ways of changing a map that has a file a.pcd and a directory cells."""
+    return {
+        "written": lambda: (tmp_path / "a.pcd").write_bytes(b"b"),
+        "renamed onto": lambda: (tmp_path / "outside" / "n").rename(tmp_path / "a.pcd"),
+        "renamed away": lambda: (tmp_path / "a.pcd").rename(tmp_path / "outside" / "a.pcd"),
+        "removed": lambda: (tmp_path / "a.pcd").unlink(),
+        "a directory made": lambda: (tmp_path / "more").mkdir(),
+        "a directory removed": lambda: (tmp_path / "outside2").rmdir(),
+    }
+
+
+@pytest.mark.parametrize(
+    "how", ["written", "renamed onto", "renamed away", "removed", "a directory made", "a directory removed"]
+)
+def test_changes(tmp_path: Path, how: str) -> None:
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside2").mkdir()
+    (tmp_path / "outside" / "n").write_bytes(b"n")
+    (tmp_path / "a.pcd").write_bytes(b"a")
+    watch = MapWatch([str(tmp_path)])
+    change = changes(tmp_path)[how]
+    assert callable(change)
+    change()
+    watch.drain(1.0)
+    assert watch.due(2.0)
+    watch.close()
+
+
+def test_reading_is_no_change(watch: MapWatch, tmp_path: Path) -> None:
+    (tmp_path / "a.pcd").write_bytes(b"a")
+    watch.drain(1.0)
+    assert watch.due(2.0)
+    (tmp_path / "a.pcd").read_bytes()
+    os.listdir(tmp_path)
+    watch.drain(3.0)
+    assert not watch.due(9.0)
+
+
+def test_a_directory_that_comes_later_is_followed(watch: MapWatch, tmp_path: Path) -> None:
+    later = tmp_path / "later"
+    watch.follow([str(later)])  # not there yet
+    later.mkdir()
+    watch.drain(1.0)
+    assert watch.due(2.0)
+    watch.follow([str(later), str(tmp_path)])
+    (later / "a.pcd").write_bytes(b"a")
+    watch.drain(3.0)
+    assert watch.due(4.0)
+
+
+def test_a_directory_that_may_not_be_watched_ends_nothing(watch: MapWatch, tmp_path: Path) -> None:
+    """The metadata may name a place that is none: it is looked for again."""
+    odd = tmp_path / "odd"
+    odd.symlink_to(odd)
+    watch.follow([str(odd)])
+    assert not watch.due(1.0)
+    odd.unlink()
+    watch.drain(2.0)
+    assert watch.due(3.0)
+    odd.mkdir()
+    watch.drain(4.0)
+    assert watch.due(5.0)
+    (odd / "a.pcd").write_bytes(b"a")
+    watch.drain(6.0)
+    assert watch.due(7.0)
+
+
+def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
+    """Moved aside, it is of no interest any more; what takes its place is, however late it comes."""
+    place, aside = tmp_path / "map", tmp_path / "aside"
+    place.mkdir()
+    watch = MapWatch([str(place)])
+    place.rename(aside)
+    watch.drain(10.0)
+    assert watch.due(11.0)
+    (aside / "a.pcd").write_bytes(b"a")
+    watch.drain(12.0)
+    assert not watch.due(13.0)
+    place.mkdir()
+    assert not watch.due(14.1), "it may be being filled"
+    assert watch.due(14.1 + SETTLE_S)
+    (place / "a.pcd").write_bytes(b"a")
+    watch.drain(15.0)
+    assert watch.due(16.0)
+    watch.close()
+
+
+def test_a_full_queue_counts_as_a_change(watch: MapWatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    overflow = file_watch._EVENT.pack(-1, 0x4000, 0, 0)
+    told = iter([overflow, b""])
+    monkeypatch.setattr(watch, "_read", lambda: next(told))
+    watch.drain(1.0)
+    assert watch.due(2.0)
+
+
+def test_a_limit_of_the_kernel_is_a_matter_of_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ctypes.get_errno", lambda: errno.ENOSPC)
+
+    class Full:
+        """Has no watches left."""
+
+        def inotify_init1(self, flags: int) -> int:
+            return os.open("/dev/null", os.O_RDONLY | (flags & os.O_CLOEXEC))
+
+        def inotify_add_watch(self, fd: int, path: bytes, mask: int) -> int:
+            del fd, path, mask
+            return -1
+
+    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: Full())
+    with pytest.raises(ConfigError, match="No space left") as raised:
+        MapWatch([str(tmp_path)])
+    assert "max_user_watches" in raised.value.hint
+
+
+def test_file_systems_are_told_apart(tmp_path: Path) -> None:
+    assert file_watch._file_system_of("/proc/self") == "proc"
+    assert file_watch._file_system_of("/dev/shm") == "tmpfs"
+    assert file_watch._file_system_of(str(tmp_path)) not in file_watch._REMOTE

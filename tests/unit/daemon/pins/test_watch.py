@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who uses a segment, by each way there is to know; and hearing when somebody let go."""
+
+from __future__ import annotations
+
+import os
+import select
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.cache.segment_name_watch import NameWatch
+from shmmap.daemon.pins.probe import PinSupport, Rung, probe_pins
+from shmmap.daemon.pins.watch import PinWatch
+from shmmap.segment.attach import attach, unmap
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import prepare_process
+from tests.support.segment_reader import map_segment
+
+NAME = "/shmmap.unit.0011223344556677"
+
+
+@pytest.fixture
+def directory(shm: ShmDirectory) -> ShmDirectory:
+    """Return a private directory with one named file of a page."""
+    prepare_process()
+    fd = shm.create()
+    os.ftruncate(fd, 4096)
+    shm.link(fd, NAME)
+    os.close(fd)
+    return shm
+
+
+def reported(fd: int, timeout_s: float = 10.0) -> bool:
+    return bool(select.select([fd], [], [], timeout_s)[0])
+
+
+def test_this_machine_tells_everything(directory: ShmDirectory) -> None:
+    support = probe_pins(directory)
+    assert support == PinSupport(True, True, True, True)
+    assert support.rung is Rung.LEASES
+    assert os.listdir(directory.path) == [NAME[1:]]
+
+
+@pytest.mark.parametrize(("less", "rung"), [("locks", Rung.LOCKS), ("sessions", Rung.SESSIONS)])
+def test_the_next_best_way_is_taken(
+    directory: ShmDirectory, monkeypatch: pytest.MonkeyPatch, less: str, rung: Rung
+) -> None:
+    monkeypatch.setenv("SHMMAP_TEST_PINS", less)
+    assert probe_pins(directory).rung is rung
+
+
+@pytest.mark.parametrize(
+    ("rung", "lock", "used"),
+    [
+        (Rung.LEASES, 77, True),
+        (Rung.LEASES, None, True),
+        (Rung.LOCKS, 77, True),
+        (Rung.LOCKS, None, False),  # overlooked, as documented
+    ],
+)
+def test_use(directory: ShmDirectory, rung: Rung, lock: int | None, used: bool) -> None:
+    pins = PinWatch(directory, rung)
+    assert pins.is_used(NAME) is False
+    mapping = map_segment(directory.path + NAME, lock)
+    assert pins.is_used(NAME) is used
+    mapping.close()
+    assert pins.is_used(NAME) is False
+    directory.unlink(NAME)
+    assert pins.is_used(NAME) is None
+
+
+def test_a_kept_segment_tells_when_it_is_let_go(directory: ShmDirectory) -> None:
+    pins = PinWatch(directory, events=True)
+    zombie = NAME + ".zombie"
+    mapping = map_segment(directory.path + NAME, 5)
+    directory.rename(NAME, zombie)
+    assert pins.keep(zombie)
+    for _ in range(3):
+        assert pins.is_used(zombie) is True
+    with pins.opened(zombie) as fd:
+        assert fd > 0
+    assert not reported(pins.fd, 0)  # its own looks are not reported
+    mapping.close()
+    assert reported(pins.fd)
+    assert pins.closed() == {zombie}
+    assert pins.is_used(zombie) is False
+    directory.unlink(zombie)  # its memory goes when it is released
+    pins.release(zombie)
+    assert pins.closed() == set()
+    pins.close()
+
+
+def test_a_segment_in_service_tells_once(directory: ShmDirectory) -> None:
+    pins = PinWatch(directory, events=True)
+    first, second = (map_segment(directory.path + NAME) for _ in range(2))
+    pins.tell_once(NAME)
+    first.close()
+    assert reported(pins.fd)
+    assert pins.closed() == {NAME}
+    second.close()
+    assert pins.closed() == set()
+    pins.close()
+
+
+def test_without_events_nothing_is_kept(directory: ShmDirectory) -> None:
+    pins = PinWatch(directory)
+    assert (pins.fd, pins.keep(NAME), pins.keeps(NAME), pins.closed()) == (-1, False, False, set())
+    pins.tell_once(NAME)
+    pins.close()
+
+
+def test_an_attached_segment_and_its_last_view(directory: ShmDirectory) -> None:
+    """The mapping that the library makes is reported like any other."""
+    pins = PinWatch(directory, events=True)
+    pins.keep(NAME)
+    fd = os.open(directory.path + NAME, os.O_RDONLY)
+    os.close(fd)
+    assert reported(pins.fd)
+    pins.closed()
+    with pytest.raises(Exception, match="not a shmmap segment"):
+        attach(NAME, shm_dir=directory.path, slot=3, on_unmap=unmap)
+    assert reported(pins.fd)
+    assert pins.closed() == {NAME}
+    assert pins.is_used(NAME) is False
+    pins.close()
+
+
+def test_names_that_vanish(directory: ShmDirectory) -> None:
+    names = NameWatch(directory.path, "/shmmap.unit.")
+    assert names.gone() == set()
+    Path(directory.path, "shmmap.other.1").write_bytes(b"")
+    Path(directory.path, "shmmap.other.1").unlink()
+    directory.rename(NAME, NAME + ".zombie")
+    directory.unlink(NAME + ".zombie")
+    assert reported(names.fd)
+    assert names.gone() == {NAME, NAME + ".zombie"}
+    names.close()

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests for cells: how long they wait, where they lie, what is loaded first, what stays of them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.cache.ledger import Key
+from shmmap.errors import BadRequest
+from shmmap.protocol.messages import (
+    Area,
+    BoxMessage,
+    CircleMessage,
+    Differential,
+    Intent,
+    Selected,
+)
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
+
+
+@pytest.mark.parametrize("wait", [-1.0, -0.0001, math.nan, math.inf, -math.inf, 3600.5, 1e300])
+@pytest.mark.parametrize("warm", [False, True])
+def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, wait: float, warm: bool) -> None:
+    """Whether the cells are in memory or not."""
+    one = inner(small_map.root)
+    session = one.session()
+    if warm:
+        one.everything()
+    with pytest.raises(BadRequest, match="wait"):
+        one.cells.area(session, Area(2, EVERYWHERE, wait=wait), one.now_s())
+    with pytest.raises(BadRequest, match="wait"):
+        one.cells.differential(session, Differential(2, EVERYWHERE, wait=wait), one.now_s())
+    with pytest.raises(BadRequest, match="wait"):
+        one.cells.selected(session, Selected(2, (), wait=wait), one.now_s())
+    assert not len(one.cells)
+    assert not one.books.queued
+
+
+def test_waits_that_are_answered_at_once(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    session = one.session()
+    for request, wait in ((1, None), (2, 0.0), (3, -0.0)):
+        one.cells.area(session, Area(request, EVERYWHERE, wait=wait), one.now_s())
+        (reply,) = [reply for _, reply in one.replies if reply.request == request]
+        assert len(reply.pending) == 16
+    one.cells.area(session, Area(4, EVERYWHERE, wait=3600.0), one.now_s())
+    assert len(one.cells_of(4).cells) == 16
+
+
+@pytest.mark.parametrize(
+    "area",
+    [
+        CircleMessage(1e300, -1e300, 1e300),
+        CircleMessage(0, 0, 1e308),
+        BoxMessage(-1.7e308, -1.7e308, 1.7e308, 1.7e308),
+        BoxMessage(1.6e308, 1.6e308, 1.7e308, 1.7e308),
+        CircleMessage(1e308, 1e308, 0.0),
+    ],
+)
+def test_areas_at_the_end_of_the_world(
+    inner: Inner, small_map: DividedMap, area: CircleMessage | BoxMessage
+) -> None:
+    """Some touch everything and some nothing; memory can still be made and others served afterwards."""
+    one = inner(small_map.root)
+    session = one.session()
+    one.cells.area(session, Area(1, area, wait=30.0), one.now_s())
+    reply = one.cells_of(1)
+    assert len(reply.cells) in (0, 16)
+    assert (reply.pending, reply.failed) == ((), ())
+    assert len(one.everything(2).cells) == 16
+    one.offset_s += 2.0
+    one.reclaimer.free(one.books.budget_bytes, one.now_s())
+    one.run_until(lambda: one.books.used_bytes == one.books.overhead_bytes)
+
+
+def test_nearest_cells_first(inner: Inner, small_map: DividedMap) -> None:
+    """As seen from where the client says it is, else from the middle of what it asks for."""
+    one = inner(small_map.root)
+    session = one.session()
+    with one.loaders_standing_still():
+        one.cells.area(session, Area(1, EVERYWHERE), one.now_s())
+        nearest = one.books.next_queued()
+    assert nearest is not None
+    assert Path(nearest.key.cell_id).name == "-20_-20.pcd"  # of the four that touch the middle
+    two = inner(small_map.root)
+    two.cells.area(two.session(), Area(1, CircleMessage(35, 35, 300)), two.now_s())
+    nearest = two.books.next_queued()
+    assert nearest is not None
+    assert Path(nearest.key.cell_id).name == "20_20.pcd"
+    two = inner(small_map.root)
+    session = two.session()
+    session.intent, session.says_where = Intent(-35.0, 35.0), True
+    two.cells.area(session, Area(1, CircleMessage(35, 35, 300)), two.now_s())
+    nearest = two.books.next_queued()
+    assert nearest is not None
+    assert Path(nearest.key.cell_id).name == "-40_20.pcd"
+
+
+def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    session = one.session()
+    with one.loaders_standing_still():
+        for request in range(1, 6):
+            one.cells.area(session, Area(request, EVERYWHERE, wait=0.01 * request), one.now_s())
+        one.cells.area(session, Area(9, EVERYWHERE, wait=30.0), one.now_s())
+        one.run_until(lambda: len(one.cells) == 1)
+        one.cells.forget(session)
+        assert len(one.cells) == 0
+    one.run_until(lambda: one.books.resident_count == 16)
+    assert all(slot.waiting == 0 for slot in one.books.slots.values())
+    assert one.cells.next_deadline_s() == math.inf
+    assert 9 not in [reply.request for _, reply in one.replies]
+    assert all(isinstance(key, Key) for key in one.settled)

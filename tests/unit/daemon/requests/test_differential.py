@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a client lacks and should drop, against a brute-force oracle written from Autoware's semantics.
+
+In Autoware (``create_differential_map_load_plan``) the cells of the area are walked in id order: one
+whose id is cached is kept, any other is new; cached ids that were never matched are to be removed, in
+the order given, unknown ones included.  Ours differ in four ways, each in the oracle below: entries carry
+versions (a cell held at another version is new and not removed), layers are held one by one, a
+duplicate is told once, and versions alone may stand for cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shmmap.daemon.requests.differential import difference, warm_difference
+from shmmap.errors import BadRequest
+from shmmap.protocol.codec import pack_versions, unpack_versions
+from shmmap.protocol.messages import Area, BoxMessage, Differential, HeldCell
+from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.unit.daemon.inner_daemon import InnerDaemon
+
+COLD = "20_20.pcd"
+BROKEN = "20_0.pcd"
+CHANGED = "0_0.pcd"
+EVERYWHERE = BoxMessage(-1e3, -1e3, 1e3, 1e3)
+
+
+@dataclass
+class Served:
+    """A daemon in which one cell is cold, one is broken after a change and one changed and loaded again."""
+
+    inner: InnerDaemon
+    made: DividedMap
+    names: list[str]
+    current: dict[str, int]
+    old: dict[str, int]
+
+
+def ask(inner: InnerDaemon, request: int, area: BoxMessage) -> dict[str, int]:
+    """Ask for an area, wait; return the versions of the cells that came."""
+    inner.cells.area(inner.session(), Area(request, area, wait=30.0), inner.now_s())
+    return {cell.id: cell.version for cell in inner.cells_of(request).cells if not cell.stale}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    root = tmp_path_factory.mktemp("difference")
+    made: DividedMap = make_map(root / "map", columns=4, rows=4, points=30)
+    inner = InnerDaemon(str(made.root), cache_dir=str(root / "cache"))
+    before = ask(inner, 1, EVERYWHERE)
+    for name, seed in ((CHANGED, 3), (BROKEN, 4)):
+        corner = made.corners[name]
+        made.write_cell(name, corner, random_points(np.random.default_rng(seed), corner, 20))
+    path = Path(made.id(BROKEN))
+    path.write_bytes(path.read_bytes()[:-9])
+    inner.reload()
+    after = ask(inner, 2, EVERYWHERE)
+    names = sorted(made.corners)
+    inner.store.evict(inner.store.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
+    inner.run_until(lambda: not inner.books.zombies)
+    assert set(before) == set(names)
+    assert set(after) == set(names) - {BROKEN}
+    assert [name for name in names if after.get(name) != before[name]] == [CHANGED, BROKEN]
+    catalogue = inner.store.catalogue
+    current = {name: catalogue.version(index) for index, name in enumerate(names)}
+    yield Served(inner, made, names, current, before)
+    inner.close()
+
+
+def oracle(
+    served: Served, inside: list[str], held: list[HeldCell], packed: list[int], layers: tuple[str, ...]
+) -> tuple[list[tuple[str, str]], list[str], set[int], set[str]]:
+    """New (name, layer), removed ids, removed versions, and names held at another version."""
+    version_of = served.current
+    by_path = {served.made.id(name): name for name in served.names} | {name: name for name in served.names}
+    has: set[tuple[str, str]] = set()
+    other: set[str] = set()
+    removed: list[str] = []
+    for cell in held:
+        name = by_path.get(cell.id)
+        if name not in inside:
+            if cell.id not in removed:
+                removed.append(cell.id)
+        elif cell.version is not None and cell.version != version_of[name]:
+            other.add(name)
+        else:
+            has |= {(name, layer) for layer in (layers if cell.layers is None else cell.layers)}
+    for name in inside:
+        if version_of[name] in packed:
+            has |= {(name, layer) for layer in layers}
+    new = [(name, layer) for name in inside for layer in layers if (name, layer) not in has]
+    known = {served.old[name]: name for name in served.names}
+    gone = set()
+    for version in packed:
+        if version in known and known[version] in inside and version != version_of[known[version]]:
+            other.add(known[version])  # the daemon remembers it: replaced, not removed
+        elif version not in [version_of[name] for name in inside]:
+            gone.add(version)
+    return new, removed, gone, other
+
+
+NAMES = [f"{x}_{y}.pcd" for x in (-40, -20, 0, 20) for y in (-40, -20, 0, 20)]
+
+
+@st.composite
+def requests(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str, str, bool]], list[tuple[str, str]]]:
+    """Cells inside; held rows (name, spelling, version, layers given); packed (name, version)."""
+    warm_only = draw(st.booleans())
+    pool = [name for name in NAMES if not warm_only or name not in (COLD, BROKEN)]
+    inside = draw(st.lists(st.sampled_from(pool), unique=True))
+    versions = st.sampled_from(["current", "old", "none", "unknown"][: 2 if warm_only else 4])
+    names = st.sampled_from([*NAMES, "nowhere.pcd", "/elsewhere/x.pcd"])
+    rows = st.tuples(names, st.sampled_from(["base", "whole"]), versions, st.booleans())
+    held = draw(st.lists(rows, max_size=12))
+    packed = draw(st.lists(st.tuples(st.sampled_from(NAMES), st.sampled_from(["current", "old", "unknown"]))))
+    return sorted(inside), [(n, s, v, lay and not warm_only) for n, s, v, lay in held], packed
+
+
+@settings(max_examples=400, deadline=None)
+@given(requests())
+def test_any_request(
+    served: Served, request_: tuple[list[str], list[tuple[str, str, str, bool]], list[tuple[str, str]]]
+) -> None:
+    inside, rows, packed_rows = request_
+    layers = ("points",)
+
+    def version(name: str, kind: str) -> int | None:
+        if kind == "none":
+            return None
+        if kind == "unknown" or name not in served.current:
+            return 0xABCDEF + NAMES.index(name) if name in NAMES else 99
+        return served.current[name] if kind == "current" else served.old[name]
+
+    held = [
+        HeldCell(
+            served.made.id(name) if spelling == "whole" and name in NAMES else name,
+            version(name, kind),
+            layers if given_layers else None,
+        )
+        for name, spelling, kind, given_layers in rows
+    ]
+    packed = [version(name, kind) or 0 for name, kind in packed_rows]
+    message = Differential(1, EVERYWHERE, layers, tuple(held), pack_versions(packed))
+    indices = [served.names.index(name) for name in inside]
+    store = served.inner.store
+
+    found = difference(store, message, indices, layers)
+    new, removed, gone, other = oracle(served, inside, held, packed, layers)
+    assert [(served.names[index], layer) for index, layer in found.cells] == new
+    assert list(found.removed) == removed
+    told = unpack_versions(found.removed_packed)
+    assert set(told) == gone
+    assert len(told) == len(gone), "duplicates are told once"
+    assert {Path(cell).name for cell in found.old} == other
+    expected = set(packed) | {cell.version for cell in held if cell.version is not None}
+    expected |= {
+        served.current[Path(cell.id).name]
+        for cell in held
+        if cell.version is None and Path(cell.id).name in inside and cell.id != "/elsewhere/x.pcd"
+    }
+    assert found.held == expected
+
+    warm = warm_difference(store, message, np.array(indices, dtype=np.intp), "points")
+    all_warm = not {COLD, BROKEN} & set(inside)
+    if all_warm and all(cell.version is not None and cell.layers is None for cell in held):
+        assert warm is not None, "the short way must take what nearly every request is"
+    if warm is not None:
+        assert all_warm
+        assert [resident.version for resident in warm.residents] == [served.current[name] for name, _ in new]
+        assert [Path(resident.key.cell_id).name for resident in warm.residents] == [name for name, _ in new]
+        assert list(warm.removed) == removed
+        assert sorted(unpack_versions(warm.removed_packed)) == sorted(gone)
+        assert warm.held == found.held
+
+
+def test_layers_are_held_one_by_one(served: Served) -> None:
+    """A cell held in another layer only is still new in this one."""
+    name = "-20_-20.pcd"
+    index = served.names.index(name)
+    for layers, lacks in (((), [(index, "points")]), (("points",), []), (("points", "points"), [])):
+        message = Differential(1, EVERYWHERE, ("points",), (HeldCell(name, served.current[name], layers),))
+        if layers:
+            found = difference(served.inner.store, message, [index], ("points",))
+            assert found.cells == lacks
+            assert found.removed == ()
+
+
+@pytest.mark.parametrize("packed", [b"1234567", b"123456789"])
+def test_packed_versions_of_broken_length(served: Served, packed: bytes) -> None:
+    message = Differential(1, EVERYWHERE, packed=packed)
+    with pytest.raises(BadRequest):
+        difference(served.inner.store, message, [0], ("points",))
+    with pytest.raises(BadRequest):
+        warm_difference(served.inner.store, message, np.array([0], dtype=np.intp), "points")
+
+
+def test_very_many_held(served: Served) -> None:
+    """100 000 held entries, all but one of them unknown: told to drop each, in their order."""
+    rows = [HeldCell(f"gone/{number}.pcd", number + 1) for number in range(100_000)]
+    rows.insert(50_000, HeldCell("0_0.pcd", served.current["0_0.pcd"]))
+    index = served.names.index("0_0.pcd")
+    message = Differential(1, EVERYWHERE, held=tuple(rows))
+    expected = [row.id for row in rows if row.id != "0_0.pcd"]
+    found = difference(served.inner.store, message, [index], ("points",))
+    assert (found.cells, list(found.removed)) == ([], expected)
+    warm = warm_difference(served.inner.store, message, np.array([index], dtype=np.intp), "points")
+    assert warm is not None
+    assert (warm.residents, list(warm.removed)) == ([], expected)

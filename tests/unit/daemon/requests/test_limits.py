@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No request asks for so much that others wait long for it; what it says is bounded before it is kept."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from shmmap.daemon.requests import limits
+from shmmap.daemon.transport.sessions import ROUTE_VERTICES
+from shmmap.errors import BadRequest, Busy
+from shmmap.protocol.messages import Area, Differential, HeldCell, Intent, Selected
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
+
+
+def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = inner(small_map.root)
+    monkeypatch.setattr(limits, "MOST_CELLS", 15)
+    with pytest.raises(BadRequest, match="16 cells in one request; 15 is the most"):
+        one.cells.area(one.session(), Area(1, EVERYWHERE), one.now_s())
+    with pytest.raises(BadRequest, match="16 cells"):  # known or not
+        one.cells.selected(one.session(), Selected(2, ("nowhere",) * 16), one.now_s())
+    assert one.books.slots == {}
+    assert one.replies == []
+
+
+def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    many = limits.MOST_HELD
+    for message in (
+        Differential(1, EVERYWHERE, held=(HeldCell("a"),) * (many + 1)),
+        Differential(1, EVERYWHERE, packed=bytes(8 * (many + 1))),
+        Differential(1, EVERYWHERE, held=(HeldCell("a", 1, ("points",) * (many + 1)),)),
+        Differential(
+            1, EVERYWHERE, held=(HeldCell("a", 1, tuple(f"voxel(leaf={1 + n / 100})" for n in range(65))),)
+        ),
+    ):
+        with pytest.raises(BadRequest, match="held"):
+            one.cells.differential(one.session(), message, one.now_s())
+    one.cells.differential(one.session(), Differential(2, EVERYWHERE, packed=bytes(8 * many)), one.now_s())
+    assert len(one.replies) == 1
+
+
+def test_loads_that_one_process_waits_for(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asking again for the same ones is no more of them; others wait for nobody else's."""
+    monkeypatch.setattr(limits, "MOST_QUEUED", 5)
+    one = inner(small_map.root)
+    with one.loaders_standing_still():
+        greedy, other = one.session(), one.session()
+        one.cells.area(greedy, Area(1, EVERYWHERE), one.now_s())
+        assert len(one.cells_of(1).pending) == 16
+        one.cells.area(greedy, Area(2, EVERYWHERE), one.now_s())
+        assert len(one.cells_of(2).pending) == 16
+        with pytest.raises(Busy, match="5 loads"):
+            one.cells.area(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
+        one.cells.area(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
+        assert len(one.cells_of(4).pending) == 16
+    one.run_until(lambda: not one.books.queued)
+    one.cells.area(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0), one.now_s())
+    assert len(one.cells_of(5).cells) == 16
+
+
+def test_layers(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = inner(small_map.root)
+    session = one.session()
+    with pytest.raises(BadRequest, match="17 layers in one request"):
+        one.cells.area(session, Area(1, EVERYWHERE, ("points",) * 17), one.now_s())
+    one.cells.selected(session, Selected(2, ("0_0.pcd",), wait=30.0), one.now_s())
+    assert len(one.cells_of(2).cells) == 1
+    monkeypatch.setattr(limits, "LEAST_LAYERS_IN_MEMORY", 1)
+    monkeypatch.setattr(limits, "LAYER_TABLES_BYTES", 0)
+    other = Selected(3, ("0_0.pcd",), ("voxel(leaf=1.0)",))
+    with pytest.raises(BadRequest, match="1 different layers are in memory already"):
+        one.cells.selected(session, other, one.now_s())
+    one.cells.selected(session, Selected(4, ("20_0.pcd",), wait=30.0), one.now_s())
+    assert len(one.cells_of(4).cells) == 1
+
+
+def test_intents() -> None:
+    route = tuple((float(n), 0.0) for n in range(1000))
+    assert len(limits.bounded_intent(Intent(0.0, 0.0, route=route)).route) == ROUTE_VERTICES
+    short = Intent(1.0, 2.0, route=((3.0, 4.0),))
+    assert limits.bounded_intent(short) is short
+    for wrong in (
+        Intent(math.nan, 0.0),
+        Intent(0.0, 0.0, heading=math.inf),
+        Intent(0.0, 0.0, route=((0.0, math.nan),)),
+    ):
+        with pytest.raises(BadRequest, match="finite"):
+            limits.bounded_intent(wrong)

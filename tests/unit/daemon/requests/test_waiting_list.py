@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Waiting requests: the next deadline is always right, and one session cannot fill the list."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap.daemon.requests.waiting_list import MOST_OF_A_SESSION, WaitingList
+from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+
+
+@dataclass(eq=False)
+class Request:
+    session: Session
+    deadline_s: float
+
+
+def sessions(count: int) -> list[Session]:
+    opened = Sessions()
+    return [opened.open(bytes([n]), Peer(), "", 0.0) for n in range(count)]
+
+
+def test_one_session_has_its_share() -> None:
+    mine, other = sessions(2)
+    waiting: WaitingList[Request] = WaitingList()
+    requests = [Request(mine, float(n)) for n in range(MOST_OF_A_SESSION)]
+    for request in requests:
+        assert waiting.has_room(mine)
+        waiting.add(request)
+    assert not waiting.has_room(mine)
+    assert waiting.has_room(other)
+    waiting.remove(requests[0])
+    assert waiting.has_room(mine)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 50), st.booleans())))
+def test_against_a_plain_list(steps: list[tuple[int, int, bool]]) -> None:
+    owners = sessions(3)
+    waiting: WaitingList[Request] = WaitingList()
+    model: list[Request] = []
+    for owner, deadline, leave in steps:
+        request = Request(owners[owner], float(deadline))
+        waiting.add(request)
+        model.append(request)
+        if leave:
+            gone = model.pop(deadline % len(model))
+            waiting.remove(gone)
+        assert list(waiting) == model
+        assert len(waiting) == len(model)
+        assert waiting.next_deadline_s() == min((r.deadline_s for r in model), default=float("inf"))
+        assert waiting.overdue(25.0) == [r for r in model if r.deadline_s <= 25.0]
+        assert waiting.of(owners[owner]) == [r for r in model if r.session is owners[owner]]

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What goes to the log and to the service manager."""
+
+from __future__ import annotations
+
+import logging
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.host.logs import set_up_logging
+from shmmap.daemon.service_manager.notify import notify
+
+
+@pytest.fixture
+def root_logger() -> Iterator[logging.Logger]:
+    """Give the root logger its handlers back after the test."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield root
+    root.handlers[:], root.level = handlers, level
+
+
+def test_on_a_terminal(
+    root_logger: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    set_up_logging()
+    logging.getLogger("shmmap.x").info("cell %s", "a.pcd")
+    logging.getLogger("shmmap.x").debug("not shown")
+    logging.getLogger("shmmap.x").error("bad")
+    out, err = capsys.readouterr()
+    first, second = err.splitlines()
+    assert out == ""
+    assert re.fullmatch(r"\d\d:\d\d:\d\d INFO    shmmap\.x: cell a\.pcd", first)
+    assert re.fullmatch(r"\d\d:\d\d:\d\d ERROR   shmmap\.x: bad", second)
+
+
+def test_under_systemd(
+    root_logger: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every line has its priority, those of a traceback too."""
+    monkeypatch.setenv("JOURNAL_STREAM", "8:12345")
+    set_up_logging(logging.DEBUG)
+    log = logging.getLogger("shmmap.y")
+    for level in (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL):
+        log.log(level, "text")
+    try:
+        raise ValueError("no")
+    except ValueError:
+        log.exception("two\nlines")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:5] == [f"<{n}>shmmap.y: text" for n in (7, 6, 4, 3, 2)]
+    assert lines[5:7] == ["<3>shmmap.y: two", "<3>lines"]
+    assert len(lines) > 8
+    assert all(line.startswith("<3>") for line in lines[5:])
+    assert lines[-1] == "<3>ValueError: no"
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_notify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool) -> None:
+    name = f"{tmp_path}/notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" + name if abstract else name)
+        monkeypatch.setenv("NOTIFY_SOCKET", "@" + name if abstract else name)
+        notify("READY=1", "STATUS=serving 5 cells of a\nMAINPID=1")
+        manager.settimeout(10)
+        assert manager.recv(100) == b"READY=1\nSTATUS=serving 5 cells of a MAINPID=1"
+
+
+@pytest.mark.parametrize(
+    "address", ["", "/nowhere/notify", "@nobody-listens-here", "relative", "@" + "x" * 300]
+)
+def test_nobody_listens(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", address)
+    notify("READY=1")
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    notify("READY=1")

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fair turns: however many requests others pile up, a quiet process waits for one of each of them at most."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap.daemon.transport.fair_queue import (
+    MOST_BYTES,
+    MOST_OF_A_CONNECTION,
+    MOST_OF_A_PROCESS,
+    MOST_REMEMBERED,
+    Turns,
+)
+
+
+def serve(turns: Turns[str], cost_s: float) -> str | None:
+    turn = turns.take()
+    if turn is None:
+        return None
+    turns.served(turn[0], cost_s)
+    return turn[1]
+
+
+def test_a_quiet_process_is_served_next() -> None:
+    turns: Turns[str] = Turns()
+    for number in range(50):
+        turns.add("loud", number % 5, "loud", 10)
+    assert serve(turns, 1.0) == "loud"
+    turns.add("quiet", 0, "quiet", 10)
+    turns.add("other", 0, "other", 10)
+    assert [serve(turns, 1.0) for _ in range(4)] == ["quiet", "other", "loud", "loud"]
+
+
+def test_who_asks_for_what_is_expensive_waits_longer() -> None:
+    turns: Turns[str] = Turns()
+    served: Counter[str] = Counter()
+    for _ in range(300):
+        for name in ("cheap", "dear"):
+            turns.add(name, 0, name, 1)
+        turn = turns.take()
+        assert turn is not None
+        served[turn[1]] += 1
+        turns.served(turn[0], 0.010 if turn[1] == "dear" else 0.001)
+    assert 8 <= served["cheap"] / served["dear"] <= 12
+
+
+def test_idling_saves_up_nothing() -> None:
+    turns: Turns[str] = Turns()
+    for _ in range(60):
+        turns.add("busy", 0, "busy", 1)
+    turns.add("idler", 0, "idler", 1)
+    serve(turns, 1.0)
+    serve(turns, 1.0)
+    for _ in range(40):
+        assert serve(turns, 1.0) == "busy"
+    for _ in range(10):
+        turns.add("idler", 0, "idler", 1)
+    assert Counter(serve(turns, 1.0) for _ in range(10)) in (
+        Counter(busy=5, idler=5),
+        Counter(busy=4, idler=6),
+    )
+
+
+def test_connections_of_a_process_take_turns() -> None:
+    turns: Turns[str] = Turns()
+    for _ in range(10):
+        turns.add("one", "a", "a", 1)
+    turns.add("one", "b", "b", 1)
+    assert [serve(turns, 1.0) for _ in range(3)] == ["a", "b", "a"]
+
+
+def test_limits() -> None:
+    turns: Turns[int] = Turns()
+    assert sum(turns.add("p", 0, n, 1) for n in range(1000)) == MOST_OF_A_CONNECTION
+    assert sum(turns.add("p", n, n, 1) for n in range(1, 2000)) == MOST_OF_A_PROCESS - MOST_OF_A_CONNECTION
+    assert turns.add("q", 0, 0, 2 * MOST_BYTES)  # a single one always may
+    assert not turns.add("q", 1, 0, 1)
+    assert turns.waiting_bytes() == {"p": MOST_OF_A_PROCESS, "q": 2 * MOST_BYTES}
+    assert len(turns) == MOST_OF_A_PROCESS + 1
+
+
+def test_nobody_is_remembered_for_ever() -> None:
+    turns: Turns[str] = Turns()
+    for number in range(3 * MOST_REMEMBERED):
+        turns.add(number, 0, "x", 1)
+        serve(turns, 1.0)
+    assert len(turns._lines) <= MOST_REMEMBERED
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2), st.floats(0.001, 1.0), st.booleans())))
+def test_everything_accepted_is_served_once_in_order(steps: list[tuple[int, int, float, bool]]) -> None:
+    turns: Turns[tuple[int, int, int]] = Turns()
+    waiting: dict[tuple[int, int], list[int]] = {}
+    for number, (process, connection, cost_s, take) in enumerate(steps):
+        if turns.add(process, connection, (process, connection, number), 1):
+            waiting.setdefault((process, connection), []).append(number)
+        if take:
+            turn = turns.take()
+            assert turn is not None
+            of, (owner, channel, item) = turn
+            assert of == owner
+            assert waiting[owner, channel].pop(0) == item
+            turns.served(of, cost_s)
+        assert len(turns) == sum(map(len, waiting.values()))
+    while (turn := turns.take()) is not None:
+        assert waiting[turn[1][:2]].pop(0) == turn[1][2]
+        turns.served(turn[0], 0.1)
+    assert not any(waiting.values())
+
+
+@pytest.mark.parametrize("loud", [1, 3, 20])
+def test_the_quiet_one_waits_for_each_loud_one_once(loud: int) -> None:
+    turns: Turns[str] = Turns()
+    for number in range(loud):
+        for _ in range(MOST_OF_A_CONNECTION):
+            turns.add(number, 0, "loud", 1)
+    for _ in range(5 * loud):
+        serve(turns, 0.01)
+    turns.add("quiet", 0, "quiet", 1)
+    before = 0
+    while serve(turns, 0.01) != "quiet":
+        before += 1
+    assert before <= loud

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions: what the kernel says of a peer, and sums that stay right whatever is held and dropped."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.transport.sessions import Peer, Session, Sessions, command_of, predicted_path
+from shmmap.errors import NoSession
+from shmmap.geometry import Circle
+from shmmap.protocol.messages import Intent
+
+
+def resident(number: int, version: int, nbytes: int) -> Resident:
+    box = (0.0, 0.0, 1.0, 1.0)
+    return Resident(f"/{number}", Key(f"/{number}.pcd", "points"), version, nbytes, 0, box, 0.0, 0.0)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["hold", "drop", "segment", "nothing"]), st.integers(0, 2), st.integers(0, 7)
+        ),
+        max_size=40,
+    )
+)
+def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
+    """Two segments share each version; what nobody has changes nothing."""
+    sessions = Sessions()
+    clients = [sessions.open(bytes([n]), Peer(), str(n), 0.0) for n in range(3)]
+    segments = [resident(n, n // 2 + 1, 10**n) for n in range(8)]
+    model: list[set[int]] = [set(), set(), set()]
+    for what, who, number in steps:
+        client, has, version = clients[who], model[who], number // 2 + 1
+        if what == "hold":
+            client.hold([segments[number], segments[number]])
+            has.add(number)
+        elif what == "drop":
+            dropped = client.drop([version, 99, version])
+            assert {s.nbytes for s in dropped} == {10**n for n in has if n // 2 + 1 == version}
+            has -= {n for n in has if n // 2 + 1 == version}
+        elif what == "segment":
+            client.drop_segment(segments[number])
+            has.discard(number)
+        else:
+            assert client.drop([]) == client.drop([12345]) == []
+        for session, numbers in zip(clients, model, strict=True):
+            assert session.held_bytes == sum(10**n for n in numbers)
+            assert {r.nbytes for r in session.residents()} == {10**n for n in numbers}
+            assert len(session.residents()) == len(numbers)
+            assert set(session.held) == {n // 2 + 1 for n in numbers}
+            alone = [n for n in numbers if sum(n in other for other in model) == 1]
+            assert session.exclusive_bytes() == sum(10**n for n in alone)
+        for number, segment in enumerate(segments):
+            assert segment.sessions == {
+                c.slot for c, has in zip(clients, model, strict=True) if number in has
+            }
+    for client in clients:
+        sessions.close(client)
+    assert len(sessions) == 0
+    assert all(not segment.sessions for segment in segments)
+
+
+@pytest.mark.parametrize(
+    ("address", "peer"),
+    [
+        ("localhost:1000:1001:4321", Peer(1000, 1001, 4321)),
+        ("a:b:c:1:2:3", Peer(1, 2, 3)),
+        ("localhost", Peer()), ("", Peer()), ("x:y:z", Peer()), ("localhost:1:2:z", Peer()), ("1:2", Peer()),
+    ],
+)  # fmt: skip
+def test_what_the_kernel_says_of_a_peer(address: str, peer: Peer) -> None:
+    assert Peer.parse(address) == peer
+
+
+def test_a_watched_process() -> None:
+    """The descriptor belongs to the process, and goes with the session."""
+    sessions = Sessions()
+    session = sessions.open(b"1", Peer(0, 0, os.getpid()), "x" * 100, 1.0)
+    pidfd = session.pidfd
+    assert f"Pid:\t{os.getpid()}" in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
+    assert session.client == "x" * 64
+    assert session.command == command_of(os.getpid()) != ""
+    assert sessions.get(b"1") is sessions.by_slot(session.slot) is session
+    sessions.close(session)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(pidfd)
+    assert (sessions.get(b"1"), sessions.by_slot(session.slot)) == (None, None)
+    sessions.close(session)  # twice does no harm
+
+
+def test_a_process_that_has_ended_gets_no_session() -> None:
+    """Nobody would ever tell that it may be closed."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    sessions = Sessions()
+    with pytest.raises(NoSession):
+        sessions.open(b"1", Peer(0, 0, process.pid), "", 0.0)
+    assert len(sessions) == 0
+
+
+def test_slots_are_never_alike() -> None:
+    sessions = Sessions()
+    opened = [sessions.open(bytes([n]), Peer(), "", 0.0) for n in range(200)]
+    assert len({session.slot for session in opened}) == 200
+    assert all(0 < session.slot < 1 << 62 for session in opened)
+    assert {type(session) for session in sessions} == {Session}
+
+
+def test_who_gives_way() -> None:
+    sessions = Sessions()
+    assert sessions.spare() is None
+    watched = sessions.open(b"w", Peer(0, 0, os.getpid()), "", 0.0)
+    assert sessions.spare() is None
+    busy = sessions.open(b"1", Peer(), "", 9.0)
+    idle = sessions.open(b"2", Peer(), "", 3.0)
+    assert sessions.spare() is idle
+    sessions.close(idle)
+    hoarded = [sessions.open(bytes([n]), Peer(0, 0, os.getpid()), "", float(n)) for n in range(3, 6)]
+    assert sessions.spare() is watched  # the process that has most gives its idlest
+    for session in (watched, *hoarded):
+        sessions.close(session)
+    assert sessions.spare() is busy
+
+
+def test_where_a_client_is() -> None:
+    """The middle of what it asks for, until it says so itself."""
+    sessions = Sessions()
+    session = sessions.open(b"1", Peer(), "", 0.0)
+    sessions.open(b"2", Peer(), "", 0.0)
+    assert sessions.poses() == []
+    for at in ((1.0, 2.0), (300.0, 4.0)):
+        session.asked_about(Circle(*at, 5.0))
+        assert sessions.poses() == [at]
+    session.intent, session.says_where = Intent(7.0, 8.0), True
+    session.asked_about(Circle(1.0, 1.0, 5.0))
+    assert sessions.poses() == [(7.0, 8.0)]
+
+
+def test_where_a_client_is_going_counts() -> None:
+    still = Intent(1.0, 2.0)
+    assert predicted_path(still) == [(1.0, 2.0)]
+    straight = predicted_path(Intent(1.0, 2.0, vx=10.0, vy=-1.0))
+    assert straight == [(1.0, 2.0), *((1.0 + 10.0 * s, 2.0 - s) for s in (1, 2, 3, 4, 5))]
+    route = tuple((float(i), 0.0) for i in range(100))
+    known = predicted_path(Intent(1.0, 2.0, vx=10.0, route=route))
+    assert known[0] == (1.0, 2.0)
+    assert known[1:] == list(route[: len(known) - 1])

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demonstration fits itself to the machine it runs on."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+
+import numpy as np
+import pytest
+
+from shmmap.demo.demo_town import DemoSettings, fit
+from shmmap.errors import ConfigError
+from shmmap.simulation.height_image import HeightImage
+
+GIB = 1 << 30
+
+
+def test_with_room_nothing_changes() -> None:
+    wanted = DemoSettings()
+    settings, budget_bytes = fit(wanted, shm_bytes=64 * GIB, disk_bytes=64 * GIB)
+    assert settings == wanted
+    window_points = math.pi * wanted.radius**2 * wanted.density
+    assert window_points * 16 < budget_bytes < window_points * 16 * 3
+
+
+@pytest.mark.parametrize("megabytes", [16, 64, 128])
+def test_in_a_container_the_town_is_thinner(megabytes: int) -> None:
+    settings, budget_bytes = fit(DemoSettings(), shm_bytes=megabytes << 20, disk_bytes=64 * GIB)
+    assert 2.0 <= settings.density < DemoSettings().density
+    assert budget_bytes <= megabytes << 20
+
+
+def test_little_disk_makes_it_thinner_too() -> None:
+    settings, _ = fit(DemoSettings(), shm_bytes=64 * GIB, disk_bytes=100 << 20)
+    ground_points = math.prod(settings.blocks) * 80.0**2 * settings.density
+    assert ground_points * 16 < 100 << 20
+
+
+@pytest.mark.parametrize(("shm_bytes", "disk_bytes"), [(1 << 20, GIB), (GIB, 1 << 20), (0, 0)])
+def test_no_room_at_all(shm_bytes: int, disk_bytes: int) -> None:
+    with pytest.raises(ConfigError, match="too little room"):
+        fit(DemoSettings(), shm_bytes=shm_bytes, disk_bytes=disk_bytes)
+
+
+def decode_png(data: bytes) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.uint8]], bytes]:
+    """Pixels and palette of a palette PNG without filters, read by the letter of the standard."""
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    chunks: dict[bytes, bytes] = {}
+    at = 8
+    while at < len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + length]
+        assert struct.unpack_from(">I", data, at + 8 + length)[0] == zlib.crc32(kind + body)
+        chunks[kind] = body
+        at += 12 + length
+    width, height, depth, colour, *rest = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
+    assert (depth, colour, rest) == (8, 3, [0, 0, 0])
+    rows = np.frombuffer(zlib.decompress(chunks[b"IDAT"]), np.uint8).reshape(height, width + 1)
+    assert not rows[:, 0].any()
+    return rows[:, 1:], chunks[b"PLTE"]
+
+
+def test_height_image_shows_the_highest_point_north_up() -> None:
+    image = HeightImage((0.0, 0.0, 4.0, 2.0), pixel=1.0)
+    xyz = np.array(
+        [[0.5, 1.5, 0.0], [3.5, 0.5, 0.0], [3.5, 0.5, 12.0], [3.5, 0.5, 6.0], [9.0, 9.0, 9.0]], np.float32
+    )
+    image.add(xyz, np.array([20, 20, 30, 200, 200], np.float32))
+    pixels, palette = decode_png(image.png(lambda x, y: 0.0 * (x + y)))
+    assert pixels.shape == (2, 4)
+    colours = np.frombuffer(palette, np.uint8).reshape(-1, 3)[pixels].astype(int)
+    seen = (colours != 255).any(axis=2)
+    assert seen.tolist() == [[True, False, False, False], [False, False, False, True]]
+    red, _, blue = colours[1, 3]
+    assert red > blue + 40, "a roof, not the leaf below it"
+    assert np.ptp(colours[0, 0]) < 10, "grey road"
