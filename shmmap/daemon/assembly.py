@@ -17,9 +17,9 @@ from typing import Final
 import zmq
 
 from shmmap import __version__
-from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.eviction_policy import POLICIES
-from shmmap.daemon.cache.ledger import Residency
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog, nowhere
@@ -29,7 +29,7 @@ from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.host.instance_names import lock_name, lock_path, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import KEEP_SIGNAL, RELOAD_SIGNAL, STOP_SIGNALS, ServingSignals, StartSignals
-from shmmap.daemon.loading.adoption import Leftovers
+from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.file_watch import MapWatch, directories_of
@@ -39,7 +39,7 @@ from shmmap.daemon.requests.operators.authorization import Privileges
 from shmmap.daemon.requests.operators.operator_requests import Admin
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
-from shmmap.daemon.serving_loop import Server
+from shmmap.daemon.serving_loop import ServingLoop
 from shmmap.daemon.transport.outbox import SEND_QUEUE
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.socket_file import bind_socket, remove_socket
@@ -53,7 +53,7 @@ from shmmap.segment.names import segment_prefix
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Life"]
+__all__ = ["Assembly"]
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ RECEIVE_QUEUE: Final = 32
 """Requests that libzmq reads ahead from one connection, of up to `MAX_REQUEST_BYTES` each."""
 
 
-class Life:
+class Assembly:
     """Everything the daemon has between its locks and its end."""
 
     def __init__(
@@ -115,16 +115,16 @@ class Life:
                 hint="make room, and lift limits on the size of files (ulimit -f, LimitFSIZE=)",
             ) from error
         self._sessions = Sessions()
-        books = Residency(budget)
-        books.overhead_bytes = self._statistics.size_bytes
+        ledger = Ledger(budget)
+        ledger.overhead_bytes = self._statistics.size_bytes
 
         def grow_statistics(nbytes: int) -> bool:
-            fits = books.shortage(nbytes) <= 0
-            books.overhead_bytes += nbytes if fits else 0
+            fits = ledger.shortage(nbytes) <= 0
+            ledger.overhead_bytes += nbytes if fits else 0
             return fits
 
         self._statistics.reserve = grow_statistics
-        reclaimer = Reclaimer(books, directory, self._sessions, POLICIES[config.eviction], pins)
+        reclaimer = Reclaimer(ledger, directory, self._sessions, POLICIES[config.eviction], pins)
         self._statistics.set("pin_source", list(Rung).index(pins.rung))
         self._statistics.set("last_reload_unix_ns", time.time_ns())
         pool = WorkerPool(
@@ -136,9 +136,9 @@ class Life:
             cache_dir=config.cache_dir,
             cache_bytes=config.cache_bytes,
         )
-        self._store = Store(
+        self._cache = CellCache(
             catalogue,
-            books,
+            ledger,
             reclaimer,
             pool,
             directory,
@@ -151,12 +151,12 @@ class Life:
             on_settled=lambda key: self._running.cells.settled(key),
             event_log=self._event_log,
         )
-        leftovers = Leftovers(directory, config.instance, self._store, reclaimer, mode=mode, gid=gid)
+        leftovers = Adoption(directory, config.instance, self._cache, reclaimer, mode=mode, gid=gid)
         leftovers.take_over(time.monotonic())
-        self._server: Server | None = None
+        self._server: ServingLoop | None = None
 
     @property
-    def _running(self) -> Server:
+    def _running(self) -> ServingLoop:
         if self._server is None:
             raise InternalError("the server does not run yet")
         return self._server
@@ -180,11 +180,11 @@ class Life:
         self._manager = manager
         self._owns_socket = activated is None
         quota = self._config.session_quota
-        budget = self._store.books.budget_bytes
+        budget = self._cache.ledger.budget_bytes
         events = EventSocket(context, self._event_log.beat)
         admin = Admin(
             self._config,
-            self._store,
+            self._cache,
             self._sessions,
             self._statistics,
             epoch=self._epoch,
@@ -192,9 +192,9 @@ class Life:
             events_path=events_path(self._socket_path),
         )
         self._pins = admin.pins
-        server = self._server = Server(
+        server = self._server = ServingLoop(
             socket,
-            self._store,
+            self._cache,
             self._sessions,
             self._statistics,
             admin,
@@ -218,7 +218,7 @@ class Life:
                 server.watch(events.fd, events.drain)
                 self._event_log.send = events.send
                 self._tell_epoch("started")
-                self._store.loads.pool.start_one()
+                self._cache.loads.pool.start_one()
                 _log.info(
                     "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
                     self._socket_path, self._config.instance, self._config.map_path,
@@ -243,17 +243,17 @@ class Life:
                 remove_socket(self._socket_path)
             remove_socket(events_path(self._socket_path))
 
-    def _watch_map(self, server: Server) -> None:
+    def _watch_map(self, server: ServingLoop) -> None:
         config = self._config
         if config.watch:
-            watch = MapWatch(directories_of(config.map_path, config.metadata, self._store.catalogue))
+            watch = MapWatch(directories_of(config.map_path, config.metadata, self._cache.catalogue))
             server.watch(watch.fd, lambda: watch.drain(time.monotonic()))
             self._map_watch = watch
 
     def _tell_epoch(self, what: str) -> None:
-        catalogue = self._store.catalogue
+        catalogue = self._cache.catalogue
         self._event_log.publish(
-            Epoch, what, catalogue.map_version, len(catalogue), self._store.books.resident_count
+            Epoch, what, catalogue.map_version, len(catalogue), self._cache.ledger.resident_count
         )
 
     def _beat(self) -> None:
@@ -262,18 +262,18 @@ class Life:
         self._running.watch_crowd(time.monotonic())
         if self._map_watch is not None and self._map_watch.due(time.monotonic()):
             self._reload()
-        version = self._store.catalogue.map_version
+        version = self._cache.catalogue.map_version
         if version != self._identity.map_version:
             self._identity = dataclasses.replace(self._identity, map_version=version)
             self._statistics.update_identity(self._identity)
 
     def _status(self) -> str:
-        books = self._store.books
+        ledger = self._cache.ledger
         return status_line(
-            resident=len({resident.key.cell_id for resident in books.residents()}),  # some have layers, too
-            cells=len(self._store.catalogue),
-            used_bytes=books.used_bytes,
-            budget_bytes=books.budget_bytes,
+            resident=len({resident.key.cell_id for resident in ledger.residents()}),  # some have layers, too
+            cells=len(self._cache.catalogue),
+            used_bytes=ledger.used_bytes,
+            budget_bytes=ledger.budget_bytes,
             clients=len(self._sessions),
             failed=self._statistics.values["loads_failed"],
         )
@@ -323,7 +323,7 @@ class Life:
 
     def close(self, *, keep: bool) -> None:
         """Take every name away, or leave those of the segments to the next life."""
-        self._store.close(keep=keep)
+        self._cache.close(keep=keep)
         self._statistics.close()
         if self._server is not None:
             self._server.close()

@@ -28,7 +28,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from shmmap.daemon.assembly import Life
+from shmmap.daemon.assembly import Assembly
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_name, lock_path, stopped_early
@@ -104,7 +104,7 @@ def run(config: DaemonConfig) -> int:
         for problem in catalogue.problems:
             _log.warning("%s", problem)
         with signals.held():
-            life = Life(config, catalogue, directory, pins, path, mode, gid)
+            life = Assembly(config, catalogue, directory, pins, path, mode, gid)
             stack.callback(lambda: life.close(keep=signals.keep))
         life.serve(Reloader(origin), started_s, signals, ServiceManager(), activated)
     return 0

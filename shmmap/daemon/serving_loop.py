@@ -16,22 +16,22 @@ from typing import Final
 
 import zmq
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Resident
 from shmmap.daemon.cache.pin_survey import Pinned, PinSurvey
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.events.map_events import tell_reload, tell_reload_failed
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.requests.cell_requests import CellRequests
-from shmmap.daemon.requests.handshake import Reception
+from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import bounded_intent
 from shmmap.daemon.requests.operators.authorization import Privileges
 from shmmap.daemon.requests.operators.operator_requests import Admin
 from shmmap.daemon.telemetry.sampler import BEAT_S, Heartbeat
 from shmmap.daemon.transport.crowd_control import CrowdControl
-from shmmap.daemon.transport.inbox import Heard, Hearing, peer_of
+from shmmap.daemon.transport.inbox import Heard, Inbox, peer_of
 from shmmap.daemon.transport.listen_gate import ListenGate
-from shmmap.daemon.transport.outbox import Replies
+from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
 from shmmap.origin.catalogue import Catalogue, compare
@@ -39,7 +39,7 @@ from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Server"]
+__all__ = ["ServingLoop"]
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ _PRIVILEGED: Final = (
 )
 
 
-class Server:
+class ServingLoop:
     """Serves one map until told to stop.
 
     Parameters
@@ -75,7 +75,7 @@ class Server:
     def __init__(
         self,
         socket: zmq.Socket[bytes],
-        store: Store,
+        cache: CellCache,
         sessions: Sessions,
         statistics: StatisticsWriter,
         admin: Admin,
@@ -88,7 +88,7 @@ class Server:
         on_beat: Callable[[], None],
     ) -> None:
         self._socket = socket
-        self._store = store
+        self._cache = cache
         self._sessions = sessions
         self._statistics = statistics
         self._admin = admin
@@ -102,9 +102,9 @@ class Server:
         self._stop_by_s = math.inf
         self._answer_at_end = True
         self.cells = CellRequests(
-            store, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
+            cache, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
         )
-        self._reception = Reception(
+        self._handshake = Handshake(
             sessions,
             self.cells,
             statistics,
@@ -114,20 +114,20 @@ class Server:
             on_left=self._left,
         )
         self._heartbeat = Heartbeat(
-            store, statistics, event_log, sessions=sessions, waiting=self.cells, on_beat=on_beat
+            cache, statistics, event_log, sessions=sessions, waiting=self.cells, on_beat=on_beat
         )
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
-        self._replies = Replies(socket, statistics)
-        self._hearing = Hearing(socket, sessions, statistics, self._refuse_unread)
-        self._survey = PinSurvey(store.reclaimer, in_service=store.is_in_service)
+        self._outbox = Outbox(socket, statistics)
+        self._inbox = Inbox(socket, sessions, statistics, self._refuse_unread)
+        self._survey = PinSurvey(cache.reclaimer, in_service=cache.is_in_service)
         self._gate = ListenGate(self.watch, self.unwatch)
         self._crowd = CrowdControl(
             self._gate,
-            waiting_bytes=self._hearing.waiting_bytes,
-            unread_bytes=lambda: self._replies.unread(list(sessions)),
+            waiting_bytes=self._inbox.waiting_bytes,
+            unread_bytes=lambda: self._outbox.unread(list(sessions)),
             session_descriptors=lambda: [session.fd for session in sessions],
         )
-        for fd, hear in ((store.reclaimer.pins.fd, store.loads.hear), (store.names.fd, store.hear_of_names)):
+        for fd, hear in ((cache.reclaimer.pins.fd, cache.loads.hear), (cache.names.fd, cache.hear_of_names)):
             if fd >= 0:
                 self.watch(fd, lambda hear=hear: hear(time.monotonic()))  # type: ignore[misc]
         self._poller = zmq.Poller()
@@ -151,9 +151,9 @@ class Server:
         self.watch(fd, lambda: self._on_worker(fd))
 
     def _on_worker(self, fd: int) -> None:
-        worker = self._store.loads.pool.by_fd(fd)
+        worker = self._cache.loads.pool.by_fd(fd)
         if worker is not None:
-            self._store.loads.on_worker(worker, time.monotonic())
+            self._cache.loads.on_worker(worker, time.monotonic())
 
     @property
     def stopping(self) -> bool:
@@ -163,7 +163,7 @@ class Server:
     def guard(self) -> None:
         """From now on descriptors and memory are watched; call it when everything is bound."""
         self._gate.close_behind()
-        self._replies.paths = self._gate.paths
+        self._outbox.paths = self._gate.paths
         self._crowd.begin()
 
     def watch_crowd(self, now_s: float) -> None:
@@ -182,13 +182,13 @@ class Server:
         while not self._stopping:
             now_s = time.monotonic()
             until_s = min(
-                self._store.loads.next_event_s(),
+                self._cache.loads.next_event_s(),
                 self.cells.next_deadline_s(),
                 self._heartbeat.next_s,
                 self._survey.next_step_s,
             )
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
-            busy = len(self._hearing) or not self._crowd.idle
+            busy = len(self._inbox) or not self._crowd.idle
             ready = self._poller.poll(0 if busy else min(timeout_ms, int(BEAT_S * 1000)))
             self._turn(ready)
         self._gate.release()
@@ -212,8 +212,8 @@ class Server:
         now_s = time.monotonic()
         self._survey.turn(now_s)
         self._crowd.step()
-        self._store.loads.end_overdue(now_s)
-        self._store.loads.pump(now_s)
+        self._cache.loads.end_overdue(now_s)
+        self._cache.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
         self._heartbeat.turn(now_s)
         if now_s >= self._stop_by_s:
@@ -227,15 +227,15 @@ class Server:
         end_s = start_s + SERVE_S
         more = True
         while start_s < end_s:
-            more = more and self._hearing.hear()
-            heard = self._hearing.take()
+            more = more and self._inbox.hear()
+            heard = self._inbox.take()
             if heard is None:
                 if not more:
                     return
                 continue
             self._handle(heard)
             now_s = time.monotonic()
-            self._hearing.served(heard, now_s - start_s)
+            self._inbox.served(heard, now_s - start_s)
             self._statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s, more = now_s, True
 
@@ -265,7 +265,7 @@ class Server:
     def _dispatch(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
-            entered = self._reception.enter(identity, frame, message, now_s)
+            entered = self._handshake.enter(identity, frame, message, now_s)
             self._send(entered, encode(self._admin.welcome(entered, message)))
             return
         session = self._sessions.get(identity)
@@ -286,7 +286,7 @@ class Server:
             self.cells.let_go(self._released(session, message))
             self._send(session, encode(messages.Released(message.request)))
         elif isinstance(message, messages.Bye):
-            self._reception.leave(session)
+            self._handshake.leave(session)
         else:
             if isinstance(message, _PRIVILEGED):
                 self._privileges.require(peer_of(frame), now_s)
@@ -317,7 +317,7 @@ class Server:
     # --- reload -------------------------------------------------------------------------------------
 
     def _reload_for(self, session: Session, message: messages.Reload) -> None:
-        before = self._store.catalogue
+        before = self._cache.catalogue
 
         def answer(result: Catalogue | ShmmapError) -> None:
             if isinstance(result, ShmmapError):
@@ -341,10 +341,10 @@ class Server:
         self._reloader.ask(answer)
 
     def _change_map(self, catalogue: Catalogue) -> None:
-        old, now_s = self._store.catalogue, time.monotonic()
+        old, now_s = self._cache.catalogue, time.monotonic()
         self.cells.renumber(lambda index: catalogue.find(old.id(index)), old.id)
-        change = self._store.replace_catalogue(catalogue, now_s)
-        tell_reload(self._event_log, self._statistics, self._store, change)
+        change = self._cache.replace_catalogue(catalogue, now_s)
+        tell_reload(self._event_log, self._statistics, self._cache, change)
         _log.info(
             "map read again: %d cells changed, %d added, %d removed",
             len(change.changed), len(change.added), len(change.removed),
@@ -353,12 +353,12 @@ class Server:
             _log.warning("%s", problem)
 
     def _keep_map(self, error: ShmmapError) -> None:
-        tell_reload_failed(self._event_log, self._statistics, self._store, error)
+        tell_reload_failed(self._event_log, self._statistics, self._cache, error)
 
     # --- replies --------------------------------------------------------------------------------------
 
     def _send(self, session: Session, reply: bytes) -> None:
-        self._replies.send(session, reply)
+        self._outbox.send(session, reply)
 
     def _refuse(self, identity: bytes, request: int, error: ShmmapError) -> None:
-        self._replies.refuse(identity, request, error)
+        self._outbox.refuse(identity, request, error)

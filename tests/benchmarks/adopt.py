@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from shmmap.daemon.loading.adoption import Leftovers
+from shmmap.daemon.loading.adoption import Adoption
 from shmmap.layers.points import build_points
 from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name
@@ -76,7 +76,7 @@ def main() -> None:
             life = InnerDaemon(
                 str(made.root), budget_bytes=4 << 30, cache_dir=scratch, shm_dir=first.shm_dir, name="next"
             )
-            leftovers = Leftovers(life.directory, "inner", life.store, life.reclaimer, mode=0o400, gid=-1)
+            leftovers = Adoption(life.directory, "inner", life.store, life.reclaimer, mode=0o400, gid=-1)
             spent = milliseconds(lambda: leftovers.take_over(life.now_s()))
             assert life.books.resident_count == options.segments
             life.leave()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import msgspec
 
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.records import Resident
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
 from shmmap.statistics.cell_rows import CellRow

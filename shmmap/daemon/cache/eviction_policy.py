@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.records import Resident
 
 __all__ = ["POLICIES", "EvictionPolicy", "by_distance", "by_last_use"]
 

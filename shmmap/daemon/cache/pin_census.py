@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.records import Resident
 
 __all__ = ["PinCensus"]
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.cache.ledger import Resident
 from shmmap.daemon.cache.reclaimer import UNKNOWN_SLOT, Reclaimer
+from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import Busy
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.records import Resident
+from shmmap.protocol.codec import encode_handle
+from shmmap.protocol.messages import Handle
 
-__all__ = ["WarmCells"]
+__all__ = ["WarmIndex"]
 
 
-class WarmCells:
+class WarmIndex:
     """The same twice: to be looked up one by one, and a whole area at once.
 
     Parameters
@@ -41,6 +44,21 @@ class WarmCells:
         """The segment of a cell, if it is warm."""
         found = self.layers.get(layer)
         return found.get(index) if found is not None else None
+
+    def encode(self, resident: Resident, wire_id: str, segment: str) -> None:
+        """Encode a segment's handle once, fresh and stale, to be used in every reply.
+
+        Parameters
+        ----------
+        wire_id, segment
+            Cell id and segment name, both without their prefixes.
+        """
+        handle = Handle(
+            wire_id, resident.version, resident.key.layer, segment, 0, resident.nbytes, resident.points,
+            *resident.box,
+        )  # fmt: skip
+        resident.handle = encode_handle(handle)
+        resident.stale_handle = encode_handle(msgspec.structs.replace(handle, stale=True))
 
     def enter(self, resident: Resident, index: int) -> None:
         """A segment has the current version of its cell."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from shmmap.daemon.cache.ledger import Failure, Key, Residency, Resident
+from shmmap.daemon.cache.ledger import Failure, Key, Ledger, Resident
 from shmmap.daemon.events.eviction_history import Ghosts
 from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.loading.scheduler import SPACE_CODES
@@ -32,21 +32,21 @@ class CellEvents:
     def __init__(
         self,
         log: EventLog,
-        books: Residency,
+        ledger: Ledger,
         statistics: StatisticsWriter,
         wire_id: Callable[[str], str],
     ) -> None:
         self._log = log
-        self._books = books
+        self._ledger = ledger
         self._statistics = statistics
         self._wire_id = wire_id
         self._ghosts = Ghosts()
         self.pressure = PressureEvents(log, self._memory)
 
     def _memory(self) -> tuple[int, int, int, int]:
-        books = self._books
+        ledger = self._ledger
         pinned = self._statistics.values["bytes_pinned"]
-        return books.budget_bytes, books.used_bytes, pinned, books.zombie_bytes
+        return ledger.budget_bytes, ledger.used_bytes, pinned, ledger.zombie_bytes
 
     def loaded(self, resident: Resident, took_ns: int, *, replaces: int = 0) -> None:
         """A segment was loaded and published; ``took_ns`` from handing the load to a worker."""

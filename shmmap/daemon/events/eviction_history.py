@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.records import Key
 
 __all__ = ["Ghosts"]
 

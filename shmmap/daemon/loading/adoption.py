@@ -5,8 +5,8 @@ Every name of the instance is looked at once, before anything is served:
 
 - a segment that is published, ours, whole by its header, and of the version its cell has in the map
   now is *adopted*: it serves again as soon as a worker has compared its bytes with their checksums;
-- any other segment that somebody still maps becomes a zombie, known by name and cell, and is freed
-  when its last reader lets go;
+- any other segment that somebody still maps is kept as a retired one, known by name and cell, and is
+  freed when its last reader lets go;
 - the rest is removed.  What this user may not remove (a stranger's file that squats one of our
   names) is left alone and never served.
 """
@@ -19,9 +19,10 @@ import os
 import stat
 from typing import NamedTuple
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Key, Resident
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.records import Key, Resident
 from shmmap.errors import BadRequest, SegmentCorrupt
 from shmmap.failpoints import step
 from shmmap.layers.spec import layer_spec
@@ -30,16 +31,16 @@ from shmmap.segment.layout import PublishBlock, SegmentHeader
 from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
 from shmmap.segment.verify import read_header
 
-__all__ = ["Leftovers", "TakenOver"]
+__all__ = ["Adoption", "TakenOver"]
 
 _log = logging.getLogger(__name__)
 
 
 class TakenOver(NamedTuple):
-    """How many segments were adopted, kept as zombies, and removed or refused."""
+    """How many segments were adopted, kept for their readers, and removed or refused."""
 
     adopted: int
-    zombies: int
+    retired: int
     dropped: int
 
 
@@ -51,7 +52,7 @@ class _Found(NamedTuple):
     why_not: str
 
 
-class Leftovers:
+class Adoption:
     """Takes over what is in the directory under an instance's name.
 
     Parameters
@@ -64,8 +65,8 @@ class Leftovers:
         self,
         directory: ShmDirectory,
         instance: str,
-        store: Store,
-        reclaimer: Reclaimer,
+        cache: CellCache,
+        loads: Loads,
         *,
         mode: int,
         gid: int,
@@ -73,14 +74,15 @@ class Leftovers:
         self._directory = directory
         self._prefix = segment_prefix(instance)
         self._not_segments = (statistics_name(instance), self._prefix + "lock")
-        self._store = store
-        self._reclaimer = reclaimer
+        self._cache = cache
+        self._reclaimer = cache.reclaimer
+        self._loads = loads
         self._mode = mode
         self._gid = gid
 
     def take_over(self, now_s: float) -> TakenOver:
         """Look at every name once."""
-        adopted = zombies = dropped = 0
+        adopted = retired = dropped = 0
         for name in self._directory.names(self._prefix):
             if name.startswith(self._not_segments):
                 continue
@@ -96,18 +98,18 @@ class Leftovers:
                     self._adopt(fd, name, found, now_s)
                     adopted += 1
                 elif self._keep_for_readers(fd, name, found, now_s):
-                    zombies += 1
+                    retired += 1
                 else:
                     dropped += 1
             finally:
                 os.close(fd)
         step("daemon.adopted")
-        if adopted or zombies or dropped:
+        if adopted or retired or dropped:
             _log.info(
                 "of an earlier daemon: %d segments taken over, %d still in use, %d dropped",
-                adopted, zombies, dropped,
+                adopted, retired, dropped,
             )  # fmt: skip
-        return TakenOver(adopted, zombies, dropped)
+        return TakenOver(adopted, retired, dropped)
 
     # --- judging ------------------------------------------------------------------------------
 
@@ -125,7 +127,7 @@ class Leftovers:
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, block: PublishBlock) -> str:
         """Why a whole segment cannot serve; empty if it can."""
-        store, catalogue = self._store, self._store.catalogue
+        cache, catalogue = self._cache, self._cache.catalogue
         if is_zombie(name):
             return "it was retired"
         if status.st_mode & 0o222 or status.st_nlink != 1:
@@ -139,17 +141,16 @@ class Leftovers:
         index = catalogue.find(header.cell_id)
         if index is None:
             return "its cell is not in the map"
-        known = store.books.slots.get(Key(header.cell_id, header.layer))
-        if known is not None and known.resident is not None:
+        if Key(header.cell_id, header.layer) in cache.ledger.by_key:
             return "there is another one"
         if (block.version, header.source) != (
-            store.layers.version(index, header.layer),
+            cache.layers.version(index, header.layer),
             catalogue.stamp(index),
         ):
             return "its source has changed"
         if header.box != catalogue.box(index) or header.frame_id != catalogue.frame_id:
             return "its cell has moved"
-        if store.books.shortage(status.st_blocks * 512) > 0:
+        if cache.ledger.shortage(status.st_blocks * 512) > 0:
             return "it does not fit in the budget"
         return ""
 
@@ -161,12 +162,14 @@ class Leftovers:
         if self._gid >= 0:
             os.fchown(fd, -1, self._gid)
         os.fchmod(fd, self._mode)
-        index = self._store.catalogue.find(found.header.cell_id)
+        index = self._cache.catalogue.find(found.header.cell_id)
         assert index is not None  # noqa: S101
-        self._store.adopt(self._resident(fd, name, found, now_s), index)
+        resident = self._resident(fd, name, found, now_s)
+        self._cache.adopt(resident, index)
+        self._loads.check(resident)
 
     def _keep_for_readers(self, fd: int, name: str, found: _Found, now_s: float) -> bool:
-        """Watch it as a zombie if somebody uses it, else remove it; True if it is used."""
+        """Watch it as a retired one if somebody uses it, else remove it; True if it is used."""
         try:
             used = os.fstat(fd).st_uid == os.geteuid() and self._reclaimer.pins.told(fd)
         except OSError:  # nothing that has leases

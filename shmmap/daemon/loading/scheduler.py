@@ -1,160 +1,192 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads from the queue to their end: room is made, a worker is given the job, its word is heard.
 
-Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is
-replaced, and the jobs behind the one it died of go back into the queue.
+Requests ask the cache; what is absent they ask the scheduler, which asks the cache for room and publishes
+into it.  Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long
+is replaced, and the jobs behind the one it died of go back into the queue.
 
-A segment of an earlier life of the daemon is checked by a worker before it is handed out, as a load
-that costs no memory; when it is not what it should be, the cell is loaded like any other.
+A segment of an earlier life of the daemon is checked by a worker before it is handed out, as a load that
+costs no memory; when it is not what it should be, the cell is loaded like any other.  So is the file of a
+cell that failed: only workers look at files, because a look may take as long as a file system hangs.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
-from typing import Final, Protocol
+from collections.abc import Callable, Hashable, Iterable
+from typing import Final
 
-from shmmap.daemon.cache.ledger import Failure, Key, Load, Residency, Resident
-from shmmap.daemon.cache.reclaimer import Outcome, Reclaimer
-from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.map_switch import MapSwitch
+from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.room import Room
+from shmmap.daemon.loading.worker_messages import (
+    Check,
+    Checked,
+    Done,
+    Failed,
+    Job,
+    Need,
+    Ready,
+    Segment,
+)  # fmt: skip
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
+from shmmap.layers.points import LAYER
+from shmmap.layers.versions import MAX_NEIGHBOURS
+from shmmap.segment.directory import is_full
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["SPACE_CODES", "Loading", "Shelf"]
+__all__ = ["Scheduler"]
 
 _log = logging.getLogger(__name__)
 
-FIRST_RETRY_S: Final = 1.0
-LAST_RETRY_S: Final = 30.0
-BUDGET_RETRY_S: Final = 0.1
 START_ATTEMPTS: Final = 3
 """After this many loaders in a row that could not start, loads fail instead of waiting."""
-SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
 
 
-class Shelf(Protocol):
-    """Where loads come from and go to: the store."""
-
-    def job(self, load: Load, number: int) -> worker_messages.Job | worker_messages.Check | None:
-        """What a worker has to do for a load; None if its cell left the map."""
-
-    def publish(self, load: Load, done: worker_messages.Done, fd: int, now_s: float) -> None:
-        """Take a finished segment; the descriptor is closed afterwards."""
-
-    def accept(self, load: Load, resident: Resident) -> bool:
-        """Hand out a checked segment from now on; False if it has left service meanwhile."""
-
-    def reject(self, resident: Resident, why: str, now_s: float) -> None:
-        """Take a segment that is not what it should be out of service."""
-
-    def estimate_of(self, key: Key) -> int:
-        """Bytes to reserve before loading a key."""
-
-    def failed(self, key: Key, failure: Failure, now_s: float) -> None:
-        """Hear that a load ended without a segment."""
+def _nobody(key: Key) -> None:
+    del key
 
 
-class Loading:
-    """Carries out the loads that the books queue.
+class Scheduler:
+    """Carries out loads.
 
     Parameters
     ----------
-    on_settled
-        Called with a key when its load ended, in whichever way.
+    pool
+        The workers.
 
     Attributes
     ----------
-    pool
-        The workers.
-    hungry : dict
-        Per job number, the worker that waits for more room, and how many bytes it needs in all.
+    loads
+        What is wanted, queued and under way, and what failed.
+    on_settled
+        Called with a key when its load ended, in whichever way.
     """
 
     def __init__(
         self,
-        shelf: Shelf,
-        books: Residency,
-        reclaimer: Reclaimer,
+        cache: CellCache,
+        loads: Loads,
+        map_switch: MapSwitch,
         pool: WorkerPool,
         statistics: StatisticsWriter,
-        on_settled: Callable[[Key], None],
     ) -> None:
-        self._shelf = shelf
-        self.books = books
-        self.reclaimer = reclaimer
-        self.pool = pool
+        self._cache = cache
+        self._map_switch = map_switch
         self._statistics = statistics
-        self._on_settled = on_settled
+        self.loads = loads
+        self.pool = pool
+        self.on_settled: Callable[[Key], None] = _nobody
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
-        self.hungry: dict[int, tuple[Worker, int]] = {}
+        self._room = Room(cache, loads, pool)
 
-    def may_retry(self, key: Key, failure: Failure, now_s: float) -> bool:
-        """Whether asking again can help: the back-off is over, or the file has changed."""
+    # --- being asked ----------------------------------------------------------------------------
+
+    def want(
+        self, index: int, layer: str, priority: float, now_s: float, asker: Hashable = None
+    ) -> Load | None:
+        """Make sure that a load of an absent cell is under way; None if it failed too recently.
+
+        A cell that failed too recently is loaded if its file has changed since: a worker looks, if it is
+        known for which state of the file it failed.
+        """
+        cache = self._cache
+        key = Key(cache.catalogue.id(index), layer)
+        failure = self.loads.failures.get(key)
+        if failure is None or key in self.loads.by_key:
+            return self.loads.want(key, cache.estimate(index, layer), priority, asker)
         if now_s >= failure.retry_at_s:
-            return True
+            cache.tell(cache.events.retried, key, failure)
+            return self.loads.want(key, cache.estimate(index, layer), priority, asker)
         if failure.code in SPACE_CODES or failure.stamp is None:
-            return False
-        return _stamp_of(key.cell_id) not in (failure.stamp, None)
+            return None
+        load = self.loads.want(key, 0, priority, asker)
+        load.unless = failure.stamp
+        return load
+
+    def drop(self, cells: Iterable[str]) -> None:
+        """These cells left the map: nobody asks for them any more."""
+        gone = set(cells)
+        for key in [key for key in {*self.loads.by_key, *self.loads.failures} if key.cell_id in gone]:
+            self.loads.cancel(key)
+            self.on_settled(key)
+
+    # --- handing out jobs -----------------------------------------------------------------------
 
     def pump(self, now_s: float) -> None:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""
-        if self.books.zombies and self.reclaimer.sweep(now_s):
-            self.books.clear_failures(SPACE_CODES)
-        self._feed_hungry(now_s)
+        if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
+            self.loads.clear_failures(SPACE_CODES)
+        if self._room.hungry:
+            self._room.feed(self._jobs, now_s)
         while self.pool.has_room:
-            load = self.books.next_queued()
+            load = self.loads.next_queued()
             if load is None:
                 return
-            job = self._shelf.job(load, self._job_numbers + 1)
+            job = self._job(load, self._job_numbers + 1)
             if job is None:
-                self.abandon(load)
+                self._end(load)
                 continue
-            shortage = self.books.shortage(load.estimate)
+            shortage = self._cache.ledger.shortage(load.estimate)
             if load.estimate and shortage > 0:
-                if self._make_room(load, shortage, now_s):
-                    continue
-                return
-            self.books.start(load, now_s)
+                refusal = self._room.refusal(load, shortage, now_s)
+                if not refusal:
+                    return
+                self._fail(load, "over_budget", refusal, None, now_s)
+                continue
+            self.loads.start(load, now_s)
             self._job_numbers += 1
             if not self.pool.submit(job, now_s):
-                self.books.requeue(load)
+                self.loads.requeue(load)
                 return
             self._jobs[job.number] = load
-            if isinstance(job, worker_messages.Job):
-                self._statistics.add("loads_started")
+            self._statistics.add("loads_started", isinstance(job, Job))
 
-    def _make_room(self, load: Load, shortage: int, now_s: float) -> bool:
-        """Whether the load was given up (True) or room is on its way (False)."""
-        if load.estimate + self.books.overhead_bytes > self.books.budget_bytes:
-            message = f"the cell needs {load.estimate} bytes, the whole budget is {self.books.budget_bytes}"
-            self.fail(load, "over_budget", message, None, now_s)
-            return True
-        if self.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_give_back():
-            return False
-        message = f"{load.estimate} bytes do not fit: the budget of {self.books.budget_bytes} bytes is in use"
-        self.fail(load, "over_budget", message, None, now_s)
-        return True
+    def _job(self, load: Load, number: int) -> Job | Check | None:
+        """What a worker has to do for a load; None if its cell left the map, or nobody wants it any more."""
+        cache, catalogue = self._cache, self._cache.catalogue
+        index = cache.index_of(load.key.cell_id)
+        if index is None:
+            return None
+        if load.unless is not None:
+            return Check(number, catalogue.path(index), "", load.unless)
+        if load.adopted is not None:
+            if cache.ledger.resident_named(load.adopted.name) is load.adopted:
+                return Check(number, catalogue.path(index), load.adopted.name, catalogue.stamp(index))
+            load.adopted = None  # it was retired before its turn came
+            if not load.wanted:
+                return None
+            load.estimate = self._cache.estimate(index, load.key.layer)
+        layer = load.key.layer
+        around = cache.layers.neighbours(index, layer)[: MAX_NEIGHBOURS + 1]
+        load.sources = tuple(map(catalogue.stamp, (index, *around)))
+        points = cache.warm.get(index, LAYER) if layer != LAYER else None
+        return Job(
+            number, load.key.cell_id, catalogue.path(index), layer, catalogue.box(index), catalogue.frame_id,
+            load.estimate, points.name if points is not None else "",
+            tuple(map(catalogue.path, around)),
+        )  # fmt: skip
 
-    def _may_give_back(self) -> bool:
-        """Whether a load runs that will end by itself: it may need less than is reserved for it.
-
-        Loads that wait for room do not end by themselves, nor do those that come after them in the
-        same loader's queue.
-        """
-        return any(worker.queue and next(iter(worker.queue)) not in self.hungry for worker in self.pool)
-
-    def hear(self, now_s: float) -> None:
+    def hear_of_closes(self, now_s: float) -> None:
         """The kernel reports that segments were closed."""
-        if self.reclaimer.hear(now_s):
-            self.books.clear_failures(SPACE_CODES)
+        if self._cache.reclaimer.hear(now_s):
+            self.loads.clear_failures(SPACE_CODES)
+
+    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
+        """Somebody dropped these: what was refused for want of memory may fit now."""
+        self._cache.reclaimer.let_go(residents, now_s)
+        self.loads.clear_failures(SPACE_CODES)
 
     def next_event_s(self) -> float:
         """When `pump` has something to do although nothing arrives; infinity for never."""
-        return min(self.reclaimer.next_sweep_s(), self.reclaimer.wake_s, self.pool.next_deadline_s())
+        reclaimer = self._cache.reclaimer
+        return min(reclaimer.next_sweep_s(), reclaimer.wake_s, self.pool.next_deadline_s())
 
     # --- what workers say -----------------------------------------------------------------------
 
@@ -168,148 +200,166 @@ class Loading:
         if received is None:
             return False
         message, fd = received
-        if fd >= 0 and not isinstance(message, worker_messages.Segment):
+        if isinstance(message, Segment):
+            step("daemon.received")
+            worker.segment_fd, fd = fd, worker.segment_fd
+        if fd >= 0:
             os.close(fd)
-        if isinstance(message, worker_messages.Ready):
+        if isinstance(message, Ready):
             worker.ready = True
             worker.head_since_s = now_s
             self.pool.failed_starts = 0
-            return True
-        if isinstance(message, worker_messages.Segment):
-            step("daemon.received")
-            if worker.segment_fd >= 0:
-                os.close(worker.segment_fd)
-            worker.segment_fd = fd
-            return True
-        if isinstance(message, worker_messages.Need):
-            self.hungry[message.number] = (worker, message.bytes)
-            self._feed_hungry(now_s)
-            return True
-        self.pool.finished(worker, message.number, now_s)
-        self.hungry.pop(message.number, None)
-        load = self._jobs.pop(message.number, None)
-        fd, worker.segment_fd = worker.segment_fd, -1
-        if isinstance(message, worker_messages.Checked):
-            if load is not None:
-                self._checked(load, message.wrong, now_s)
-        elif isinstance(message, worker_messages.Failed):
-            if fd >= 0:
-                os.close(fd)
-            if load is not None:
-                self.fail(load, message.code, message.message, message.stamp, now_s)
-        elif fd >= 0:
-            try:
-                if load is not None:
-                    self._shelf.publish(load, message, fd, now_s)
-            finally:
-                os.close(fd)
-        elif load is not None:  # this process had no descriptor left to receive it
-            self.fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
+        elif isinstance(message, Need):
+            self._room.ask(worker, message)
+            self._room.feed(self._jobs, now_s)
+        elif not isinstance(message, Segment):
+            self._on_end(worker, message, now_s)
         return True
 
-    def _checked(self, load: Load, wrong: str, now_s: float) -> None:
-        """An adopted segment was compared with its checksums, or could not be."""
+    def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
+        """A worker is done with a job, in whichever way."""
+        self.pool.finished(worker, message.number, now_s)
+        self._room.hungry.pop(message.number, None)
+        load = self._jobs.pop(message.number, None)
+        fd, worker.segment_fd = worker.segment_fd, -1
+        try:
+            if load is None:
+                return
+            if isinstance(message, Checked):
+                self._on_checked(load, message.wrong, now_s)
+            elif isinstance(message, Failed):
+                self._fail(load, message.code, message.message, message.stamp, now_s)
+            elif fd >= 0:
+                self._publish(load, message, fd, now_s)
+            else:  # this process had no descriptor left to receive it
+                self._fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
+        finally:
+            if fd >= 0:
+                os.close(fd)
+
+    def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
+        """Have a finished segment handed out from now on."""
+        cache, key = self._cache, load.key
+        index = cache.index_of(key.cell_id)
+        if index is None:
+            self._statistics.add("loads_failed")
+            self._end(load)
+            return
+        cells = (index, *cache.layers.neighbours(index, key.layer))
+        reads = (done.stamp, *done.neighbours)
+        if tuple(map(cache.catalogue.stamp, cells)) != reads and not self._map_switch.catch_up(
+            cells, reads, load.sources
+        ):
+            self.loads.requeue(load)
+            return
+        resident = Resident(
+            name="", key=key, version=0, nbytes=0, points=done.points, box=cache.catalogue.box(index),
+            z_min=done.z_min, z_max=done.z_max, last_use_s=now_s, load_ns=done.load_ns,
+        )  # fmt: skip
+        try:
+            replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
+        except OSError as error:
+            code = "no_space" if is_full(error) else "load_failed"
+            self._fail(load, code, f"cannot publish: {error.strerror}", None, now_s)
+            return
+        cache.tell(cache.events.loaded, resident, int((now_s - load.started_s) * 1e9), replaces)
+        self._statistics.add("loads_from_cache", done.cached)
+        self._statistics.add("layers_computed", not done.cached and key.layer != LAYER)
+        for warning in done.warnings:
+            _log.info("%s: %s", key.cell_id, warning)
+        if done.dropped:
+            _log.info("%s: %d points left out, not finite", key.cell_id, done.dropped)
+        self._end(load)
+
+    def _on_checked(self, load: Load, wrong: str, now_s: float) -> None:
+        """A worker compared an adopted segment with its checksums, or a file with the state it failed for."""
+        if load.unless is not None:
+            self._on_looked(load, changed=bool(wrong))
+            return
         resident, load.adopted = load.adopted, None
-        if resident is not None and not wrong and self._shelf.accept(load, resident):
-            self._on_settled(load.key)
+        if resident is not None and not wrong and self._cache.accept(resident):
+            self._end(load)
             return
         if resident is not None and wrong:
-            self._shelf.reject(resident, wrong, now_s)
-        if load.wanted:
-            load.estimate = self._shelf.estimate_of(load.key)
-            self.books.requeue(load)
-        else:
-            self.abandon(load)
+            self._cache.reject(resident, wrong, now_s)
+        self._load_after_all(load)
 
-    def _feed_hungry(self, now_s: float) -> None:
-        """Grant, hold or refuse the extra bytes that workers asked for."""
-        for number, (worker, nbytes) in list(self.hungry.items()):
-            load = self._jobs.get(number)
-            if load is None:
-                del self.hungry[number]
-            elif self.books.grow(load, nbytes):
-                del self.hungry[number]
-                self.pool.answer(worker, worker_messages.Grant(number))
-            else:
-                shortage = self.books.shortage(nbytes - load.reserved)
-                hopeless = nbytes + self.books.overhead_bytes > self.books.budget_bytes
-                outcome = Outcome.IMPOSSIBLE if hopeless else self.reclaimer.free(shortage, now_s)
-                if hopeless or (outcome is Outcome.IMPOSSIBLE and not self._may_give_back()):
-                    del self.hungry[number]
-                    self.pool.answer(worker, worker_messages.Refuse(number))
+    def _on_looked(self, load: Load, *, changed: bool) -> None:
+        """A worker compared a file with the state it failed for: another state is tried at once."""
+        failure, load.unless = self.loads.failures.get(load.key), None
+        if not changed:
+            self._end(load, failure)
+            return
+        if failure is not None:
+            self._cache.tell(self._cache.events.retried, load.key, failure)
+        self._load_after_all(load)
+
+    def _load_after_all(self, load: Load) -> None:
+        index = self._cache.index_of(load.key.cell_id)
+        if load.wanted and index is not None:
+            load.estimate = self._cache.estimate(index, load.key.layer)
+            self.loads.requeue(load)
+        else:
+            self._end(load)
 
     def _on_worker_end(self, worker: Worker, now_s: float) -> None:
-        unfinished, how = self.pool.remove(worker)
-        self._statistics.add("worker_crashes")
         if not worker.ready:
             self.pool.failed_starts += 1
-            _log.error("a loader could not start: %s", how)
         at_fault = worker.ready or self.pool.failed_starts >= START_ATTEMPTS
-        for position, job in enumerate(unfinished):
-            self.hungry.pop(job.number, None)
-            load = self._jobs.pop(job.number, None)
-            if load is None:
-                continue
-            if position == 0 and at_fault:
-                _log.error("loader died while it read %s: %s", job.path, how)
-                message = f"{job.path}: the loader died of it ({how})"
-                self.fail(load, "load_failed", message, _stamp_of(job.path), now_s)
-            else:
-                self.books.requeue(load)
+        how = self._replace(worker, "load_failed" if at_fault else "", now_s)
+        self._statistics.add("worker_crashes")
+        if not worker.ready:
+            _log.error("a loader could not start: %s", how)
 
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load took too long; only the cell they worked on fails."""
         for worker in self.pool.overdue(now_s):
-            if not worker.ready:
+            if worker.ready:
+                self._statistics.add("loads_timed_out")
+                self._replace(worker, "load_timeout", now_s)
+            else:
                 self._on_worker_end(worker, now_s)
-                continue
-            number, job = next(iter(worker.queue.items()))
-            load = self._jobs.pop(number, None)
-            worker.queue.pop(number)
-            unfinished, _how = self.pool.remove(worker)
-            self.hungry.pop(number, None)
-            self._statistics.add("loads_timed_out")
-            _log.error("loading %s took too long, its loader was ended", job.path)
-            if load is not None:
-                self.fail(load, "load_timeout", f"{job.path}: loading took longer than allowed", None, now_s)
-            for other in unfinished:
-                self.hungry.pop(other.number, None)
-                waiting = self._jobs.pop(other.number, None)
-                if waiting is not None:
-                    self.books.requeue(waiting)
 
-    def fail(
-        self, load: Load, code: str, message: str, stamp: tuple[int, int, int] | None, now_s: float
-    ) -> None:
+    def _replace(self, worker: Worker, code: str, now_s: float) -> str:
+        """Forget a worker; with a code the job it worked on fails, the others are queued again.
+
+        Returns how it ended, for people.
+        """
+        unfinished, how = self.pool.remove(worker)
+        for position, job in enumerate(unfinished):
+            self._room.hungry.pop(job.number, None)
+            load = self._jobs.pop(job.number, None)
+            if position == 0 and code:
+                why = (
+                    f"the loader died of it ({how})"
+                    if code == "load_failed"
+                    else "loading took longer than allowed"
+                )
+                _log.error("a loader was replaced: %s: %s", job.path, why)
+                if load is not None:
+                    self._fail(load, code, f"{job.path}: {why}", None, now_s)
+            elif load is not None:
+                self.loads.requeue(load)
+        return how
+
+    def _fail(self, load: Load, code: str, message: str, stamp: SourceStamp | None, now_s: float) -> None:
         """The load ended without a segment; the back-off doubles when it failed the same way before."""
-        if load.adopted is not None:
-            self._checked(load, message, now_s)
+        if load.adopted is not None or load.unless is not None:
+            self._on_checked(load, message if load.unless is None else "", now_s)
             return
-        old = self.books.slot(load.key).failure
         if code in SPACE_CODES:
-            delay_s = BUDGET_RETRY_S
             self._statistics.add("refused_over_budget")
         else:
-            delay_s = min(2 * old.delay_s, LAST_RETRY_S) if old and old.code == code else FIRST_RETRY_S
             self._statistics.add("loads_failed")
             _log.warning("cannot load %s: %s: %s", load.key.cell_id, code, message)
-        if self._shelf.job(load, 0) is None:
-            self.abandon(load)
+        if self._cache.index_of(load.key.cell_id) is None:  # it left the map: nothing is remembered of it
+            self._end(load)
             return
-        failure = Failure(code, message, stamp, now_s + delay_s, delay_s)
-        self.books.failed(load, failure)
-        self._shelf.failed(load.key, failure, now_s)
-        self._on_settled(load.key)
+        failure = self.loads.failure(load.key, code, message, stamp, now_s)
+        self._cache.tell(self._cache.events.failed, load.key, failure, now_s)
+        self._end(load, failure)
 
-    def abandon(self, load: Load) -> None:
-        """The cell left the map: nobody asks for this any more, so nothing is remembered of it."""
-        self.books.failed(load, None)
-        self._on_settled(load.key)
-
-
-def _stamp_of(path: str) -> SourceStamp | None:
-    """What a file is now; None where it cannot be looked at."""
-    try:
-        return SourceStamp.of(os.stat(path))
-    except OSError:
-        return None
+    def _end(self, load: Load, failure: Failure | None = None) -> None:
+        """A load ended; whoever waits for it is told."""
+        self.loads.finish(load, failure)
+        self.on_settled(load.key)

@@ -176,7 +176,7 @@ class _Worker:
         try:
             if SourceStamp.of(os.stat(job.path)) != job.stamp:
                 wrong = "its source has changed"
-            else:
+            elif job.segment:
                 fd = self._directory.open(job.segment)
                 try:
                     step("worker.check")

@@ -12,6 +12,8 @@ from typing import Final, TypeAlias
 
 import msgspec
 
+from shmmap.segment.layout import SourceStamp
+
 __all__ = [
     "Check",
     "Checked",
@@ -50,12 +52,12 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
-    """Compare a segment of an earlier life with its checksums, and its source with ``stamp``."""
+    """Compare a file with ``stamp``, and a segment of an earlier life, if named, with its checksums."""
 
     number: int
     path: str
     segment: str
-    stamp: tuple[int, int, int]
+    stamp: SourceStamp
 
 
 class Grant(msgspec.Struct, array_like=True, tag="grant"):
@@ -99,15 +101,15 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     dropped: int
     z_min: float
     z_max: float
-    stamp: tuple[int, int, int]
+    stamp: SourceStamp
     load_ns: int
     warnings: tuple[str, ...] = ()
-    neighbours: tuple[tuple[int, int, int], ...] = ()
+    neighbours: tuple[SourceStamp, ...] = ()
     cached: bool = False
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
-    """A segment is what it should be, or ``wrong`` says why not; the worker has closed it again."""
+    """File and segment are what they should be, or ``wrong`` says why not; the worker has closed both."""
 
     number: int
     wrong: str = ""
@@ -119,22 +121,12 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
     number: int
     code: str
     message: str
-    stamp: tuple[int, int, int] | None = None
+    stamp: SourceStamp | None = None
 
 
 ToWorker: TypeAlias = Job | Check | Grant | Refuse
 FromWorker: TypeAlias = Ready | Need | Segment | Done | Checked | Failed
 
 encode: Final = msgspec.msgpack.Encoder().encode
-_to_worker: Final[msgspec.msgpack.Decoder[ToWorker]] = msgspec.msgpack.Decoder(ToWorker)
-_from_worker: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
-
-
-def decode_to_worker(data: bytes) -> ToWorker:
-    """Return the message for the worker."""
-    return _to_worker.decode(data)
-
-
-def decode_from_worker(data: bytes) -> FromWorker:
-    """Return the worker's message."""
-    return _from_worker.decode(data)
+decode_to_worker: Final = msgspec.msgpack.Decoder[ToWorker](ToWorker).decode
+decode_from_worker: Final = msgspec.msgpack.Decoder[FromWorker](FromWorker).decode

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.loading.scheduler import SPACE_CODES
-from shmmap.daemon.requests.pending_request import Wanted
+from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.codec import encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Answer", "CellAnswers"]
+__all__ = ["Answer", "CellReplies"]
 
 PROMISED: Final = 1e9
 """Priority of a load that only a "pending" speaks of: behind the distances of all that is asked for."""
@@ -33,8 +33,8 @@ class Answer:
     blockers: tuple[Holder, ...] | None = None
 
 
-class CellAnswers:
-    """Answers with what the store has.
+class CellReplies:
+    """Answers with what the cache has.
 
     Parameters
     ----------
@@ -44,30 +44,30 @@ class CellAnswers:
 
     def __init__(
         self,
-        store: Store,
+        cache: CellCache,
         statistics: StatisticsWriter,
         *,
         epoch: int,
         send: Callable[[Session, bytes], None],
     ) -> None:
-        self._store = store
+        self._cache = cache
         self._statistics = statistics
         self._epoch = epoch
         self._send = send
 
-    def answer(self, wanted: Wanted, now_s: float) -> None:
+    def answer(self, wanted: PendingRequest, now_s: float) -> None:
         """Send what there is by now of everything that is wanted."""
-        warm = self._store.warm.layers
+        warm = self._cache.warm.layers
         answer = Answer()
         if wanted.area is not None and wanted.area.z is not None:
-            inside = set(self._store.at_height([index for index, _ in wanted.cells], wanted.area.z))
+            inside = set(self._cache.at_height([index for index, _ in wanted.cells], wanted.area.z))
             wanted.cells = [cell for cell in wanted.cells if cell[0] in inside]
         for cell_id, layer in wanted.unknown:
             answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
         for index, layer in wanted.cells:
             resident = warm[layer].get(index) if layer in warm else None
             if resident is None:  # evicted since the request came, perhaps, and still whole
-                resident = self._store.find_warm(index, layer, now_s)
+                resident = self._cache.find_warm(index, layer, now_s)
             if resident is not None and not wanted.refused:
                 answer.handles.append(resident.handle)
                 answer.residents.append(resident)
@@ -86,11 +86,11 @@ class CellAnswers:
         removed: tuple[str, ...],
         removed_packed: bytes,
     ) -> None:
-        """Send a reply; the books follow in `hand_out`, when it is on its way."""
+        """Send a reply; the ledger follow in `hand_out`, when it is on its way."""
         reply = encode_cells(
             request,
             self._epoch,
-            self._store.catalogue.map_version,
+            self._cache.catalogue.map_version,
             answer.handles,
             removed,
             removed_packed,
@@ -105,18 +105,20 @@ class CellAnswers:
             resident.last_use_s = now_s
             resident.hits += 1
         session.hold(answer.residents)
-        self._store.used.update(answer.residents)
+        self._cache.used.update(answer.residents)
         self._statistics.add("handles_sent", len(answer.handles))
 
-    def _answer_cold(self, wanted: Wanted, index: int, layer: str, answer: Answer, now_s: float) -> None:
+    def _answer_cold(
+        self, wanted: PendingRequest, index: int, layer: str, answer: Answer, now_s: float
+    ) -> None:
         """Answer for one cell that is not simply warm."""
-        store = self._store
-        key = Key(store.catalogue.id(index), layer)
-        wire_id = store.wire_id(key.cell_id)
-        slot = store.books.slot(key)
+        cache = self._cache
+        key = Key(cache.catalogue.id(index), layer)
+        wire_id = cache.wire_id(key.cell_id)
+        slot = cache.ledger.slot(key)
         refusal = wanted.refused.get(key)
         resident = slot.resident if slot.resident is None or slot.resident.checked else None
-        current = resident is not None and resident.version == store.layers.version(index, layer)
+        current = resident is not None and resident.version == cache.layers.version(index, layer)
         if resident is not None and refusal is None and (current or key.cell_id not in wanted.held_old):
             answer.handles.append(resident.handle if current else resident.stale_handle)
             answer.residents.append(resident)
@@ -127,11 +129,11 @@ class CellAnswers:
             holders: tuple[Holder, ...] = ()
             if slot.failure.code in SPACE_CODES:
                 if answer.blockers is None:
-                    answer.blockers = store.reclaimer.holders_of(store.reclaimer.everything())
+                    answer.blockers = cache.reclaimer.holders_of(cache.ledger.everything())
                 holders = answer.blockers
             answer.failed.append(FailedCell(wire_id, layer, slot.failure.code, slot.failure.message, holders))
         elif not current:
             if slot.load is None:  # evicted, or no longer out of room: "pending" promises a load
-                store.want(index, layer, PROMISED, now_s, wanted.session.asker)
+                cache.want(index, layer, PROMISED, now_s, wanted.session.asker)
             answer.pending.append(PendingCell(wire_id, layer))
-        store.books.forget_if_empty(key)
+        cache.ledger.forget_if_empty(key)

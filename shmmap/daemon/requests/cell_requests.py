@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests for cells: area, differential and selected.
 
-A request first becomes a `Wanted`: which cells in which order, minus what the client holds.  If all
+A request first becomes a `PendingRequest`: which cells in which order, minus what the client holds.  If all
 of it is warm the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the
 answer (`cell_answers`) leaves when the last one settled or the client's patience ends, whichever is
 first.
@@ -14,13 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.loading.scheduler import SPACE_CODES
-from shmmap.daemon.requests.cell_replies import Answer, CellAnswers
+from shmmap.daemon.requests.cell_replies import Answer, CellReplies
 from shmmap.daemon.requests.differential import difference, warm_difference
 from shmmap.daemon.requests.limits import admitted_layers, check_count, check_held, check_queue
-from shmmap.daemon.requests.pending_request import Wanted
+from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.requests.quota import SessionQuota
 from shmmap.daemon.requests.waiting_list import WaitingList
 from shmmap.daemon.transport.sessions import Session
@@ -34,7 +34,7 @@ MAX_WAIT_S: Final = 3600.0
 
 
 class CellRequests:
-    """Answers requests for cells from the store.
+    """Answers requests for cells from the cache.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class CellRequests:
 
     def __init__(
         self,
-        store: Store,
+        cache: CellCache,
         statistics: StatisticsWriter,
         *,
         epoch: int,
@@ -56,13 +56,13 @@ class CellRequests:
         send: Callable[[Session, bytes], None],
         clock: Callable[[], float],
     ) -> None:
-        self._store = store
+        self._cache = cache
         self._statistics = statistics
         self._now_s = clock
-        self._quota = SessionQuota(quota_bytes, store, statistics, clock)
-        self._answers = CellAnswers(store, statistics, epoch=epoch, send=send)
-        self._waiting: dict[Key, list[Wanted]] = {}
-        self._patient: WaitingList[Wanted] = WaitingList()
+        self._quota = SessionQuota(quota_bytes, cache, statistics, clock)
+        self._answers = CellReplies(cache, statistics, epoch=epoch, send=send)
+        self._waiting: dict[Key, list[PendingRequest]] = {}
+        self._patient: WaitingList[PendingRequest] = WaitingList()
 
     def __len__(self) -> int:
         return len(self._patient)
@@ -74,26 +74,26 @@ class CellRequests:
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         session.asked_about(area)
-        layers = admitted_layers(self._store, message.layers)
-        indices = self._store.at_height(self._store.catalogue.query(area).tolist(), area.z)
+        layers = admitted_layers(self._cache, message.layers)
+        indices = self._cache.at_height(self._cache.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
-        self._begin(Wanted(session, message.request, cells, area=area), message.wait, now_s)
+        self._begin(PendingRequest(session, message.request, cells, area=area), message.wait, now_s)
 
     def selected(self, session: Session, message: messages.Selected, now_s: float) -> None:
         """Cells by id, in the order asked for."""
         _check_wait(message.wait)
-        layers = admitted_layers(self._store, message.layers)
+        layers = admitted_layers(self._cache, message.layers)
         check_count(len(message.ids) * len(layers))
         cells: list[tuple[int, str]] = []
         unknown: list[tuple[str, str]] = []
         for cell_id in message.ids:
-            index = self._store.index_of(cell_id)
+            index = self._cache.index_of(cell_id)
             for layer in layers:
                 if index is None:
                     unknown.append((cell_id, layer))
                 else:
                     cells.append((index, layer))
-        self._begin(Wanted(session, message.request, cells, unknown=unknown), message.wait, now_s)
+        self._begin(PendingRequest(session, message.request, cells, unknown=unknown), message.wait, now_s)
 
     def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
         """Cells that touch an area, minus those the client holds."""
@@ -101,20 +101,20 @@ class CellRequests:
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         session.asked_about(area)
-        layers = admitted_layers(self._store, message.layers)
-        found = self._store.catalogue.query(area)
+        layers = admitted_layers(self._cache, message.layers)
+        found = self._cache.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._quota.is_out_of_reach(session):
-            warm = warm_difference(self._store, message, found, layers[0])
+            warm = warm_difference(self._cache, message, found, layers[0])
             if warm is not None:
                 answer = Answer([resident.handle for resident in warm.residents], warm.residents)
                 self._answers.reply(session, message.request, answer, warm.removed, warm.removed_packed)
-                # the books can wait until the answer is out
+                # the ledger can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
                 self._account(session, warm.held)
                 self._answers.hand_out(session, answer, now_s)
                 return
-        lacks = difference(self._store, message, self._store.at_height(found.tolist(), area.z), layers)
-        wanted = Wanted(
+        lacks = difference(self._cache, message, self._cache.at_height(found.tolist(), area.z), layers)
+        wanted = PendingRequest(
             session,
             message.request,
             lacks.cells,
@@ -134,15 +134,15 @@ class CellRequests:
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these: what was refused for want of memory may fit now."""
-        self._store.reclaimer.let_go(residents, self._now_s())
-        self._store.books.clear_failures(SPACE_CODES)
+        self._cache.reclaimer.let_go(residents, self._now_s())
+        self._cache.ledger.clear_failures(SPACE_CODES)
 
     # --- loading and waiting --------------------------------------------------------------------
 
-    def _begin(self, wanted: Wanted, wait_s: float | None, now_s: float) -> None:
+    def _begin(self, wanted: PendingRequest, wait_s: float | None, now_s: float) -> None:
         check_count(len(wanted.cells))
-        warm = self._store.warm.layers
-        find = self._store.find_warm
+        warm = self._cache.warm.layers
+        find = self._cache.find_warm
         cold = [
             (index, layer)
             for index, layer in wanted.cells
@@ -151,7 +151,7 @@ class CellRequests:
         self._statistics.add("hits", len(wanted.cells) - len(cold))
         self._quota.check(wanted, cold)
         if cold:
-            check_queue(self._store, wanted.session, cold)
+            check_queue(self._cache, wanted.session, cold)
             self._statistics.add("misses", len(cold))
             self._load(wanted, cold, now_s)
             if wait_s and wanted.outstanding and self._patient.has_room(wanted.session):
@@ -160,28 +160,28 @@ class CellRequests:
                 return
         self._answers.answer(wanted, now_s)
 
-    def _load(self, wanted: Wanted, cold: list[tuple[int, str]], now_s: float) -> None:
-        store = self._store
-        boxes = store.catalogue.boxes[np.array([index for index, _ in cold], dtype=np.intp)]
+    def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], now_s: float) -> None:
+        cache = self._cache
+        boxes = cache.catalogue.boxes[np.array([index for index, _ in cold], dtype=np.intp)]
         for (index, layer), distance in zip(cold, wanted.distances_m(boxes).tolist(), strict=True):
-            key = Key(store.catalogue.id(index), layer)
+            key = Key(cache.catalogue.id(index), layer)
             if key in wanted.refused:
                 continue
-            if store.want(index, layer, distance, now_s, wanted.session.asker).load is not None:
+            if cache.want(index, layer, distance, now_s, wanted.session.asker).load is not None:
                 wanted.outstanding.add(key)
 
-    def _wait(self, wanted: Wanted) -> None:
-        catalogue = self._store.catalogue
+    def _wait(self, wanted: PendingRequest) -> None:
+        catalogue = self._cache.catalogue
         wanted.keys = tuple({Key(catalogue.id(index), layer) for index, layer in wanted.cells})
         for key in wanted.keys:
-            self._store.books.slot(key).waiting += 1
+            self._cache.ledger.slot(key).waiting += 1
         for key in wanted.outstanding:
             self._waiting.setdefault(key, []).append(wanted)
         self._patient.add(wanted)
 
-    def _stop_waiting(self, wanted: Wanted) -> None:
+    def _stop_waiting(self, wanted: PendingRequest) -> None:
         for key in wanted.keys:
-            self._store.books.unwait(key)
+            self._cache.ledger.unwait(key)
         for key in wanted.outstanding:
             waiters = self._waiting.get(key)
             if waiters is not None:
@@ -198,19 +198,19 @@ class CellRequests:
                 self._stop_waiting(wanted)
                 self._answers.answer(wanted, self._now_s())
 
-    def _goes_on_waiting(self, wanted: Wanted) -> bool:
+    def _goes_on_waiting(self, wanted: PendingRequest) -> bool:
         """Whether a cell that had settled is cold again, or may fit now, and there is time to load it."""
         now_s = self._now_s()
         if now_s >= wanted.deadline_s:
             return False
         for index, layer in wanted.cells:
-            key = Key(self._store.catalogue.id(index), layer)
-            if key in wanted.refused or self._store.find_warm(index, layer, now_s) is not None:
+            key = Key(self._cache.catalogue.id(index), layer)
+            if key in wanted.refused or self._cache.find_warm(index, layer, now_s) is not None:
                 continue
             if (
                 key not in wanted.outstanding  # it may be asked for twice
-                and self._store.books.slot(key).failure is None
-                and self._store.want(index, layer, 0.0, now_s, wanted.session.asker).load
+                and self._cache.ledger.slot(key).failure is None
+                and self._cache.want(index, layer, 0.0, now_s, wanted.session.asker).load
             ):
                 wanted.outstanding.add(key)
                 self._waiting.setdefault(key, []).append(wanted)

@@ -15,8 +15,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Resident
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
@@ -35,13 +35,13 @@ class WarmDifference:
 
 
 def warm_difference(
-    store: Store, message: Differential, found: NDArray[np.intp], layer: str
+    cache: CellCache, message: Differential, found: NDArray[np.intp], layer: str
 ) -> WarmDifference | None:
     """Return the difference if it takes versions only and every cell of the area is warm, else None.
 
     ``found`` are the catalogue indices of the area's cells, ascending.
     """
-    known = store.warm.versions.get(layer)
+    known = cache.warm.versions.get(layer)
     if known is None:
         return None
     versions = known[found].tolist()
@@ -55,7 +55,7 @@ def warm_difference(
         held.update(cast("list[int]", given))
     if 0 in current:
         return None  # 0 stands for "not in memory"
-    warm, index_of = store.warm.layers[layer], store.index_of_version
+    warm, index_of = cache.warm.layers[layer], cache.index_of_version
     missing = [index_of[version] for version in current - held]
     missing.sort()
     removed: tuple[str, ...] = ()
@@ -66,20 +66,20 @@ def warm_difference(
         replaced = [v for v in gone if (i := index_of.get(v)) in warm and warm[i].version in current]
         gone.difference_update(replaced)
         if named:
-            removed = _removed_names(store, named, gone, current, layer)
+            removed = _removed_names(cache, named, gone, current, layer)
         if message.packed:
             removed_packed = pack_versions(gone if not named else gone.intersection(packed))
     return WarmDifference([warm[index] for index in missing], removed, removed_packed, held)
 
 
 def _removed_names(
-    store: Store, named: Sequence[HeldCell], gone: set[int], current: set[int], layer: str
+    cache: CellCache, named: Sequence[HeldCell], gone: set[int], current: set[int], layer: str
 ) -> tuple[str, ...]:
     """Held ids to drop, in the order given; one whose cell is in the area at another version stays."""
     removed: dict[str, None] = {}
     for cell_id in [cell.id for cell in named if cell.version in gone]:
-        index = store.index_of(cell_id)
-        resident = store.warm.get(index, layer) if index is not None else None
+        index = cache.index_of(cell_id)
+        resident = cache.warm.get(index, layer) if index is not None else None
         if resident is None or resident.version not in current:
             removed[cell_id] = None
     return tuple(removed)
@@ -109,17 +109,17 @@ class Difference:
 
 
 def difference(
-    store: Store, message: Differential, indices: Sequence[int], layers: tuple[str, ...]
+    cache: CellCache, message: Differential, indices: Sequence[int], layers: tuple[str, ...]
 ) -> Difference:
     """Return what the client lacks of the area's cells ``indices``, whether in memory or not."""
-    version_of, id_of = store.layers.version, store.catalogue.id
+    version_of, id_of = cache.layers.version, cache.catalogue.id
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
     result = Difference(held=set(packed))
     has: dict[int, set[str]] = {}
     removed: dict[str, None] = {}
     for cell in message.held:
-        index = store.index_of(cell.id)
+        index = cache.index_of(cell.id)
         if cell.version is not None:
             result.held.add(cell.version)
         if index is None or index not in inside:
@@ -141,7 +141,7 @@ def difference(
                 result.cells.append((index, layer))
     gone = packed - current
     for version in [*gone]:
-        known = store.index_of_version.get(version)
+        known = cache.index_of_version.get(version)
         if known in inside and known is not None:
             gone.discard(version)
             result.old.add(id_of(known))

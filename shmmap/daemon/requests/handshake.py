@@ -17,12 +17,12 @@ from shmmap.protocol import events
 from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Reception"]
+__all__ = ["Handshake"]
 
 _SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 
 
-class Reception:
+class Handshake:
     """Opens and ends sessions.
 
     Parameters

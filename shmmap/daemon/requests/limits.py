@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much one request may ask for: the loop serves one at a time, so none may take it long."""
+"""How much one request may ask for, and one session keep: nobody may take the loop or the memory for long."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Final
 
 import msgspec
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layers
@@ -66,7 +66,7 @@ def check_held(message: messages.Differential) -> None:
         raise BadRequest(f"{len(layers)} layers held; {MOST_LAYERS_HELD} is the most one request may name")
 
 
-def check_queue(store: Store, session: Session, cold: Sequence[tuple[int, str]]) -> None:
+def check_queue(cache: CellCache, session: Session, cold: Sequence[tuple[int, str]]) -> None:
     """Refuse to queue more loads for a process that waits for very many; ``cold`` is what they are of.
 
     Raises
@@ -74,16 +74,16 @@ def check_queue(store: Store, session: Session, cold: Sequence[tuple[int, str]])
     Busy
         It waits for `MOST_QUEUED` loads, and these are others.
     """
-    if store.books.queued_of(session.asker) < MOST_QUEUED:
+    if cache.ledger.queued_of(session.asker) < MOST_QUEUED:
         return
-    slots, id_of = store.books.slots, store.catalogue.id
+    slots, id_of = cache.ledger.slots, cache.catalogue.id
     for index, layer in cold:
         slot = slots.get(Key(id_of(index), layer))
         if slot is None or slot.load is None:
             raise Busy(f"{MOST_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
-def admitted_layers(store: Store, specs: Sequence[str]) -> tuple[str, ...]:
+def admitted_layers(cache: CellCache, specs: Sequence[str]) -> tuple[str, ...]:
     """Return the layers a request names, in canonical form.
 
     Raises
@@ -94,11 +94,11 @@ def admitted_layers(store: Store, specs: Sequence[str]) -> tuple[str, ...]:
     if len(specs) > MOST_LAYERS:
         raise BadRequest(f"{len(specs)} layers in one request; {MOST_LAYERS} is the most")
     layers = canonical_layers(specs)
-    new = [layer for layer in layers if layer not in store.warm.layers]
-    most = max(LEAST_LAYERS_IN_MEMORY, LAYER_TABLES_BYTES // (8 * max(1, len(store.catalogue))))
-    if new and len(store.warm.layers) >= most:
+    new = [layer for layer in layers if layer not in cache.warm.layers]
+    most = max(LEAST_LAYERS_IN_MEMORY, LAYER_TABLES_BYTES // (8 * max(1, len(cache.catalogue))))
+    if new and len(cache.warm.layers) >= most:
         raise BadRequest(
-            f"{len(store.warm.layers)} different layers are in memory already, {most} is the most",
+            f"{len(cache.warm.layers)} different layers are in memory already, {most} is the most",
             hint="agree on parameters, or `shmmap evict` what nobody needs",
         )
     return layers

@@ -1,22 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one request for cells asks for."""
+"""Requests for cells that are not answered yet: what each asks for, and whose patience ends next."""
 
 from __future__ import annotations
 
+import heapq
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session
 from shmmap.geometry import Area, distance_to_boxes
 
-__all__ = ["Wanted"]
+__all__ = ["MOST_OF_A_SESSION", "PendingRequest", "WaitingList"]
+
+MOST_OF_A_SESSION: Final = 64
+"""Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
 
 
 @dataclass(eq=False, slots=True)
-class Wanted:
+class PendingRequest:
     """What one request asks for, and what of it is still outstanding.
 
     Attributes
@@ -64,3 +71,61 @@ class Wanted:
         if self.area is not None:
             return distance_to_boxes(*self.area.center, boxes)
         return np.zeros(len(boxes))
+
+
+class WaitingList:
+    """Requests that wait for loads, in order of their deadlines.
+
+    Adding and removing one costs the same however many wait.
+    """
+
+    def __init__(self) -> None:
+        self._requests: dict[PendingRequest, None] = {}
+        self._heap: list[tuple[float, int, PendingRequest]] = []
+        self._counts: Counter[Session] = Counter()
+        self._number = 0
+
+    def __len__(self) -> int:
+        return len(self._requests)
+
+    def __iter__(self) -> Iterator[PendingRequest]:
+        return iter(list(self._requests))
+
+    def has_room(self, session: Session) -> bool:
+        """Whether one more request of the session may wait."""
+        return self._counts[session] < MOST_OF_A_SESSION
+
+    def add(self, request: PendingRequest) -> None:
+        """A request waits until its ``deadline_s``, which does not change any more."""
+        self._number += 1
+        self._requests[request] = None
+        self._counts[request.session] += 1
+        heapq.heappush(self._heap, (request.deadline_s, self._number, request))
+
+    def remove(self, request: PendingRequest) -> None:
+        """A request waits no longer."""
+        del self._requests[request]
+        self._counts[request.session] -= 1
+        if not self._counts[request.session]:
+            del self._counts[request.session]
+        if len(self._heap) > 2 * len(self._requests) + 64:
+            self._heap = [entry for entry in self._heap if entry[2] in self._requests]
+            heapq.heapify(self._heap)
+
+    def next_deadline_s(self) -> float:
+        """When the next one's patience ends; infinity when none waits."""
+        while self._heap and self._heap[0][2] not in self._requests:
+            heapq.heappop(self._heap)
+        return self._heap[0][0] if self._heap else float("inf")
+
+    def overdue(self, now_s: float) -> list[PendingRequest]:
+        """Those whose patience has ended."""
+        if self.next_deadline_s() > now_s:
+            return []
+        return [request for request in self._requests if request.deadline_s <= now_s]
+
+    def of(self, session: Session) -> list[PendingRequest]:
+        """Those of one session."""
+        if session not in self._counts:
+            return []
+        return [request for request in self._requests if request.session is session]

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Key
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
-from shmmap.daemon.requests.pending_request import Wanted
+from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -29,25 +29,25 @@ class SessionQuota:
     """
 
     def __init__(
-        self, nbytes: int, store: Store, statistics: StatisticsWriter, clock: Callable[[], float]
+        self, nbytes: int, cache: CellCache, statistics: StatisticsWriter, clock: Callable[[], float]
     ) -> None:
         self._nbytes = nbytes
-        self._store = store
+        self._cache = cache
         self._statistics = statistics
         self._now_s = clock
 
     def is_out_of_reach(self, session: Session) -> bool:
         """Whether the session could have everything that is in memory."""
-        return session.held_bytes + self._store.books.resident_bytes <= self._nbytes
+        return session.held_bytes + self._cache.ledger.resident_bytes <= self._nbytes
 
-    def check(self, wanted: Wanted, cold: Sequence[tuple[int, str]]) -> None:
+    def check(self, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> None:
         """Note in ``wanted.refused`` what is too much, farthest cells first; ``cold`` is not in memory."""
-        session, store, warm = wanted.session, self._store, self._store.warm.layers
+        session, cache, warm = wanted.session, self._cache, self._cache.warm.layers
         if self.is_out_of_reach(session) and not cold:
             return
         chilled = set(cold)
         sizes = [
-            store.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes
+            cache.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes
             for index, layer in wanted.cells
         ]
         if session.held_bytes + sum(sizes) <= self._nbytes:
@@ -55,15 +55,15 @@ class SessionQuota:
         self._refresh(session)
         left = self._nbytes - session.exclusive_bytes()
         # a new version takes the place of the old one that its holder is about to drop
-        replaced = {r.key: r.nbytes for r in session.residents() if not store.is_current(r)}
-        boxes = store.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
+        replaced = {r.key: r.nbytes for r in session.residents() if not cache.is_current(r)}
+        boxes = cache.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
         counted: set[tuple[int, str]] = set()
         for position in np.argsort(wanted.distances_m(boxes), kind="stable").tolist():
             index, layer = wanted.cells[position]
             if (index, layer) in counted:
                 continue
             counted.add((index, layer))
-            key = Key(store.catalogue.id(index), layer)
+            key = Key(cache.catalogue.id(index), layer)
             resident = None if (index, layer) in chilled else warm[layer][index]
             if resident is not None and resident.sessions:
                 continue  # somebody keeps it anyway, perhaps this session itself
@@ -74,12 +74,12 @@ class SessionQuota:
                 )
                 wanted.refused[key] = ("over_budget", message)
                 self._statistics.add("refused_quota")
-                store.events.pressure.refused(store.wire_id(key.cell_id), layer, "quota", self._now_s())
+                cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self._now_s())
 
     def _refresh(self, session: Session) -> None:
         """Ask the kernel which segments the session really still uses."""
         before_s = self._now_s() - HAND_OUT_GRACE_S
         for resident in session.residents():
-            slots = self._store.reclaimer.slots_of(resident)
+            slots = self._cache.reclaimer.slots_of(resident)
             if slots is not None and session.slot not in slots and resident.last_use_s < before_s:
                 session.drop_segment(resident)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sized
 from itertools import islice
 from typing import Final
 
-from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.pin_census import PinCensus
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
@@ -47,7 +47,7 @@ class Heartbeat:
 
     def __init__(
         self,
-        store: Store,
+        cache: CellCache,
         statistics: StatisticsWriter,
         event_log: EventLog,
         *,
@@ -55,13 +55,13 @@ class Heartbeat:
         waiting: Sized,
         on_beat: Callable[[], None],
     ) -> None:
-        self._store = store
+        self._cache = cache
         self._statistics = statistics
         self._sessions = sessions
         self._waiting = waiting
         self._on_beat = on_beat
         self._event_log = event_log
-        self._pins = PinCensus(store.reclaimer.everything, store.reclaimer.is_pinned)
+        self._pins = PinCensus(cache.ledger.everything, cache.reclaimer.is_pinned)
         self._recent = RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
         self._looked_s = self._told_s = float("-inf")
         self._last_s = 0.0
@@ -78,21 +78,21 @@ class Heartbeat:
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
-        books, set_value = self._store.books, self._statistics.set
+        ledger, set_value = self._cache.ledger, self._statistics.set
         set_value("sessions", len(self._sessions))
         set_value("waiting_requests", len(self._waiting))
-        set_value("workers", len(self._store.loads.pool))
-        set_value("load_queue", books.queued)
-        set_value("cells_resident", books.resident_count)
-        set_value("stale_cells", books.resident_count - books.unchecked_count - len(self._store.warm))
-        set_value("bytes_resident", books.resident_bytes)
-        set_value("zombies", len(books.zombies))
-        set_value("bytes_zombie", books.zombie_bytes)
-        set_value("bytes_reserved", books.reserved_bytes)
+        set_value("workers", len(self._cache.loads.pool))
+        set_value("load_queue", ledger.queued)
+        set_value("cells_resident", ledger.resident_count)
+        set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(self._cache.warm))
+        set_value("bytes_resident", ledger.resident_bytes)
+        set_value("zombies", len(ledger.zombies))
+        set_value("bytes_zombie", ledger.zombie_bytes)
+        set_value("bytes_reserved", ledger.reserved_bytes)
         set_value("bytes_statistics", self._statistics.size_bytes)
-        set_value("budget_bytes", books.budget_bytes)
-        set_value("evictions", self._store.reclaimer.evicted_count)
-        set_value("map_cells", len(self._store.catalogue))
+        set_value("budget_bytes", ledger.budget_bytes)
+        set_value("evictions", self._cache.reclaimer.evicted_count)
+        set_value("map_cells", len(self._cache.catalogue))
         set_value("events_published", self._event_log.last)
 
     def _look_around(self, now_s: float) -> None:
@@ -108,7 +108,7 @@ class Heartbeat:
                 values[f"{name}_{span}"] = count
         clients = islice(self._sessions, MAX_CLIENTS)
         self._statistics.show_clients([client_row(session) for session in clients])
-        self._store.events.pressure.turn(now_s)
+        self._cache.events.pressure.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
             self._event_log.beat()
@@ -117,7 +117,7 @@ class Heartbeat:
         self.measure()
         if now_s - self._looked_s >= BEAT_S:
             self._look_around(now_s)
-        self._store.books.overhead_bytes = self._statistics.size_bytes
-        self._store.show_used(USED_ROWS_A_BEAT)
+        self._cache.ledger.overhead_bytes = self._statistics.size_bytes
+        self._cache.show_used(USED_ROWS_A_BEAT)
         self._statistics.beat()
         self._on_beat()

@@ -17,7 +17,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
-__all__ = ["MOST_BYTES", "MOST_OF_A_CONNECTION", "MOST_OF_A_PROCESS", "Turns"]
+__all__ = ["MOST_BYTES", "MOST_OF_A_CONNECTION", "MOST_OF_A_PROCESS", "FairQueue"]
 
 Item = TypeVar("Item")
 
@@ -40,7 +40,7 @@ class _Line(Generic[Item]):
     nbytes: int = 0
 
 
-class Turns(Generic[Item]):
+class FairQueue(Generic[Item]):
     """Requests that were heard and wait to be served."""
 
     def __init__(self) -> None:

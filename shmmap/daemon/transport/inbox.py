@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Taking requests off the socket at once, and serving them in fair turns.
 
-Hearing goes on whatever waits to be served, so that a request of a quiet process never stands in a
+Inbox goes on whatever waits to be served, so that a request of a quiet process never stands in a
 socket's queue behind those of a loud one.
 """
 
@@ -13,11 +13,11 @@ from typing import Final
 
 import zmq
 
-from shmmap.daemon.transport.fair_queue import Turns
+from shmmap.daemon.transport.fair_queue import FairQueue
 from shmmap.daemon.transport.sessions import Peer, Sessions
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Heard", "Hearing", "peer_of"]
+__all__ = ["Heard", "Inbox", "peer_of"]
 
 HEARD_AT_ONCE: Final = 16
 
@@ -41,7 +41,7 @@ def peer_of(frame: zmq.Frame) -> Peer:
     return Peer.parse(str(address))
 
 
-class Hearing:
+class Inbox:
     """Requests heard and not yet served.
 
     Parameters
@@ -61,10 +61,10 @@ class Hearing:
         self._sessions = sessions
         self._statistics = statistics
         self._refuse = refuse
-        self._turns: Turns[Heard] = Turns()
+        self._queue: FairQueue[Heard] = FairQueue()
 
     def __len__(self) -> int:
-        return len(self._turns)
+        return len(self._queue)
 
     def hear(self) -> bool:
         """Take what is on the socket, a bounded number at once; False when there is no more."""
@@ -82,7 +82,7 @@ class Hearing:
             self._statistics.add("bytes_received", nbytes)
             process = self._process(identity, frame)
             heard = Heard(identity, frame, process, several)
-            if not self._turns.add(process, identity, heard, nbytes):
+            if not self._queue.add(process, identity, heard, nbytes):
                 self._refuse(heard)
         return True
 
@@ -94,13 +94,13 @@ class Hearing:
 
     def take(self) -> Heard | None:
         """Take the request whose turn it is; tell `served` afterwards."""
-        turn = self._turns.take()
+        turn = self._queue.take()
         return None if turn is None else turn[1]
 
     def served(self, heard: Heard, seconds: float) -> None:
         """A request taken has been served."""
-        self._turns.served(heard.process, seconds)
+        self._queue.served(heard.process, seconds)
 
     def waiting_bytes(self) -> dict[Hashable, int]:
         """Bytes of requests that wait, by process id (by identity where it is not known)."""
-        return self._turns.waiting_bytes()
+        return self._queue.waiting_bytes()

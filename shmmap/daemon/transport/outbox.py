@@ -22,18 +22,18 @@ from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["SEND_QUEUE", "Replies"]
+__all__ = ["SEND_QUEUE", "Outbox"]
 
 _log = logging.getLogger(__name__)
 
 SEND_QUEUE: Final = 256
-"""Replies kept for a client that does not read them; further ones are dropped."""
+"""Outbox kept for a client that does not read them; further ones are dropped."""
 DOUBTFUL_BYTES: Final = 1 << 20
 """When a session was sent this much, the kernel is asked whether it reads."""
 MOST_UNREAD_BYTES: Final = 16 << 20
 
 
-class Replies:
+class Outbox:
     """The daemon's voice on one ROUTER socket.
 
     Attributes

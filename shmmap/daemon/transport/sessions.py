@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.records import Resident
 from shmmap.errors import NoSession
 from shmmap.geometry import Area
 from shmmap.protocol.messages import Holder, Intent

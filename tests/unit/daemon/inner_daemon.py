@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from shmmap.daemon.cache.cell_cache import Store
+from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.eviction_policy import POLICIES
-from shmmap.daemon.cache.ledger import Key, Residency
+from shmmap.daemon.cache.ledger import Key, Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
@@ -47,7 +47,7 @@ def names(reply: Cells) -> list[str]:
 
 
 class InnerDaemon:
-    """Store, sessions and requests over one map; ``offset_s`` moves its clock ahead."""
+    """CellCache, sessions and requests over one map; ``offset_s`` moves its clock ahead."""
 
     def __init__(
         self,
@@ -73,9 +73,9 @@ class InnerDaemon:
         )  # fmt: skip
         self.statistics = StatisticsWriter(self.directory, name, identity)
         self.sessions = Sessions()
-        self.books = Residency(budget_bytes)
-        self.books.overhead_bytes = self.statistics.size_bytes
-        self.reclaimer = Reclaimer(self.books, self.directory, self.sessions, POLICIES["distance"])
+        self.ledger = Ledger(budget_bytes)
+        self.ledger.overhead_bytes = self.statistics.size_bytes
+        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, POLICIES["distance"])
         self._poll = select.epoll()
         self.pool = WorkerPool(
             workers,
@@ -86,8 +86,8 @@ class InnerDaemon:
         )
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
-        self.store = Store(
-            catalogue, self.books, self.reclaimer, self.pool, self.directory, self.statistics,
+        self.cache = CellCache(
+            catalogue, self.ledger, self.reclaimer, self.pool, self.directory, self.statistics,
             instance="inner", epoch=EPOCH, id_prefix=catalogue.id_prefix, mode=0o400, gid=-1,
             on_settled=self._on_settled, event_log=self.event_log,
         )  # fmt: skip
@@ -95,7 +95,7 @@ class InnerDaemon:
         self.stopped_at_s: float | None = None
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
-            self.store,
+            self.cache,
             self.statistics,
             epoch=EPOCH,
             quota_bytes=quota_bytes,
@@ -104,7 +104,7 @@ class InnerDaemon:
         )
         config = DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir)
         self.admin = Admin(
-            config, self.store, self.sessions, self.statistics, epoch=EPOCH, event_log=self.event_log
+            config, self.cache, self.sessions, self.statistics, epoch=EPOCH, event_log=self.event_log
         )
 
     def _on_settled(self, key: Key) -> None:
@@ -129,10 +129,10 @@ class InnerDaemon:
         for fd, _ in self._poll.poll(timeout_s):
             worker = self.pool.by_fd(fd)
             if worker is not None:
-                self.store.loads.on_worker(worker, self.now_s())
+                self.cache.loads.on_worker(worker, self.now_s())
         now_s = self.now_s()
-        self.store.loads.end_overdue(now_s)
-        self.store.loads.pump(now_s)
+        self.cache.loads.end_overdue(now_s)
+        self.cache.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
 
     def run_until(self, done: Callable[[], object]) -> None:
@@ -166,7 +166,7 @@ class InnerDaemon:
 
     def path_of(self, segment: str) -> str:
         """Path of a segment that a reply names."""
-        return f"{self.shm_dir}{self.store.segment_prefix}{segment}"
+        return f"{self.shm_dir}{self.cache.segment_prefix}{segment}"
 
     @contextlib.contextmanager
     def loaders_standing_still(self) -> Iterator[list[int]]:
@@ -187,17 +187,17 @@ class InnerDaemon:
 
     def reload(self) -> Catalogue:
         """Read the map again and serve what it is now."""
-        old = self.store.catalogue
+        old = self.cache.catalogue
         new = self.origin.load(fresh=True)
         self.cells.renumber(lambda index: new.find(old.id(index)), old.id)
-        self.store.replace_catalogue(new, self.now_s())
+        self.cache.replace_catalogue(new, self.now_s())
         return new
 
     def leave(self) -> None:
         """End everything but the segments, as before a restart."""
         for session in list(self.sessions):
             self.sessions.close(session)
-        self.store.close(keep=True)
+        self.cache.close(keep=True)
         self.statistics.close()
         self._poll.close()
         self.directory.close()

@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Key
 from shmmap.daemon.loading.load_queue import BACKGROUND
 from shmmap.errors import OverBudget
 from shmmap.layers.spec import canonical_layers
@@ -28,12 +28,12 @@ LOOKS_AT_ONCE: Final = 64
 class OperatorPins:
     """The pinned cells of one map.
 
-    A pin counts in the books as one more request that waits for the cell: that is what keeps it out
+    A pin counts in the ledger as one more request that waits for the cell: that is what keeps it out
     of the candidates for eviction.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, cache: CellCache) -> None:
+        self._cache = cache
         self._keys: set[Key] = set()
         self._round: deque[Key] = deque()
 
@@ -57,14 +57,14 @@ class OperatorPins:
         """
         wanted, unknown = self._keys_of(message.ids, canonical_layers(message.layers))
         total = sum(map(self._size, self._keys | wanted))
-        budget = self._store.books.budget_bytes
-        if wanted and total + self._store.books.overhead_bytes > budget:
+        budget = self._cache.ledger.budget_bytes
+        if wanted and total + self._cache.ledger.overhead_bytes > budget:
             raise OverBudget(
                 f"with these cells {total} bytes would be pinned; the budget is {budget} bytes",
                 hint="unpin others, or serve with a larger --budget",
             )
         for key in wanted - self._keys:
-            self._store.books.slot(key).waiting += 1
+            self._cache.ledger.slot(key).waiting += 1
             self._keys.add(key)
             self._round.append(key)
         for key in wanted:
@@ -80,7 +80,7 @@ class OperatorPins:
             gone, unknown = self._keys_of(message.ids, None)
         for key in gone & self._keys:
             self._keys.remove(key)
-            self._store.books.unwait(key)
+            self._cache.ledger.unwait(key)
         self._round = deque(key for key in self._round if key in self._keys)
         return self._answer(message.request, self._keys, unknown)
 
@@ -92,44 +92,44 @@ class OperatorPins:
             self._keep(key, now_s)
 
     def _keep(self, key: Key, now_s: float) -> None:
-        store = self._store
-        index = store.index_of(key.cell_id)
-        if index is not None and store.find_warm(index, key.layer, now_s) is None:
-            store.want(index, key.layer, BACKGROUND, now_s)
+        cache = self._cache
+        index = cache.index_of(key.cell_id)
+        if index is not None and cache.find_warm(index, key.layer, now_s) is None:
+            cache.want(index, key.layer, BACKGROUND, now_s)
 
     def _keys_of(self, ids: Iterable[str], layers: tuple[str, ...] | None) -> tuple[set[Key], list[str]]:
         """Keys of cells by id, in these layers (None: in those that are pinned), and ids unknown."""
         keys: set[Key] = set()
         unknown: list[str] = []
         for cell in ids:
-            index = self._store.index_of(cell)
+            index = self._cache.index_of(cell)
             if index is None:
                 unknown.append(cell)
                 continue
-            cell_id = self._store.catalogue.id(index)
+            cell_id = self._cache.catalogue.id(index)
             names = self.layers_of(cell_id) if layers is None else layers
             keys |= {Key(cell_id, layer) for layer in names}
         return keys, unknown
 
     def _size(self, key: Key) -> int:
-        slot = self._store.books.slots.get(key)
+        slot = self._cache.ledger.slots.get(key)
         if slot is not None and slot.resident is not None:
             return slot.resident.nbytes
-        index = self._store.index_of(key.cell_id)
-        return 0 if index is None else self._store.estimate(index, key.layer)
+        index = self._cache.index_of(key.cell_id)
+        return 0 if index is None else self._cache.estimate(index, key.layer)
 
     def _answer(self, request: int, keys: Iterable[Key], unknown: list[str]) -> messages.Pinned:
         rows = [self._row(key) for key in sorted(keys)]
         return messages.Pinned(request, tuple(rows), tuple(unknown))
 
     def _row(self, key: Key) -> PinnedCell:
-        slot = self._store.books.slot(key)
+        slot = self._cache.ledger.slot(key)
         resident = slot.resident
         if resident is not None:
-            state = "resident" if self._store.is_current(resident) else "stale"
+            state = "resident" if self._cache.is_current(resident) else "stale"
         elif slot.load is not None:
             state = "loading"
         else:
             state = slot.failure.code if slot.failure is not None else "absent"
         nbytes = resident.nbytes if resident is not None else 0
-        return PinnedCell(self._store.wire_id(key.cell_id), key.layer, state, nbytes)
+        return PinnedCell(self._cache.wire_id(key.cell_id), key.layer, state, nbytes)

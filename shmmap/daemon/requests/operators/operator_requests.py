@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmmap import __version__
-from shmmap.daemon.cache.cell_cache import Store
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Resident
 from shmmap.daemon.cache.pin_survey import Pinned, Share
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
@@ -34,7 +34,7 @@ class Admin:
     def __init__(
         self,
         config: DaemonConfig,
-        store: Store,
+        cache: CellCache,
         sessions: Sessions,
         statistics: StatisticsWriter,
         *,
@@ -43,20 +43,20 @@ class Admin:
         events_path: str = "",
     ) -> None:
         self._config = config
-        self._store = store
+        self._cache = cache
         self._sessions = sessions
         self._statistics = statistics
         self._epoch = epoch
         self._event_log = event_log
         self._events_path = events_path
-        self.pins = OperatorPins(store)
+        self.pins = OperatorPins(cache)
         self._kinds = tuple(kind.describe() for kind in kinds())
         self._bounds_of: Catalogue | None = None
         self._known_bounds: tuple[float, float, float, float] | None = None
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
         """Tell a new client where everything is."""
-        catalogue = self._store.catalogue
+        catalogue = self._cache.catalogue
         return messages.Welcome(
             request=message.request,
             major=messages.PROTOCOL_VERSION[0],
@@ -69,19 +69,19 @@ class Admin:
             map_path=self._config.map_path,
             frame_id=catalogue.frame_id,
             shm_dir=self._config.shm_dir,
-            id_prefix=self._store.id_prefix,
-            segment_prefix=self._store.segment_prefix,
+            id_prefix=self._cache.id_prefix,
+            segment_prefix=self._cache.segment_prefix,
             cells=len(catalogue),
             bounds=self._bounds(),
             layers=self._kinds,
-            budget_bytes=self._store.books.budget_bytes,
+            budget_bytes=self._cache.ledger.budget_bytes,
             pid=os.getpid(),
             events=self._events_path,
         )
 
     def _bounds(self) -> tuple[float, float, float, float] | None:
         """Box around all cells; looked for once per catalogue, there may be a million of them."""
-        catalogue = self._store.catalogue
+        catalogue = self._cache.catalogue
         if self._bounds_of is not catalogue:
             self._bounds_of, self._known_bounds = catalogue, None
             if len(catalogue):
@@ -107,7 +107,7 @@ class Admin:
         raise BadRequest(f"a {type(message).__name__} cannot be answered here")
 
     def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
-        store, catalogue = self._store, self._store.catalogue
+        cache, catalogue = self._cache, self._cache.catalogue
         indices: Sequence[int]
         indices = (
             range(len(catalogue))
@@ -120,9 +120,9 @@ class Admin:
             change = self._changes_since(message.since)
             known = change is not None
             if change is not None:
-                touched = {i for cell in change[0] if (i := store.index_of(cell)) is not None}
+                touched = {i for cell in change[0] if (i := cache.index_of(cell)) is not None}
                 indices = [i for i in indices if i in touched] if message.area else sorted(touched)
-                removed = tuple(store.wire_id(cell) for cell in change[1]) if message.start == 0 else ()
+                removed = tuple(cache.wire_id(cell) for cell in change[1]) if message.start == 0 else ()
         start = max(0, message.start)
         end = start + max(1, min(message.limit, PAGE_ROWS))
         return messages.MetadataPage(
@@ -136,10 +136,10 @@ class Admin:
         )
 
     def _row(self, index: int) -> messages.MetadataRow:
-        catalogue = self._store.catalogue
-        heights = self._store.heights.get(index, (None, None))
+        catalogue = self._cache.catalogue
+        heights = self._cache.heights.get(index, (None, None))
         return messages.MetadataRow(
-            self._store.wire_id(catalogue.id(index)),
+            self._cache.wire_id(catalogue.id(index)),
             catalogue.version(index),
             *catalogue.box(index),
             catalogue.stamp(index).size,
@@ -148,9 +148,9 @@ class Admin:
 
     def _changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
         """Ids that changed or appeared, and that vanished, since a map version; None: not known."""
-        if map_version == self._store.catalogue.map_version:
+        if map_version == self._cache.catalogue.map_version:
             return set(), []
-        history = list(self._store.history)
+        history = list(self._cache.history)
         starts = [number for number, entry in enumerate(history) if entry[0] == map_version]
         if not starts:
             return None
@@ -170,7 +170,7 @@ class Admin:
         return messages.StatsReply(
             request=message.request,
             epoch=self._epoch,
-            map_version=self._store.catalogue.map_version,
+            map_version=self._cache.catalogue.map_version,
             counters=dict(self._statistics.values),
             sessions=tuple(
                 self._session_row(session, pinned.shares.get(session.slot, Share()), now_s)
@@ -200,30 +200,30 @@ class Admin:
         )
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
-        store = self._store
-        index = store.index_of(message.id)
+        cache = self._cache
+        index = cache.index_of(message.id)
         if index is None:
             return self._show_gone(message)
-        cell_id = store.catalogue.id(index)
-        version = store.catalogue.version(index)
-        slots = {key: slot for key, slot in store.books.slots.items() if key.cell_id == cell_id}
-        zombies = store.books.zombies
+        cell_id = cache.catalogue.id(index)
+        version = cache.catalogue.version(index)
+        slots = {key: slot for key, slot in cache.ledger.slots.items() if key.cell_id == cell_id}
+        zombies = cache.ledger.zombies
         shown = []
-        for resident in store.reclaimer.everything():
+        for resident in cache.ledger.everything():
             if resident.key.cell_id == cell_id:
                 state = (
                     "zombie"
                     if resident.name in zombies
-                    else "resident" if store.is_current(resident) else "stale"
+                    else "resident" if cache.is_current(resident) else "stale"
                 )  # fmt: skip
                 shown.append(self._segment(resident, state))
-        z_min, z_max = store.heights.get(index, (None, None))
+        z_min, z_max = cache.heights.get(index, (None, None))
         return messages.ShownCell(
             message.request,
             cell_id,
             version,
-            *store.catalogue.box(index),
-            store.catalogue.stamp(index).size,
+            *cache.catalogue.box(index),
+            cache.catalogue.stamp(index).size,
             tuple(shown),
             tuple(key.layer for key, slot in slots.items() if slot.load is not None),
             "; ".join(
@@ -236,8 +236,8 @@ class Admin:
 
     def _show_gone(self, message: messages.Show) -> messages.ShownCell:
         """A cell that left the map while somebody maps it: version 0."""
-        everything = self._store.reclaimer.everything()
-        names = (message.id, self._store.id_prefix + message.id)
+        everything = self._cache.ledger.everything()
+        names = (message.id, self._cache.id_prefix + message.id)
         left = [resident for resident in everything if resident.key.cell_id in names and message.id]
         if not left:
             raise UnknownCell(
@@ -254,25 +254,25 @@ class Admin:
             state,
             resident.nbytes,
             resident.points,
-            self._store.reclaimer.holders_of([resident]),
+            self._cache.reclaimer.holders_of([resident]),
         )
 
     def _evict(self, message: messages.Evict, now_s: float) -> messages.Evicted:
-        store = self._store
+        cache = self._cache
         unknown: list[str] = []
         chosen: list[Resident] = []
         if message.ids is None:
-            chosen = list(store.books.residents())
+            chosen = list(cache.ledger.residents())
         else:
             asked: set[str] = set()
             for cell in message.ids:
-                index = store.index_of(cell)
+                index = cache.index_of(cell)
                 if index is None:
                     unknown.append(cell)
                 else:
-                    asked.add(store.catalogue.id(index))
-            chosen = [r for r in store.books.residents() if r.key.cell_id in asked]
+                    asked.add(cache.catalogue.id(index))
+            chosen = [r for r in cache.ledger.residents() if r.key.cell_id in asked]
         loose = [resident for resident in chosen if resident.key not in self.pins]
-        freed = sum(store.evict(resident, now_s) for resident in loose)
+        freed = sum(cache.evict(resident, now_s) for resident in loose)
         kept = len(chosen) - len(loose)
         return messages.Evicted(message.request, freed, len(loose) - freed, tuple(unknown), kept)

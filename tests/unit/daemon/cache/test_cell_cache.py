@@ -13,7 +13,7 @@ import sys
 import pytest
 
 from shmmap.daemon.cache import ledger
-from shmmap.daemon.cache.ledger import Key
+from shmmap.daemon.records import Key
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.worker_pool import Worker
 from shmmap.layers.versions import MAX_NEIGHBOURS
@@ -76,20 +76,20 @@ def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
 def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last ones of each kind; of those forgotten nothing stays."""
     monkeypatch.setattr(ledger, "MOST_FAILURES", 3)
-    books = ledger.Residency(1 << 20)
+    ledger = ledger.Ledger(1 << 20)
 
     def fail(number: int, code: str) -> Key:
         key = Key(f"/{number}.pcd", "points")
-        load = books.want(key, 0, 1.0)
-        books.start(load, 0.0)
-        books.failed(load, ledger.Failure(code, "", None, 0.0, 0.0))
+        load = ledger.want(key, 0, 1.0)
+        ledger.start(load, 0.0)
+        ledger.failed(load, ledger.Failure(code, "", None, 0.0, 0.0))
         return key
 
     broken = [fail(number, "load_failed") for number in (0, 1, 2, 0, 3, 4)]
     full = [fail(number, "no_space") for number in (5, 6)]
-    assert set(books.slots) == {broken[0], broken[4], broken[5], *full}
-    books.clear_failures(frozenset({"no_space"}))
-    assert set(books.slots) == {broken[0], broken[4], broken[5]}
+    assert set(ledger.slots) == {broken[0], broken[4], broken[5], *full}
+    ledger.clear_failures(frozenset({"no_space"}))
+    assert set(ledger.slots) == {broken[0], broken[4], broken[5]}
 
 
 class Puppet:
@@ -146,7 +146,7 @@ def test_a_loader_that_sends_nonsense_is_ended(puppet: Puppet, nonsense: bytes) 
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert first.path in reply.failed[0].message
     assert len(reply.cells) == 3
-    assert one.books.reserved_bytes == 0
+    assert one.ledger.reserved_bytes == 0
     puppet.channel.close()
 
 
@@ -164,7 +164,7 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     reply = one.cells_of(1)
     (failure,) = reply.failed
     assert second.path in failure.message, "the second is what it died of"
-    assert one.store.wire_id(first.cell_id) in [cell.id for cell in reply.cells]
+    assert one.cache.wire_id(first.cell_id) in [cell.id for cell in reply.cells]
     assert len(reply.cells) == 3
 
 
@@ -256,8 +256,8 @@ def test_done_without_a_segment(puppet: Puppet) -> None:
     (job,) = puppet.queue(1)
     puppet.say(puppet.done(job))
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_failed"]
-    assert one.books.reserved_bytes == 0
-    assert one.books.slots[Key(job.cell_id, "points")].load is None
+    assert one.ledger.reserved_bytes == 0
+    assert one.ledger.slots[Key(job.cell_id, "points")].load is None
     puppet.channel.close()
 
 
@@ -279,7 +279,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
         next(d for d in iter(lambda: puppet.channel.recv(65536), b"") if b"grant" in d)
     )
     assert granted == worker_messages.Grant(queue[0].number)
-    assert (one.books.reserved_bytes, one.store.loads.hungry) == (0, {})
+    assert (one.ledger.reserved_bytes, one.cache.loads.hungry) == (0, {})
     puppet.channel.close()
 
 
@@ -288,7 +288,7 @@ def test_more_needed_than_there_will_ever_be(puppet: Puppet) -> None:
     one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
     (job,) = puppet.queue(1)
     assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == job
-    puppet.say(worker_messages.Need(job.number, one.books.budget_bytes))
+    puppet.say(worker_messages.Need(job.number, one.ledger.budget_bytes))
     one.run_until(lambda: wait_readable([puppet.channel.fileno()], 0.0))
     assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == worker_messages.Refuse(job.number)
     puppet.say(worker_messages.Failed(job.number, "over_budget", "it does not fit"))
@@ -301,8 +301,8 @@ def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     one.cells.area(one.session(), Area(1, EVERYWHERE, wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 16
-    for resident in list(one.books.residents()):
-        one.store.evict(resident, one.now_s())
+    for resident in list(one.ledger.residents()):
+        one.cache.evict(resident, one.now_s())
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     lowest = os.dup(0)
     os.close(lowest)
@@ -310,8 +310,8 @@ def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     try:
         one.offset_s += 5.0
         one.turn()
-        assert len(one.books.zombies) == 16, "freed without a look"
+        assert len(one.ledger.zombies) == 16, "freed without a look"
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     one.offset_s += 5.0
-    one.run_until(lambda: not one.books.zombies)
+    one.run_until(lambda: not one.ledger.zombies)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction_policy import POLICIES, by_distance, by_last_use
-from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.records import Key, Resident
 
 coordinates = st.floats(-1e5, 1e5)
 

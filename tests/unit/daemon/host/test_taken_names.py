@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from shmmap.daemon.cache.ledger import Resident
+from shmmap.daemon.records import Resident
 from shmmap.protocol.messages import Selected
 from shmmap.segment.names import zombie_name
 from shmmap.statistics.reader import read_statistics
@@ -24,7 +24,7 @@ Inner = Callable[..., InnerDaemon]
 def load(one: InnerDaemon, request: int) -> Resident:
     one.cells.selected(one.session(), Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
     assert len(one.cells_of(request).cells) == 1
-    return one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    return one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
 
 
 @contextmanager
@@ -46,16 +46,16 @@ def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> N
     first = load(one, 1)
     old = first.name
     with taken(one, zombie_name(old)), open(f"{one.shm_dir}{old}", "rb"):
-        one.store.evict(first, one.now_s())
+        one.cache.evict(first, one.now_s())
         assert first.name != old
         assert Path(f"{one.shm_dir}{zombie_name(first.name)}").exists()
         assert shown(one) == {first.name.rpartition(".")[2]: "zombie"}
         assert load(one, 2) is first
         assert shown(one) == {first.name.rpartition(".")[2]: "resident"}
         assert Path(f"{one.shm_dir}{first.name}").exists()
-    one.store.evict(first, one.now_s())
-    one.run_until(lambda: not one.books.zombies)
-    assert (one.books.zombie_bytes, one.books.resident_bytes, shown(one)) == (0, 0, {})
+    one.cache.evict(first, one.now_s())
+    one.run_until(lambda: not one.ledger.zombies)
+    assert (one.ledger.zombie_bytes, one.ledger.resident_bytes, shown(one)) == (0, 0, {})
     assert [name for name in os.listdir(one.shm_dir) if not name.endswith("statistics")] == []
 
 
@@ -64,8 +64,8 @@ def test_the_name_it_had_before(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     first = load(one, 1)
     with open(f"{one.shm_dir}{first.name}", "rb"):
-        one.store.evict(first, one.now_s())
+        one.cache.evict(first, one.now_s())
         with taken(one, first.name):
             assert load(one, 2) is not first
-        assert one.books.zombies
-    one.run_until(lambda: not one.books.zombies)
+        assert one.ledger.zombies
+    one.run_until(lambda: not one.ledger.zombies)

@@ -22,15 +22,15 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
     session = one.session()
     one.cells.selected(session, Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0), one.now_s())
     one.cells_of(1)
-    first = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
-    second = one.store.warm.layers["points"][one.store.index_of("20_20.pcd") or 0]
+    first = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
+    second = one.cache.warm.layers["points"][one.cache.index_of("20_20.pcd") or 0]
     wanted = ("0_0.pcd", "20_20.pcd", "20_0.pcd")
     with one.loaders_standing_still(), open(one.path_of(second.name.rsplit(".", 1)[1]), "rb"):
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
-        one.store.evict(first, one.now_s() - 1.0)
-        one.store.evict(second, one.now_s() - 1.0)
-        one.run_until(lambda: first.name not in one.books.zombies)
-        assert second.name in one.books.zombies, "somebody has it open"
+        one.cache.evict(first, one.now_s() - 1.0)
+        one.cache.evict(second, one.now_s() - 1.0)
+        one.run_until(lambda: first.name not in one.ledger.zombies)
+        assert second.name in one.ledger.zombies, "somebody has it open"
         os.kill(next(iter(one.pool)).process.pid, signal.SIGCONT)
         reply = one.cells_of(2)
     assert names(reply) == list(wanted)
@@ -43,20 +43,20 @@ def sizes(small_map: DividedMap, inner: Inner) -> int:
     """Bytes of one ordinary segment of this map (all are alike)."""
     one = inner(small_map.root)
     one.everything()
-    return min(resident.nbytes for resident in one.books.residents())
+    return min(resident.nbytes for resident in one.ledger.residents())
 
 
 def test_a_budget_that_is_just_enough(inner: Inner, small_map: DividedMap) -> None:
     """While cells load more is reserved than they come to need: no reason to refuse the last ones."""
     each = sizes(small_map, inner)
     one = inner(small_map.root, workers=2)
-    estimate = one.store.estimate(0, "points")
+    estimate = one.cache.estimate(0, "points")
     assert estimate > each
-    one.books.budget_bytes = one.books.overhead_bytes + 15 * each + estimate
+    one.ledger.budget_bytes = one.ledger.overhead_bytes + 15 * each + estimate
     reply = one.everything()
     assert (len(reply.cells), reply.failed) == (16, ())
     other = inner(small_map.root, workers=2)
-    other.books.budget_bytes = other.books.overhead_bytes + 15 * each + estimate - 4096
+    other.ledger.budget_bytes = other.ledger.overhead_bytes + 15 * each + estimate - 4096
     reply = other.everything()
     assert (len(reply.cells), [failure.code for failure in reply.failed]) == (15, ["over_budget"])
 
@@ -67,7 +67,7 @@ def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
     """Somebody else is told at once, though each answer begins another grace for what it hands out."""
     each = sizes(small_map, inner)
     one = inner(small_map.root)
-    one.books.budget_bytes = one.books.overhead_bytes + 4 * each + 8192
+    one.ledger.budget_bytes = one.ledger.overhead_bytes + 4 * each + 8192
     reader, other = one.session("reader"), one.session("other")
     one.cells.area(reader, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     opened = [os.open(one.path_of(cell.segment), os.O_RDONLY) for cell in one.cells_of(1).cells]
@@ -98,27 +98,27 @@ def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: Di
     for name in ("0_0.pcd", "20_20.pcd"):
         write_ascii(small_map.pcd_dir / name, 50_000)
     one = inner(small_map.root, workers=2)
-    half = one.store.estimate(one.store.index_of("0_0.pcd") or 0, "points")
-    one.books.budget_bytes = one.books.overhead_bytes + 2 * half + 100_000
+    half = one.cache.estimate(one.cache.index_of("0_0.pcd") or 0, "points")
+    one.ledger.budget_bytes = one.ledger.overhead_bytes + 2 * half + 100_000
     one.cells.selected(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0), one.now_s())
     reply = one.cells_of(1)
     assert len(reply.cells) == 1
     assert [failure.code for failure in reply.failed] == ["over_budget"]
     assert one.statistics.values["loads_timed_out"] == 0
-    assert one.books.reserved_bytes == 0
+    assert one.ledger.reserved_bytes == 0
 
 
 def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
     write_ascii(small_map.pcd_dir / "20_20.pcd", 50_000)
     each = sizes(small_map, inner)
     one = inner(small_map.root)
-    one.books.budget_bytes = one.books.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
+    one.ledger.budget_bytes = one.ledger.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
     session = one.session()
     one.stop_clock()  # the cells handed out first stay in their grace
     one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 4
     one.cells.selected(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0), one.now_s())
-    one.run_until(lambda: one.store.loads.hungry)
+    one.run_until(lambda: one.cache.loads.hungry)
     (worker,) = one.pool
     worker.process.kill()
     one.run_until(lambda: worker not in list(one.pool))
@@ -126,28 +126,28 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     reply = one.cells_of(2)
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert "SIGKILL" in reply.failed[0].message
-    one.run_until(lambda: not one.books.reserved_bytes)
-    assert one.store.loads.hungry == {}
+    one.run_until(lambda: not one.ledger.reserved_bytes)
+    assert one.cache.loads.hungry == {}
 
 
 def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
     write_ascii(small_map.pcd_dir / "20_20.pcd", 50_000)
     each = sizes(small_map, inner)
     one = inner(small_map.root, load_timeout_s=0.5)
-    one.books.budget_bytes = one.books.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
+    one.ledger.budget_bytes = one.ledger.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
     session = one.session()
     one.stop_clock()
     one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 4
     one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=30.0), one.now_s())
-    one.run_until(lambda: one.store.loads.hungry)
+    one.run_until(lambda: one.cache.loads.hungry)
     one.offset_s += 0.6
     assert [failure.code for failure in one.cells_of(2).failed] == ["load_timeout"]
-    assert (one.books.reserved_bytes, one.store.loads.hungry, len(one.pool)) == (0, {}, 0)
+    assert (one.ledger.reserved_bytes, one.cache.loads.hungry, len(one.pool)) == (0, {}, 0)
 
 
 def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:
-    quota = 3 * inner(small_map.root).store.estimate(0, "points")
+    quota = 3 * inner(small_map.root).cache.estimate(0, "points")
     one = inner(small_map.root, quota_bytes=quota)
     session, ids = one.session(), ("0_0.pcd",) * 10 + ("20_20.pcd",) * 10
     for request in (1, 2):  # cold, then warm
@@ -167,12 +167,12 @@ def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
     session = one.session()
     one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
     one.cells_of(1)
-    first = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    first = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
     wanted = ("0_0.pcd", "0_0.pcd", "20_0.pcd")
     with one.loaders_standing_still():
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
-        one.store.evict(first, one.now_s() - 1.0)
-        one.run_until(lambda: first.name not in one.books.zombies)
+        one.cache.evict(first, one.now_s() - 1.0)
+        one.run_until(lambda: first.name not in one.ledger.zombies)
     assert names(one.cells_of(2)) == list(wanted)
     assert sum(reply.request == 2 for _, reply in one.replies) == 1
     assert len(one.cells) == 0

@@ -49,14 +49,14 @@ def test_indices_change_while_requests_wait(inner: Inner, small_map: DividedMap)
     assert [(f.id.rsplit("/", 1)[-1], f.code) for f in reply.failed] == [("0_-20.pcd", "unknown_cell")]
     for cell in (*one.cells_of(1).cells, *reply.cells):
         assert (cell.min_x, cell.min_y) == small_map.corners[Path(cell.id).name]
-    one.run_until(lambda: not one.books.reserved_bytes)
-    assert {Path(key.cell_id).name for key in one.books.slots} == set(names(one.cells_of(1))) | {"20_20.pcd"}
+    one.run_until(lambda: not one.ledger.reserved_bytes)
+    assert {Path(key.cell_id).name for key in one.ledger.slots} == set(names(one.cells_of(1))) | {"20_20.pcd"}
 
 
 def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: DividedMap) -> None:
     """What was read counts, and both the version and the map's version say so."""
     one = inner(small_map.root)
-    session, before = one.session(), one.store.catalogue.map_version
+    session, before = one.session(), one.cache.catalogue.map_version
     with one.loaders_standing_still():
         one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
         one.turn()
@@ -68,7 +68,7 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     assert [Path(row.id).name for row in page.rows] == ["0_0.pcd"]  # type: ignore[union-attr]
     assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
     one.reload()
-    assert one.store.catalogue.version(one.store.index_of("0_0.pcd") or 0) == reply.cells[0].version
+    assert one.cache.catalogue.version(one.cache.index_of("0_0.pcd") or 0) == reply.cells[0].version
 
 
 def test_a_map_switched_back_by_its_symlink(inner: Inner, small_map: DividedMap, tmp_path: Path) -> None:
@@ -107,9 +107,9 @@ def test_a_map_that_comes_and_goes(inner: Inner, small_map: DividedMap, tmp_path
             for cell in reply.cells:
                 with open(one.path_of(cell.segment), "rb") as file:
                     mapped.append(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
-        assert one.books.resident_count == 16
-        assert {slot.resident.name for slot in one.books.slots.values() if slot.resident} == {
-            resident.name for resident in one.books.residents()
+        assert one.ledger.resident_count == 16
+        assert {slot.resident.name for slot in one.ledger.slots.values() if slot.resident} == {
+            resident.name for resident in one.ledger.residents()
         }
         (small_map.root / "link").symlink_to(other if turn % 2 == 0 else first)
         (small_map.root / "link").rename(small_map.pcd_dir)
@@ -143,9 +143,9 @@ def test_heights_of_a_replaced_file_are_unknown(inner: Inner, small_map: Divided
 def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     one.everything()
-    evicted = one.store.warm.layers["points"][one.store.index_of("0_0.pcd") or 0]
+    evicted = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
     with open(one.path_of(evicted.name.rsplit(".", 1)[1]), "rb") as held:
-        one.store.evict(evicted, one.now_s())  # a zombie while it moves
+        one.cache.evict(evicted, one.now_s())  # a zombie while it moves
         small_map.corners["0_0.pcd"] = (400, 400)
         small_map.corners["20_20.pcd"] = (500, 500)
         small_map.write_metadata()
@@ -168,14 +168,14 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     before = one.everything()
     empty = Catalogue.from_cells([])
-    one.cells.renumber(nowhere, one.store.catalogue.id)
-    one.store.replace_catalogue(empty, one.now_s())
+    one.cells.renumber(nowhere, one.cache.catalogue.id)
+    one.cache.replace_catalogue(empty, one.now_s())
     assert one.everything(2) == Cells(2, 77, empty.map_version)
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.cells.differential(one.session(), Differential(3, EVERYWHERE, packed=packed), one.now_s())
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
     welcome = one.admin.welcome(one.session(), Hello(4, 1, 0))
     assert (welcome.cells, welcome.bounds) == (0, None)
-    one.run_until(lambda: one.books.used_bytes == one.books.overhead_bytes)
+    one.run_until(lambda: one.ledger.used_bytes == one.ledger.overhead_bytes)
     one.reload()
     assert len(one.everything(5).cells) == 16

@@ -63,12 +63,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     inner.reload()
     after = ask(inner, 2, EVERYWHERE)
     names = sorted(made.corners)
-    inner.store.evict(inner.store.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
-    inner.run_until(lambda: not inner.books.zombies)
+    inner.cache.evict(inner.cache.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
+    inner.run_until(lambda: not inner.ledger.zombies)
     assert set(before) == set(names)
     assert set(after) == set(names) - {BROKEN}
     assert [name for name in names if after.get(name) != before[name]] == [CHANGED, BROKEN]
-    catalogue = inner.store.catalogue
+    catalogue = inner.cache.catalogue
     current = {name: catalogue.version(index) for index, name in enumerate(names)}
     yield Served(inner, made, names, current, before)
     inner.close()
@@ -149,9 +149,9 @@ def test_any_request(
     packed = [version(name, kind) or 0 for name, kind in packed_rows]
     message = Differential(1, EVERYWHERE, layers, tuple(held), pack_versions(packed))
     indices = [served.names.index(name) for name in inside]
-    store = served.inner.store
+    cache = served.inner.cache
 
-    found = difference(store, message, indices, layers)
+    found = difference(cache, message, indices, layers)
     new, removed, gone, other = oracle(served, inside, held, packed, layers)
     assert [(served.names[index], layer) for index, layer in found.cells] == new
     assert list(found.removed) == removed
@@ -167,7 +167,7 @@ def test_any_request(
     }
     assert found.held == expected
 
-    warm = warm_difference(store, message, np.array(indices, dtype=np.intp), "points")
+    warm = warm_difference(cache, message, np.array(indices, dtype=np.intp), "points")
     all_warm = not {COLD, BROKEN} & set(inside)
     if all_warm and all(cell.version is not None and cell.layers is None for cell in held):
         assert warm is not None, "the short way must take what nearly every request is"
@@ -187,7 +187,7 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
     for layers, lacks in (((), [(index, "points")]), (("points",), []), (("points", "points"), [])):
         message = Differential(1, EVERYWHERE, ("points",), (HeldCell(name, served.current[name], layers),))
         if layers:
-            found = difference(served.inner.store, message, [index], ("points",))
+            found = difference(served.inner.cache, message, [index], ("points",))
             assert found.cells == lacks
             assert found.removed == ()
 
@@ -196,9 +196,9 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
 def test_packed_versions_of_broken_length(served: Served, packed: bytes) -> None:
     message = Differential(1, EVERYWHERE, packed=packed)
     with pytest.raises(BadRequest):
-        difference(served.inner.store, message, [0], ("points",))
+        difference(served.inner.cache, message, [0], ("points",))
     with pytest.raises(BadRequest):
-        warm_difference(served.inner.store, message, np.array([0], dtype=np.intp), "points")
+        warm_difference(served.inner.cache, message, np.array([0], dtype=np.intp), "points")
 
 
 def test_very_many_held(served: Served) -> None:
@@ -208,8 +208,8 @@ def test_very_many_held(served: Served) -> None:
     index = served.names.index("0_0.pcd")
     message = Differential(1, EVERYWHERE, held=tuple(rows))
     expected = [row.id for row in rows if row.id != "0_0.pcd"]
-    found = difference(served.inner.store, message, [index], ("points",))
+    found = difference(served.inner.cache, message, [index], ("points",))
     assert (found.cells, list(found.removed)) == ([], expected)
-    warm = warm_difference(served.inner.store, message, np.array([index], dtype=np.intp), "points")
+    warm = warm_difference(served.inner.cache, message, np.array([index], dtype=np.intp), "points")
     assert warm is not None
     assert (warm.residents, list(warm.removed)) == ([], expected)

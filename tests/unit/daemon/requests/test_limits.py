@@ -22,7 +22,7 @@ def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: 
         one.cells.area(one.session(), Area(1, EVERYWHERE), one.now_s())
     with pytest.raises(BadRequest, match="16 cells"):  # known or not
         one.cells.selected(one.session(), Selected(2, ("nowhere",) * 16), one.now_s())
-    assert one.books.slots == {}
+    assert one.ledger.slots == {}
     assert one.replies == []
 
 
@@ -59,7 +59,7 @@ def test_loads_that_one_process_waits_for(
             one.cells.area(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
         one.cells.area(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
         assert len(one.cells_of(4).pending) == 16
-    one.run_until(lambda: not one.books.queued)
+    one.run_until(lambda: not one.ledger.queued)
     one.cells.area(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0), one.now_s())
     assert len(one.cells_of(5).cells) == 16
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.cache.pin_census import PinCensus
 from shmmap.daemon.events.eviction_history import Ghosts
 from shmmap.daemon.telemetry.recent_counts import RecentCounts

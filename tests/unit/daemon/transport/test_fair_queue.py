@@ -14,11 +14,11 @@ from shmmap.daemon.transport.fair_queue import (
     MOST_OF_A_CONNECTION,
     MOST_OF_A_PROCESS,
     MOST_REMEMBERED,
-    Turns,
+    FairQueue,
 )
 
 
-def serve(turns: Turns[str], cost_s: float) -> str | None:
+def serve(turns: FairQueue[str], cost_s: float) -> str | None:
     turn = turns.take()
     if turn is None:
         return None
@@ -27,7 +27,7 @@ def serve(turns: Turns[str], cost_s: float) -> str | None:
 
 
 def test_a_quiet_process_is_served_next() -> None:
-    turns: Turns[str] = Turns()
+    turns: FairQueue[str] = FairQueue()
     for number in range(50):
         turns.add("loud", number % 5, "loud", 10)
     assert serve(turns, 1.0) == "loud"
@@ -37,7 +37,7 @@ def test_a_quiet_process_is_served_next() -> None:
 
 
 def test_who_asks_for_what_is_expensive_waits_longer() -> None:
-    turns: Turns[str] = Turns()
+    turns: FairQueue[str] = FairQueue()
     served: Counter[str] = Counter()
     for _ in range(300):
         for name in ("cheap", "dear"):
@@ -50,7 +50,7 @@ def test_who_asks_for_what_is_expensive_waits_longer() -> None:
 
 
 def test_idling_saves_up_nothing() -> None:
-    turns: Turns[str] = Turns()
+    turns: FairQueue[str] = FairQueue()
     for _ in range(60):
         turns.add("busy", 0, "busy", 1)
     turns.add("idler", 0, "idler", 1)
@@ -67,7 +67,7 @@ def test_idling_saves_up_nothing() -> None:
 
 
 def test_connections_of_a_process_take_turns() -> None:
-    turns: Turns[str] = Turns()
+    turns: FairQueue[str] = FairQueue()
     for _ in range(10):
         turns.add("one", "a", "a", 1)
     turns.add("one", "b", "b", 1)
@@ -75,7 +75,7 @@ def test_connections_of_a_process_take_turns() -> None:
 
 
 def test_limits() -> None:
-    turns: Turns[int] = Turns()
+    turns: FairQueue[int] = FairQueue()
     assert sum(turns.add("p", 0, n, 1) for n in range(1000)) == MOST_OF_A_CONNECTION
     assert sum(turns.add("p", n, n, 1) for n in range(1, 2000)) == MOST_OF_A_PROCESS - MOST_OF_A_CONNECTION
     assert turns.add("q", 0, 0, 2 * MOST_BYTES)  # a single one always may
@@ -85,7 +85,7 @@ def test_limits() -> None:
 
 
 def test_nobody_is_remembered_for_ever() -> None:
-    turns: Turns[str] = Turns()
+    turns: FairQueue[str] = FairQueue()
     for number in range(3 * MOST_REMEMBERED):
         turns.add(number, 0, "x", 1)
         serve(turns, 1.0)
@@ -94,7 +94,7 @@ def test_nobody_is_remembered_for_ever() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2), st.floats(0.001, 1.0), st.booleans())))
 def test_everything_accepted_is_served_once_in_order(steps: list[tuple[int, int, float, bool]]) -> None:
-    turns: Turns[tuple[int, int, int]] = Turns()
+    turns: FairQueue[tuple[int, int, int]] = FairQueue()
     waiting: dict[tuple[int, int], list[int]] = {}
     for number, (process, connection, cost_s, take) in enumerate(steps):
         if turns.add(process, connection, (process, connection, number), 1):
@@ -115,7 +115,7 @@ def test_everything_accepted_is_served_once_in_order(steps: list[tuple[int, int,
 
 @pytest.mark.parametrize("loud", [1, 3, 20])
 def test_the_quiet_one_waits_for_each_loud_one_once(loud: int) -> None:
-    turns: Turns[str] = Turns()
+    turns: FairQueue[str] = FairQueue()
     for number in range(loud):
         for _ in range(MOST_OF_A_CONNECTION):
             turns.add(number, 0, "loud", 1)

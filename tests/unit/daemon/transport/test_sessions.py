@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.cache.ledger import Key, Resident
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions, command_of, predicted_path
 from shmmap.errors import NoSession
 from shmmap.geometry import Circle

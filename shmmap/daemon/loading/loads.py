@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Absent cells: what is wanted, which load comes next, what is under way, what failed.
+
+Those who ask take turns, and of each one's loads the nearest comes first: however many cells one process
+asks for, another one's cells do not wait for more than a fair share of them.  Turns are by bytes, as
+`shmmap.daemon.transport.fair_queue` has them by time.  What nobody waits for (checks of adopted segments,
+pinned cells) comes when nothing else is queued.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Final, Generic, Protocol, TypeVar
+
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
+from shmmap.segment.layout import SourceStamp
+
+__all__ = ["BACKGROUND", "LoadQueue", "Loads"]
+
+BACKGROUND: Final = 1e12
+"""From this priority on a load is one that nobody waits for."""
+FIRST_RETRY_S: Final = 1.0
+LAST_RETRY_S: Final = 30.0
+BUDGET_RETRY_S: Final = 0.1
+MOST_FAILURES: Final = 1 << 14
+"""Failures of a kind that are remembered: who asks for ever new layers must not fill the memory with them."""
+LOAD_COST_BYTES: Final = 64 << 10
+"""What a load costs besides its bytes: many tiny cells are work, too."""
+
+
+class _Load(Protocol):
+    """What the queue needs to know of a load."""
+
+    estimate: int
+    number: int
+
+
+Queued = TypeVar("Queued", bound=_Load)
+
+
+@dataclass(eq=False, slots=True)
+class _Asker(Generic[Queued]):
+    """One asker's loads by priority; ``clock`` is the bytes it has been given."""
+
+    clock: int
+    heap: list[tuple[float, int, Queued]] = field(default_factory=list)
+    best: dict[int, float] = field(default_factory=dict)
+
+
+class LoadQueue(Generic[Queued]):
+    """Loads that wait for a worker or for room; one is here from `push` to `discard`."""
+
+    def __init__(self) -> None:
+        self._loads: dict[int, Queued] = {}
+        self._askers: dict[Hashable, _Asker[Queued]] = {}
+        self._clock = 0
+        self._chosen: Hashable = None
+
+    def __len__(self) -> int:
+        return len(self._loads)
+
+    def count(self, asker: Hashable) -> int:
+        """How many loads somebody asked for wait."""
+        mine = self._askers.get(asker)
+        return 0 if mine is None else sum(number in self._loads for number in mine.best)
+
+    def push(self, load: Queued, priority: float, asker: Hashable) -> None:
+        """Somebody wants this; asked for again, it is never moved back."""
+        self._loads[load.number] = load
+        mine = self._askers.get(asker)
+        if mine is None:
+            mine = self._askers[asker] = _Asker(self._clock)
+        known = mine.best.get(load.number)
+        if known is None or priority < known:
+            mine.best[load.number] = priority
+            heapq.heappush(mine.heap, (priority, load.number, load))
+
+    def discard(self, load: Queued) -> None:
+        """It does not wait any more."""
+        self._loads.pop(load.number, None)
+
+    def started(self, load: Queued) -> None:
+        """It does not wait any more, and counts for whose turn it was."""
+        self.discard(load)
+        chosen = self._askers.get(self._chosen)
+        if chosen is not None:
+            chosen.clock += load.estimate + LOAD_COST_BYTES
+
+    def next(self) -> Queued | None:
+        """The load that comes next, or None."""
+        found: tuple[bool, int, float, int] | None = None
+        for asker, mine in list(self._askers.items()):
+            self._clean(mine)
+            if not mine.heap:
+                del self._askers[asker]
+                continue
+            priority, number, _ = mine.heap[0]
+            rank = (priority >= BACKGROUND, mine.clock, priority, number)
+            if found is None or rank < found:
+                found, self._chosen = rank, asker
+        if found is None:
+            return None
+        chosen = self._askers[self._chosen]
+        self._clock = max(self._clock, chosen.clock)
+        return chosen.heap[0][2]
+
+    def _clean(self, mine: _Asker[Queued]) -> None:
+        """Drop what does not wait any more from the front, and from everywhere once it is most."""
+        while mine.heap and mine.heap[0][1] not in self._loads:
+            mine.best.pop(heapq.heappop(mine.heap)[1], None)
+        if len(mine.heap) > 2 * len(self._loads) + 64:
+            mine.best = {number: p for number, p in mine.best.items() if number in self._loads}
+            mine.heap = [(p, number, self._loads[number]) for number, p in mine.best.items()]
+            heapq.heapify(mine.heap)
+
+
+class Loads:
+    """What is wanted, queued and under way, and what failed; without any I/O.
+
+    Parameters
+    ----------
+    ledger
+        Promises the bytes of what is under way.
+
+    Attributes
+    ----------
+    by_key : dict
+        Loads that have not ended.
+    failures : dict
+        Why the last load of a key failed, until it succeeds or the cause may have passed.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self.by_key: dict[Key, Load] = {}
+        self.failures: dict[Key, Failure] = {}
+        self._keys_failed: dict[str, dict[Key, None]] = {}  # by code, those that failed longest ago first
+        self._queue: LoadQueue[Load] = LoadQueue()
+        self._numbers = 0
+
+    def __len__(self) -> int:
+        """How many loads wait for a worker or for room."""
+        return len(self._queue)
+
+    def queued_of(self, asker: Hashable) -> int:
+        """How many of those somebody asked for."""
+        return self._queue.count(asker)
+
+    def want(self, key: Key, estimate: int, priority: float, asker: Hashable = None) -> Load:
+        """Queue a load, or move a queued one forward; however many ask, there is one load.
+
+        Those who ask take turns, in `LoadQueue`.
+        """
+        load = self.by_key.get(key)
+        if load is None:
+            self._numbers += 1
+            load = self.by_key[key] = Load(key, estimate, priority, self._numbers, asker=asker)
+        elif load.running:
+            load.wanted = True
+            return load
+        load.wanted, load.priority = True, min(load.priority, priority)
+        self._queue.push(load, priority, asker)
+        return load
+
+    def is_promised(self, key: Key) -> bool:
+        """Whether a load of this is on its way, more than a look at the file that it failed for."""
+        load = self.by_key.get(key)
+        return load is not None and load.unless is None
+
+    def check(self, resident: Resident) -> None:
+        """Queue the check of a segment of an earlier life, behind everything that somebody asks for."""
+        load = self.want(resident.key, 0, float("inf"))
+        load.adopted, load.wanted = resident, False
+
+    def next_queued(self) -> Load | None:
+        """The queued load nearest to whose turn it is, or None."""
+        while (load := self._queue.next()) is not None:
+            if self.by_key.get(load.key) is load and not load.running:
+                return load
+            self._queue.discard(load)  # given up meanwhile
+        return None
+
+    def start(self, load: Load, now_s: float) -> bool:
+        """Reserve the load's bytes and count it as running; False if they do not fit."""
+        if not self._ledger.reserve(load.estimate):
+            return False
+        self._queue.started(load)
+        load.running, load.started_s, load.reserved = True, now_s, load.estimate
+        return True
+
+    def grow(self, load: Load, nbytes: int) -> bool:
+        """Raise a running load's reservation to ``nbytes``; False if that does not fit."""
+        extra = max(0, nbytes - load.reserved)
+        fits = self._ledger.reserve(extra)
+        load.reserved += extra if fits else 0
+        return fits
+
+    def requeue(self, load: Load) -> None:
+        """Put a running load back (its worker died before its turn, or what it read is outdated)."""
+        self._take_back(load)
+        load.running = False
+        self._queue.push(load, load.priority, load.asker)
+
+    def _take_back(self, load: Load) -> None:
+        self._ledger.reserved_bytes -= load.reserved
+        load.reserved = 0
+
+    def finish(self, load: Load, failure: Failure | None = None) -> None:
+        """The load ended; ``failure``, if there is one, stands until it succeeds or is cleared."""
+        self._take_back(load)
+        self._queue.discard(load)
+        if self.by_key.get(load.key) is load:
+            del self.by_key[load.key]
+            self.failures.pop(load.key, None)
+            if failure is not None:
+                self._remember(load.key, failure)
+
+    def failure(self, key: Key, code: str, message: str, stamp: SourceStamp | None, now_s: float) -> Failure:
+        """Describe why a load failed; the back-off doubles when it failed the same way before."""
+        old = self.failures.get(key)
+        if code in SPACE_CODES:
+            delay_s = BUDGET_RETRY_S
+        else:
+            delay_s = min(2 * old.delay_s, LAST_RETRY_S) if old and old.code == code else FIRST_RETRY_S
+        return Failure(code, message, stamp, now_s + delay_s, delay_s)
+
+    def _remember(self, key: Key, failure: Failure) -> None:
+        self.failures[key] = failure
+        keys = self._keys_failed.setdefault(failure.code, {})
+        keys.pop(key, None)
+        keys[key] = None
+        if len(keys) > MOST_FAILURES:
+            oldest = next(iter(keys))
+            del keys[oldest]
+            self._forget_failure(oldest, failure.code)
+
+    def cancel(self, key: Key) -> None:
+        """Drop a queued load and a standing failure of a key (its cell left the map)."""
+        self.failures.pop(key, None)
+        load = self.by_key.get(key)
+        if load is not None and not load.running:
+            self._queue.discard(load)
+            del self.by_key[key]
+
+    def clear_failures(self, codes: frozenset[str]) -> None:
+        """Forget standing failures of these kinds: what caused them may have passed."""
+        for code in codes:
+            for key in self._keys_failed.pop(code, ()):
+                self._forget_failure(key, code)
+
+    def _forget_failure(self, key: Key, code: str) -> None:
+        failure = self.failures.get(key)
+        if failure is not None and failure.code == code:
+            del self.failures[key]

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every room of the daemon may name: a key, a segment in memory, a retired one, a load, a failure."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from shmmap.segment.layout import SourceStamp
+
+__all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired"]
+
+SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
+"""Failures for want of memory: they pass when somebody lets go."""
+
+
+class Key(NamedTuple):
+    """One layer of one cell."""
+
+    cell_id: str
+    layer: str
+
+
+@dataclass(slots=True, eq=False)
+class Resident:
+    """A published segment and what the daemon knows of its use.
+
+    ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
+    their checksums: until then nobody is handed it.  ``handle`` and ``stale_handle`` are encoded once,
+    to be used in every reply; ``sessions`` are the slots of those who hold it.
+    """
+
+    name: str
+    key: Key
+    version: int
+    nbytes: int
+    points: int
+    box: tuple[float, float, float, float]
+    z_min: float
+    z_max: float
+    handle: bytes = b""
+    stale_handle: bytes = b""
+    last_use_s: float = 0.0
+    load_ns: int = 0
+    hits: int = 0
+    checked: bool = True
+    sessions: set[int] = field(default_factory=set)
+
+
+@dataclass(slots=True, eq=False)
+class Retired:
+    """A segment out of service; ``resident`` says what it was.
+
+    ``probe_after_s`` is when its use is next worth a look, ``condemned`` that nobody had it open
+    at the last look, ``interval_s`` how long the last wait between two looks was.
+    """
+
+    resident: Resident
+    condemned: bool = False
+    probe_after_s: float = 0.0
+    interval_s: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Load:
+    """A load that is queued or under way; ``reserved`` bytes are promised to it meanwhile.
+
+    ``adopted`` is a segment of an earlier life that only has to be checked, ``unless`` the state of a file
+    that could not be loaded: in that state it is not tried again.  ``wanted`` says that somebody asked for
+    it, ``sources`` what the catalogue knew of its file and its neighbours' when a worker was given the job.
+    """
+
+    key: Key
+    estimate: int
+    priority: float
+    number: int
+    asker: Hashable = None
+    running: bool = False
+    reserved: int = 0
+    started_s: float = 0.0
+    adopted: Resident | None = None
+    unless: SourceStamp | None = None
+    wanted: bool = True
+    sources: tuple[SourceStamp, ...] = ()
+
+
+@dataclass(slots=True)
+class Failure:
+    """Why the last load of a key failed, and when asking again is worth another try.
+
+    ``stamp`` is the state of the file that it failed for: another state is tried at once.  None, if it is
+    not known or nobody should look (its file system may be what hangs).
+    """
+
+    code: str
+    message: str
+    stamp: SourceStamp | None
+    retry_at_s: float
+    delay_s: float
