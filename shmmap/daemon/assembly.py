@@ -32,7 +32,7 @@ from shmmap.daemon.host.signals import KEEP_SIGNAL, RELOAD_SIGNAL, STOP_SIGNALS,
 from shmmap.daemon.loading.adoption import Leftovers
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.file_watch import MapWatch, directories_of
+from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.pins.probe import Rung
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.requests.operators.authorization import Privileges
@@ -80,7 +80,7 @@ class Life:
         self._privileges = Privileges(config.admin_group)
         self._epoch = secrets.randbits(63) | 1
         self._event_log = EventLog(self._epoch)
-        self._map_watch: MapWatch | None = None
+        self._map_watch: FileWatch | None = None
         self._directory = directory
         self._catalogue = catalogue
         self._identity = DaemonIdentity(
@@ -246,7 +246,7 @@ class Life:
     def _watch_map(self, server: Server) -> None:
         config = self._config
         if config.watch:
-            watch = MapWatch(directories_of(config.map_path, config.metadata, self._store.catalogue))
+            watch = FileWatch(directories_of(config.map_path, config.metadata, self._store.catalogue))
             server.watch(watch.fd, lambda: watch.drain(time.monotonic()))
             self._map_watch = watch
 

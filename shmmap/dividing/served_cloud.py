@@ -28,7 +28,7 @@ from typing import Any, Final
 from xxhash import xxh3_64_hexdigest
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.service_manager.notify import notify
+from shmmap.daemon.service_manager.status import notify
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.origin.catalogue import Catalogue

@@ -17,7 +17,7 @@ from typing import Final
 from shmmap.daemon.cache.encoded_handles import cell_row, encode_handles
 from shmmap.daemon.cache.ledger import Failure, Key, Load, Residency, Resident, Slot
 from shmmap.daemon.cache.reclaimer import Reclaimer
-from shmmap.daemon.cache.segment_name_watch import NameWatch
+from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
 from shmmap.daemon.cache.warm_index import WarmCells
 from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog
@@ -102,7 +102,7 @@ class Store:
         self.id_prefix = id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
-        self.names = NameWatch(directory.path, self.segment_prefix)
+        self.names = SegmentNameWatch(directory.path, self.segment_prefix)
         self._directory = directory
         self._statistics = statistics
         self._instance = instance

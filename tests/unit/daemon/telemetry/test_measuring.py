@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Growth over spans, the census of pins, and the memory of what was evicted."""
+"""Growth over spans and the census of pins."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.cache.ledger import Key, Resident
 from shmmap.daemon.cache.pin_census import PinCensus
-from shmmap.daemon.events.eviction_history import Ghosts
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 
 
@@ -63,14 +62,3 @@ def test_a_segment_that_vanished_is_not_pinned() -> None:
     census = PinCensus(lambda: [resident("a")], lambda _: None)
     census.look(5)
     assert census.pinned_bytes == 0
-
-
-def test_ghosts_know_what_was_evicted_once() -> None:
-    ghosts = Ghosts(limit=3)
-    for number in range(5):
-        ghosts.evicted(Key(f"{number}", "points"), number)
-    assert len(ghosts) == 3
-    assert not ghosts.loaded(Key("0", "points"), 0)  # forgotten
-    assert ghosts.loaded(Key("3", "points"), 3)
-    assert not ghosts.loaded(Key("3", "points"), 3)  # it was just brought back
-    assert not ghosts.loaded(Key("4", "points"), 99)  # it changed meanwhile
