@@ -18,7 +18,7 @@ import zmq
 
 from shmmap.daemon.cache.cell_cache import Store
 from shmmap.daemon.cache.ledger import Resident
-from shmmap.daemon.cache.pin_survey import Pinned, PinSurvey
+from shmmap.daemon.cache.survey import Usage
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.events.map_events import tell_reload, tell_reload_failed
 from shmmap.daemon.map.catalogue_reload import Reloader
@@ -119,7 +119,7 @@ class Server:
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
         self._replies = Replies(socket, statistics)
         self._hearing = Hearing(socket, sessions, statistics, self._refuse_unread)
-        self._survey = PinSurvey(store.reclaimer, in_service=store.is_in_service)
+        self._survey = store.survey
         self._gate = ListenGate(self.watch, self.unwatch)
         self._crowd = CrowdControl(
             self._gate,
@@ -297,13 +297,13 @@ class Server:
             elif isinstance(message, messages.Reload):
                 self._reload_for(session, message)
             elif isinstance(message, messages.Stats):
-                self._survey.ask(session, lambda pinned: self._tell_stats(session, message, pinned))
+                self._survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
             else:
                 self._send(session, encode(self._admin.answer(message, now_s)))
 
-    def _tell_stats(self, session: Session, message: messages.Stats, pinned: Pinned) -> None:
+    def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
         self._heartbeat.measure()
-        self._send(session, encode(self._admin.stats(message, pinned, time.monotonic())))
+        self._send(session, encode(self._admin.stats(message, usage, time.monotonic())))
 
     def _released(self, session: Session, message: messages.Release) -> list[Resident]:
         if message.packed is None:

@@ -18,6 +18,7 @@ from shmmap.daemon.cache.encoded_handles import cell_row, encode_handles
 from shmmap.daemon.cache.ledger import Failure, Key, Load, Residency, Resident, Slot
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
+from shmmap.daemon.cache.survey import Survey
 from shmmap.daemon.cache.warm_index import WarmCells
 from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog
@@ -68,6 +69,8 @@ class Store:
         For ``since``: map version before a change, ids that changed or appeared, ids that vanished.
     used : set
         Segments handed out since the statistics last showed them.
+    survey
+        Who maps how much of it.
     warm
         The cells that are in memory at their current version.
     heights : dict
@@ -98,6 +101,7 @@ class Store:
         self.reclaimer = reclaimer
         self.layers = LayerVersions(lambda: self.catalogue)
         self.loads = Loading(self, residency, reclaimer, pool, statistics, on_settled)
+        self.survey = Survey(reclaimer, in_service=self.is_in_service)
         self.warm = WarmCells(lambda: len(self.catalogue))
         self.id_prefix = id_prefix
         self.segment_prefix = segment_prefix(instance)

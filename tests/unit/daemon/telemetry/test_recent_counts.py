@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Growth over spans and the census of pins."""
+"""How much counters grew over spans."""
 
 from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.cache.ledger import Key, Resident
-from shmmap.daemon.cache.pin_census import PinCensus
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 
 
@@ -34,31 +32,3 @@ def test_the_longest_span_is_remembered() -> None:
     for second in range(2000):
         recent.look({"hits": second}, float(second))
     assert recent.growth({"hits": 1999}, 1999.0) == [(600,)]
-
-
-def resident(name: str, nbytes: int = 10) -> Resident:
-    return Resident(name, Key(name, "points"), 1, nbytes, 1, (0.0, 0.0, 1.0, 1.0), 0.0, 1.0)
-
-
-def test_pins_are_counted_a_few_at_a_time() -> None:
-    segments = [resident(str(number), nbytes=10 + number) for number in range(10)]
-    pinned = {"1", "2", "9"}
-    census = PinCensus(lambda: segments, lambda one: one.name in pinned)
-    for _ in range(4):
-        census.look(3)
-    assert (census.pinned_count, census.pinned_bytes) == (3, 11 + 12 + 19)
-    pinned = {"2"}
-    del segments[9]
-    for _ in range(8):
-        census.look(3)
-    assert (census.pinned_count, census.pinned_bytes) == (1, 12)
-    segments.clear()
-    for _ in range(5):
-        census.look(3)
-    assert (census.pinned_count, census.pinned_bytes) == (0, 0)
-
-
-def test_a_segment_that_vanished_is_not_pinned() -> None:
-    census = PinCensus(lambda: [resident("a")], lambda _: None)
-    census.look(5)
-    assert census.pinned_bytes == 0
