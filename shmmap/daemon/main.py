@@ -42,7 +42,7 @@ from shmmap.daemon.prerequisites import (
     raise_descriptor_limit,
 )
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
-from shmmap.daemon.service_manager.status import ServiceManager
+from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import ConfigError
 from shmmap.failpoints import step
@@ -82,7 +82,13 @@ def run(config: DaemonConfig) -> int:
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
         pins = choose_pins(directory)
-        origin = find_origin(config)
+        origin = find_origin(
+            config.map_path,
+            metadata=config.metadata,
+            strict=config.strict,
+            cache_dir=config.cache_dir,
+            tell=notify,
+        )
         config = dataclasses.replace(  # loaders and clients run elsewhere
             config,
             map_path=origin.path,

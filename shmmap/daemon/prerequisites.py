@@ -9,9 +9,9 @@ import resource
 from pathlib import Path
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.host.groups import group_id
 from shmmap.daemon.pins.probe import Rung, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.requests.operators.authorization import group_id
 from shmmap.errors import ConfigError
 from shmmap.segment.directory import ShmDirectory
 

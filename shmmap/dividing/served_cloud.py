@@ -27,8 +27,6 @@ from typing import Any, Final
 
 from xxhash import xxh3_64_hexdigest
 
-from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.service_manager.notify import notify
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.origin.catalogue import Catalogue
@@ -51,26 +49,39 @@ _USE_LOCK: Final = ".use"  # held shared by every daemon that serves the cloud
 _MAKING_LOCK: Final = ".making"  # held by the one that divides it
 
 
-def find_origin(config: DaemonConfig) -> MapOrigin:
-    """Return the origin of the map that a daemon is to serve.
+def _tell_nobody(*lines: str) -> None:
+    del lines
+
+
+def find_origin(
+    map_path: str,
+    *,
+    metadata: str = "",
+    strict: bool = False,
+    cache_dir: str = "",
+    tell: Callable[..., None] = _tell_nobody,
+) -> MapOrigin:
+    """Return the origin of the map at a path, be it a map or a cloud that has to be divided first.
+
+    Parameters
+    ----------
+    metadata, strict, cache_dir
+        As in `open_map`; empty ones are looked for, or the user's.
+    tell
+        Sends ``KEY=value`` lines of progress to the service manager, see `DividedCloud`.
 
     Raises
     ------
     MapMissing
         There is nothing at the path.
     """
-    path = absolute_path(config.map_path)
+    path = absolute_path(map_path)
     suffix = os.path.splitext(path)[1].lower()
-    is_cloud = os.path.isfile(path) and suffix in CLOUD_SUFFIXES and not config.metadata
+    is_cloud = os.path.isfile(path) and suffix in CLOUD_SUFFIXES and not metadata
     if is_cloud and not (suffix == ".pcd" and is_served_whole(path)):
-        cache_dir = absolute_path(config.cache_dir or default_cache_directory())
-        return DividedCloud(path, cache_dir, strict=config.strict)
-    return open_map(
-        path,
-        metadata=config.metadata or None,
-        strict=config.strict,
-        cache_dir=config.cache_dir or None,
-    )
+        cache_dir = absolute_path(cache_dir or default_cache_directory())
+        return DividedCloud(path, cache_dir, strict=strict, tell=tell)
+    return open_map(path, metadata=metadata or None, strict=strict, cache_dir=cache_dir or None)
 
 
 class DividedCloud:
@@ -89,7 +100,7 @@ class DividedCloud:
     """
 
     def __init__(
-        self, path: str, cache_dir: str, *, strict: bool = False, tell: Callable[..., None] = notify
+        self, path: str, cache_dir: str, *, strict: bool = False, tell: Callable[..., None] = _tell_nobody
     ) -> None:
         self.path = path
         self._cache_dir = cache_dir

@@ -5,21 +5,35 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from xxhash import xxh3_64_intdigest
 
-from shmmap.geometry import Box
+from shmmap.geometry import Area, Box
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
-from shmmap.origin.catalogue import Catalogue
 
-__all__ = ["MAX_NEIGHBOURS", "LayerVersions"]
+__all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 
 MAX_NEIGHBOURS: Final = 64
 """Most files that a layer with a halo reads beside its own."""
 MOST_REMEMBERED: Final = 1 << 18
 """Versions, about 200 bytes each; whoever asks for ever new layers must not fill the daemon's memory."""
+
+
+class Cells(Protocol):
+    """What is asked of a map's catalogue: its cells by index."""
+
+    def version(self, index: int) -> int:
+        """64-bit version of a cell."""
+
+    def box(self, index: int) -> tuple[float, float, float, float]:
+        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+
+    def query(self, area: Area) -> NDArray[np.intp]:
+        """Cells whose box touches ``area``, ascending."""
 
 
 class LayerVersions:
@@ -31,7 +45,7 @@ class LayerVersions:
         Returns the map's current catalogue.
     """
 
-    def __init__(self, catalogue: Callable[[], Catalogue]) -> None:
+    def __init__(self, catalogue: Callable[[], Cells]) -> None:
         self._catalogue = catalogue
         self._halos: dict[str, float] = {LAYER: 0.0}
         self._versions: dict[tuple[int, str], int] = {}

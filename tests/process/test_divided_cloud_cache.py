@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.daemon.config import DaemonConfig
 from shmmap.dividing import served_cloud
 from shmmap.dividing.served_cloud import DividedCloud, find_origin
 from shmmap.errors import CannotWrite, MapDataError, MapMissing
@@ -26,7 +25,7 @@ def cloud(path: Path, points: int = 100) -> Path:
 
 def test_which_maps_are_divided_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def kind(path: Path) -> type[object]:
-        return type(find_origin(DaemonConfig(map_path=str(path), cache_dir=str(tmp_path / "cache"))))
+        return type(find_origin(str(path), cache_dir=str(tmp_path / "cache")))
 
     for name in ("a.las", "b.LAZ", "c.ply", "d.xyz"):
         (tmp_path / name).write_bytes(b"")
@@ -77,7 +76,7 @@ def test_where_the_daemon_was_started_plays_no_part(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     cloud(tmp_path / "a.laz.pcd")
     monkeypatch.setattr(single_pcd, "MAX_SINGLE_PCD_BYTES", 500)
-    catalogue = find_origin(DaemonConfig(map_path="a.laz.pcd", cache_dir="cache")).load()
+    catalogue = find_origin("a.laz.pcd", cache_dir="cache").load()
     assert catalogue.id_prefix.startswith(f"{tmp_path}/cache/divided/")
 
 

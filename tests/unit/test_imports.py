@@ -32,9 +32,9 @@ LAYERS = {
     "segment": {"errors", "columns", "geometry", "failpoints"},
     "protocol": {"errors", "columns", "geometry"},
     "statistics": {"errors", "columns", "geometry", "segment"},
-    "layers": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics", "origin"},
+    "layers": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
     "origin": {"errors", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
-    "dividing": {"errors", "columns", "geometry", "formats", "layers", "origin", "processes", "daemon"},
+    "dividing": {"errors", "columns", "geometry", "formats", "layers", "origin", "processes"},
     "daemon": {
         "errors", "columns", "failpoints", "processes", "geometry", "formats", "segment", "protocol",
         "statistics", "layers", "origin", "dividing",

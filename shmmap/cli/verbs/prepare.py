@@ -62,7 +62,6 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.daemon.config import DaemonConfig
     from shmmap.dividing.served_cloud import find_origin
     from shmmap.errors import BadRequest
     from shmmap.layers.spec import canonical_layers
@@ -73,9 +72,7 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
-    origin = find_origin(
-        DaemonConfig(args.map_path, args.metadata or "", strict=args.strict, cache_dir=cache_dir)
-    )
+    origin = find_origin(args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir)
     layers = canonical_layers(args.layers)
     catalogue = origin.load(fresh=True)
     done = prepare_map(

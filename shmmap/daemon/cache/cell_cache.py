@@ -16,7 +16,8 @@ from typing import Any, Final
 from shmmap.daemon.cache.encoded_handles import cell_row
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
-from shmmap.daemon.cache.segment_name_watch import NameWatch
+from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
+from shmmap.daemon.cache.survey import Survey
 from shmmap.daemon.cache.warm_index import WarmIndex
 from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog
@@ -58,6 +59,8 @@ class CellCache:
         Tells what happens to cells.
     used : set
         Segments handed out since the statistics last showed them.
+    survey
+        Who maps how much of it.
     warm
         The cells that are in memory at their current version.
     heights : dict
@@ -84,11 +87,12 @@ class CellCache:
         self.ledger = ledger
         self.reclaimer = reclaimer
         self.layers = LayerVersions(lambda: self.catalogue)
+        self.survey = Survey(reclaimer, in_service=self.is_in_service)
         self.warm = WarmIndex(lambda: len(self.catalogue))
         self.id_prefix = catalogue.id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
-        self.names = NameWatch(directory.path, self.segment_prefix)
+        self.names = SegmentNameWatch(directory.path, self.segment_prefix)
         self.events = CellEvents(event_log, ledger, statistics, self.wire_id)
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()

@@ -99,7 +99,7 @@ class Reclaimer:
         pins: PinWatch | None = None,
     ) -> None:
         self.pins = pins or PinWatch(directory)
-        self._ledger = ledger
+        self.ledger = ledger
         self._directory = directory
         self._sessions = sessions
         self._policy = policy
@@ -112,7 +112,7 @@ class Reclaimer:
     # --- retiring -----------------------------------------------------------------------------
 
     def _on_disk(self, resident: Resident) -> str:
-        return zombie_name(resident.name) if resident.name in self._ledger.retired else resident.name
+        return zombie_name(resident.name) if resident.name in self.ledger.retired else resident.name
 
     def is_pinned(self, resident: Resident) -> bool | None:
         """The kernel's word on a segment; None if its name is gone."""
@@ -123,7 +123,7 @@ class Reclaimer:
     def retire(self, resident: Resident, now_s: float, why: str = "request") -> bool:
         """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
         found = self._hide(resident)
-        self._ledger.retire(resident)
+        self.ledger.retire(resident)
         return self._watch(resident, now_s, why, found=found)
 
     def superseded(self, old: Resident, now_s: float) -> None:
@@ -141,13 +141,13 @@ class Reclaimer:
             old, new = resident.name, another_name(resident.name)
             _log.warning("cannot rename %s to %s: %s", old, zombie_name(old), error.strerror)
             found = self._directory.rename(old, zombie_name(new))
-            self._ledger.rename(resident, new)
+            self.ledger.rename(resident, new)
             self.observer.renamed(old)
             return found
 
     def _watch(self, resident: Resident, now_s: float, why: str, *, found: bool) -> bool:
         """Have an eye on a segment out of service; True if nobody has it mapped."""
-        retired = self._ledger.retired[resident.name]
+        retired = self.ledger.retired[resident.name]
         self.observer.retired(resident, why)
         if not found:
             self._forget(retired)
@@ -161,7 +161,7 @@ class Reclaimer:
 
     def adopt(self, resident: Resident, now_s: float) -> None:
         """Watch a retired segment of an earlier life of the daemon."""
-        self._ledger.add_retired(resident).probe_after_s = now_s + TICK_S
+        self.ledger.add_retired(resident).probe_after_s = now_s + TICK_S
         self.pins.keep(zombie_name(resident.name))
 
     def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
@@ -181,7 +181,7 @@ class Reclaimer:
             return None
         self.pins.release(zombie_name(name))
         del self._by_key[key]
-        old = self._ledger.revive(retired)
+        old = self.ledger.revive(retired)
         if old is not None:
             self.superseded(old, now_s)
         return retired.resident
@@ -200,13 +200,13 @@ class Reclaimer:
             if session is not None:
                 session.drop_segment(resident)
         self.observer.freed(resident)
-        return self._ledger.freed(resident.name)
+        return self.ledger.freed(resident.name)
 
     # --- freeing ------------------------------------------------------------------------------
 
     def sweep(self, now_s: float) -> int:
         """Look at the retired segments that are due and free those nobody has; returns the bytes freed."""
-        due = [one for one in self._ledger.retired.values() if one.probe_after_s <= now_s]
+        due = [one for one in self.ledger.retired.values() if one.probe_after_s <= now_s]
         return sum(self._probe(one, now_s) for one in due[:PROBES_AT_ONCE])
 
     def let_go(self, residents: Iterable[Resident], now_s: float) -> int:
@@ -214,7 +214,7 @@ class Reclaimer:
         freed = 0
         for resident in residents:
             self._pinned_until_s.pop(resident.name, None)
-            retired = self._ledger.retired.get(resident.name)
+            retired = self.ledger.retired.get(resident.name)
             if retired is not None:
                 freed += self._probe(retired, now_s)
         return freed
@@ -236,17 +236,17 @@ class Reclaimer:
         if self.pins.keeps(zombie_name(retired.resident.name)):
             retired.interval_s = min(max(TICK_S, 2 * retired.interval_s), WATCHED_INTERVAL_S)
             return retired.interval_s
-        return max(RETIRED_INTERVAL_S, RETIRED_SHARE_S * len(self._ledger.retired))
+        return max(RETIRED_INTERVAL_S, RETIRED_SHARE_S * len(self.ledger.retired))
 
     def hear(self, now_s: float) -> bool:
         """Somebody closed something: free what nobody has now; whether anything may fit that did not."""
         names = self.pins.closed()
         if names is None:
             self._pinned_until_s.clear()
-            names = {zombie_name(name) for name in self._ledger.retired}
+            names = {zombie_name(name) for name in self.ledger.retired}
         changed = False
         for name in names:
-            retired = self._ledger.retired.get(name.removesuffix(zombie_name("")))
+            retired = self.ledger.retired.get(name.removesuffix(zombie_name("")))
             if retired is not None:
                 retired.interval_s = 0.0
                 changed |= self._probe(retired, now_s) > 0
@@ -256,7 +256,7 @@ class Reclaimer:
 
     def next_sweep_s(self) -> float:
         """When the next look at a retired segment is due; infinity when there is none."""
-        return min((one.probe_after_s for one in self._ledger.retired.values()), default=float("inf"))
+        return min((one.probe_after_s for one in self.ledger.retired.values()), default=float("inf"))
 
     def free(self, shortage: int, now_s: float) -> Outcome:
         """Retire segments until ``shortage`` bytes are about to be freed.
@@ -264,10 +264,10 @@ class Reclaimer:
         Looks at a bounded number per call; `Outcome.PENDING` means that calling again later helps.
         """
         self.wake_s = float("inf")
-        missing = shortage - self._ledger.condemned_bytes()
+        missing = shortage - self.ledger.condemned_bytes()
         if missing <= 0:
             return Outcome.PENDING
-        candidates, graced = self._ledger.candidates(now_s, HAND_OUT_GRACE_S)
+        candidates, graced = self.ledger.candidates(now_s, HAND_OUT_GRACE_S)
         self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
         unknown = [r for r in candidates if r.name not in self._pinned_until_s]
         ordered = self._policy(unknown, self._sessions.poses())
@@ -296,7 +296,7 @@ class Reclaimer:
         if len(unknown) > PROBES_AT_ONCE:
             self.wake_s = now_s
             return Outcome.PENDING
-        return Outcome.PENDING if self._ledger.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
+        return Outcome.PENDING if self.ledger.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
 
     # --- who ----------------------------------------------------------------------------------
 
@@ -345,7 +345,7 @@ class Reclaimer:
 
     def remove_all(self) -> None:
         """Take every name away; memory goes back as soon as its last reader ends."""
-        for resident in self._ledger.everything():
+        for resident in self.ledger.everything():
             with contextlib.suppress(OSError):
                 self._directory.unlink(self._on_disk(resident))
 

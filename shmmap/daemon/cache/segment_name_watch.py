@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from shmmap.daemon.host.inotify import NAME_GONE, OVERFLOW, Inotify
 
-__all__ = ["NameWatch"]
+__all__ = ["SegmentNameWatch"]
 
 
-class NameWatch:
+class SegmentNameWatch:
     """Watches a directory for names that vanish.
 
     Attributes

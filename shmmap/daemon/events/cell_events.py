@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from shmmap.daemon.cache.ledger import Failure, Key, Ledger, Resident
-from shmmap.daemon.events.eviction_history import Ghosts
+from shmmap.daemon.events.eviction_history import EvictionHistory
 from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.loading.scheduler import SPACE_CODES
 from shmmap.protocol import events
@@ -40,7 +40,7 @@ class CellEvents:
         self._ledger = ledger
         self._statistics = statistics
         self._wire_id = wire_id
-        self._ghosts = Ghosts()
+        self._history = EvictionHistory()
         self.pressure = PressureEvents(log, self._memory)
 
     def _memory(self) -> tuple[int, int, int, int]:
@@ -50,7 +50,7 @@ class CellEvents:
 
     def loaded(self, resident: Resident, took_ns: int, *, replaces: int = 0) -> None:
         """A segment was loaded and published; ``took_ns`` from handing the load to a worker."""
-        again = self._ghosts.loaded(resident.key, resident.version)
+        again = self._history.loaded(resident.key, resident.version)
         self._statistics.add("loads_finished")
         self._statistics.add("bytes_loaded", resident.nbytes)
         self._statistics.add("loads_after_eviction", again)
@@ -59,7 +59,7 @@ class CellEvents:
 
     def revived(self, resident: Resident) -> None:
         """A retired segment is in service again, without a load."""
-        again = self._ghosts.loaded(resident.key, resident.version)
+        again = self._history.loaded(resident.key, resident.version)
         self._tell_loaded(resident, 0, again, 0)
 
     def _tell_loaded(self, resident: Resident, load_ns: int, again: bool, replaces: int) -> None:
@@ -75,7 +75,7 @@ class CellEvents:
     def retired(self, resident: Resident, why: str) -> None:
         """A segment left service; of superseded ones their successor's event tells."""
         if why == "room":
-            self._ghosts.evicted(resident.key, resident.version)
+            self._history.evicted(resident.key, resident.version)
         if why != "superseded":
             self._log.publish(
                 events.Evicted, self._wire_id(resident.key.cell_id), resident.key.layer,

@@ -10,12 +10,12 @@ from typing import Final
 
 from shmmap.daemon.records import Key
 
-__all__ = ["Ghosts"]
+__all__ = ["EvictionHistory"]
 
 LIMIT: Final = 1 << 14
 
 
-class Ghosts:
+class EvictionHistory:
     """The last keys that were evicted to make room, at most 16384 of them."""
 
     def __init__(self, limit: int = LIMIT) -> None:

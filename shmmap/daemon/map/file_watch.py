@@ -8,18 +8,17 @@ changes made on this machine: on NFS and the like, a reload has to be asked for.
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import logging
 import os
-import struct
 from collections.abc import Iterable
 from typing import Final
 
+from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
 from shmmap.errors import ConfigError
 from shmmap.origin.catalogue import Catalogue
 
-__all__ = ["MapWatch", "directories_of"]
+__all__ = ["FileWatch", "directories_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -28,24 +27,6 @@ MOST_S: Final = 5.0
 LOOK_S: Final = 1.0
 """How often a directory that has vanished is looked for."""
 
-# inotify(7); linux/inotify.h
-IN_CLOSE_WRITE: Final = 0x8
-IN_MOVED_FROM: Final = 0x40
-IN_MOVED_TO: Final = 0x80
-IN_CREATE: Final = 0x100
-IN_DELETE: Final = 0x200
-IN_DELETE_SELF: Final = 0x400
-IN_MOVE_SELF: Final = 0x800
-IN_IGNORED: Final = 0x8000
-IN_ISDIR: Final = 0x40000000
-IN_ONLYDIR: Final = 0x1000000
-IN_EXCL_UNLINK: Final = 0x4000000
-_MASK: Final = (
-    IN_CLOSE_WRITE | IN_MOVED_FROM | IN_MOVED_TO | IN_CREATE | IN_DELETE | IN_DELETE_SELF | IN_MOVE_SELF
-    | IN_ONLYDIR | IN_EXCL_UNLINK
-)  # fmt: skip
-_EVENT: Final = struct.Struct("=iIII")
-_READ_BYTES: Final = 64 << 10
 _REMOTE: Final = frozenset(
     {
         "nfs",
@@ -56,9 +37,9 @@ _REMOTE: Final = frozenset(
         "ceph",
         "lustre",
         "glusterfs",
+        "afs",
         "fuse.sshfs",
         "fuse.glusterfs",
-        "afs",
     }
 )
 
@@ -74,7 +55,7 @@ def directories_of(map_path: str, metadata: str, catalogue: Catalogue) -> set[st
     return {directory or "." for directory in found}
 
 
-class MapWatch:
+class FileWatch:
     """Watches directories for changes of the files in them.
 
     Parameters
@@ -94,23 +75,20 @@ class MapWatch:
     """
 
     def __init__(self, directories: Iterable[str]) -> None:
-        self._libc = ctypes.CDLL(None, use_errno=True)
-        self.fd: int = self._libc.inotify_init1(os.O_CLOEXEC | os.O_NONBLOCK)
-        if self.fd < 0:
-            number = ctypes.get_errno()
-            raise _refusal(number)
+        try:
+            self._inotify = Inotify()
+        except OSError as error:
+            raise _refusal(error) from error
+        self.fd = self._inotify.fd
         self._since_s: float | None = None
         self._last_s = self._look_s = 0.0
         self._paths: dict[int, str] = {}
         self._missing: set[str] = set()
-        try:
-            for directory in directories:
-                if (number := self._add(directory)) not in (0, errno.ENOENT, errno.ENOTDIR):
-                    raise _refusal(number)
-        except BaseException:
-            self.close()
-            raise
         for directory in sorted(directories):
+            refused = self._add(directory)
+            if refused is not None and refused.errno not in (errno.ENOENT, errno.ENOTDIR):
+                self.close()
+                raise _refusal(refused)
             if (kind := _file_system_of(directory)) in _REMOTE:
                 _log.warning(
                     "watch: %s is on %s, which does not tell of changes made elsewhere; reload to see them",
@@ -122,42 +100,31 @@ class MapWatch:
         for directory in directories:
             self._add(directory)
 
-    def _add(self, directory: str) -> int:
-        """Watch a directory; returns why that cannot be (errno), or 0."""
-        found = self._libc.inotify_add_watch(self.fd, os.fsencode(directory), _MASK)
-        if found < 0:
+    def _add(self, directory: str) -> OSError | None:
+        """Watch a directory, or return why that cannot be."""
+        try:
+            self._paths[self._inotify.add(directory, CHANGED)] = directory
+        except OSError as error:
             self._missing.add(directory)
-            return ctypes.get_errno()
-        self._paths[found] = directory
+            return error
         self._missing.discard(directory)
-        return 0
+        return None
 
     def drain(self, now_s: float) -> None:
-        """Take note of what the kernel tells."""
-        while data := self._read():
-            at = 0
-            while at + _EVENT.size <= len(data):
-                watch, mask, _, length = _EVENT.unpack_from(data, at)
-                at += _EVENT.size + length
-                if mask & IN_MOVE_SELF:  # what is followed is a path, not what used to be there
-                    self._libc.inotify_rm_watch(self.fd, watch)
-                if mask & (IN_MOVE_SELF | IN_IGNORED) and watch in self._paths:
-                    self._missing.add(self._paths.pop(watch))
-                # a file that is only created has nothing in it yet: its writer closes or renames it
-                if mask & IN_IGNORED or (mask & IN_CREATE and not mask & IN_ISDIR):
-                    continue
+        """Take note of what the kernel tells, a bounded number of events at a time."""
+        for event in self._inotify.read():
+            if event.mask & SELF_MOVED:  # what is followed is a path, not what used to be there
+                self._inotify.remove(event.watch)
+            if event.mask & (SELF_MOVED | ENDED) and event.watch in self._paths:
+                self._missing.add(self._paths.pop(event.watch))
+            # a file that is only created has nothing in it yet: its writer closes or renames it
+            if not event.mask & ENDED and (event.mask & DIRECTORY or not event.mask & CREATED):
                 self._note(now_s)
 
     def _note(self, now_s: float) -> None:
         if self._since_s is None:
             self._since_s = now_s
         self._last_s = now_s
-
-    def _read(self) -> bytes:
-        try:
-            return os.read(self.fd, _READ_BYTES)
-        except BlockingIOError:
-            return b""
 
     def due(self, now_s: float) -> bool:
         """Whether it is time to read the map again; says so once."""
@@ -175,14 +142,12 @@ class MapWatch:
 
     def close(self) -> None:
         """Watch no more."""
-        if self.fd >= 0:
-            os.close(self.fd)
-            self.fd = -1
+        self._inotify.close()
 
 
-def _refusal(number: int) -> ConfigError:
+def _refusal(error: OSError) -> ConfigError:
     limits = "raise fs.inotify.max_user_watches and max_user_instances, or leave out --watch"
-    return ConfigError(f"cannot watch the map: {os.strerror(number)}", key="watch", hint=limits)
+    return ConfigError(f"cannot watch the map: {error.strerror}", key="watch", hint=limits)
 
 
 def _file_system_of(path: str) -> str:

@@ -52,7 +52,7 @@ class SessionQuota:
         ]
         if session.held_bytes + sum(sizes) <= self._nbytes:
             return
-        self._refresh(session)
+        cache.survey.drop_unused(session, self._now_s() - HAND_OUT_GRACE_S)
         left = self._nbytes - session.exclusive_bytes()
         # a new version takes the place of the old one that its holder is about to drop
         replaced = {r.key: r.nbytes for r in session.residents() if not cache.is_current(r)}
@@ -75,11 +75,3 @@ class SessionQuota:
                 wanted.refused[key] = ("over_budget", message)
                 self._statistics.add("refused_quota")
                 cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self._now_s())
-
-    def _refresh(self, session: Session) -> None:
-        """Ask the kernel which segments the session really still uses."""
-        before_s = self._now_s() - HAND_OUT_GRACE_S
-        for resident in session.residents():
-            slots = self._cache.reclaimer.slots_of(resident)
-            if slots is not None and session.slot not in slots and resident.last_use_s < before_s:
-                session.drop_segment(resident)

@@ -8,18 +8,35 @@ MONOTONIC_USEC (newer versions fail the reload without it) and READY=1 when it i
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import re
+import socket
 import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from shmmap.daemon.service_manager.notify import notify
-
-__all__ = ["ServiceManager", "status_line", "watchdog_interval_s"]
+__all__ = ["ServiceManager", "notify", "status_line", "watchdog_interval_s"]
 
 STATUS_EVERY_S: Final = 2.0
 """Each status line wakes whoever listens to the service manager: not at every beat."""
+
+
+def notify(*lines: str) -> None:
+    """Send ``KEY=value`` lines to ``NOTIFY_SOCKET`` (sd_notify(3)), if there is one.
+
+    A line break inside a value (a path may have one) becomes a blank: it would start another line.
+    """
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
+    ):
+        text = "\n".join(line.replace("\n", " ") for line in lines)
+        channel.sendto(text.encode(errors="replace"), re.sub("^@", "\0", address))
 
 
 def watchdog_interval_s(environ: Mapping[str, str]) -> float:

@@ -11,7 +11,6 @@ from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.pin_census import PinCensus
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import client_row
@@ -24,8 +23,6 @@ __all__ = ["BEAT_S", "Heartbeat"]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
-PROBES_A_BEAT: Final = 16
-"""Segments whose pins are looked at: about half a millisecond."""
 EVENT_BEAT_S: Final = 1.0
 """How often listeners are told the last event's number, so that a missed one does not stay unnoticed."""
 USED_ROWS_A_BEAT: Final = 64
@@ -61,7 +58,6 @@ class Heartbeat:
         self._waiting = waiting
         self._on_beat = on_beat
         self._event_log = event_log
-        self._pins = PinCensus(cache.ledger.everything, cache.reclaimer.is_pinned)
         self._recent = RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
         self._looked_s = self._told_s = float("-inf")
         self._last_s = 0.0
@@ -88,6 +84,8 @@ class Heartbeat:
         set_value("bytes_resident", ledger.resident_bytes)
         set_value("zombies", len(ledger.zombies))
         set_value("bytes_zombie", ledger.zombie_bytes)
+        set_value("bytes_pinned", self._cache.survey.usage.nbytes)
+        set_value("segments_pinned", self._cache.survey.usage.count)
         set_value("bytes_reserved", ledger.reserved_bytes)
         set_value("bytes_statistics", self._statistics.size_bytes)
         set_value("budget_bytes", ledger.budget_bytes)
@@ -98,9 +96,8 @@ class Heartbeat:
     def _look_around(self, now_s: float) -> None:
         """What takes longer, and need not be done at each of many beats while cells load."""
         self._looked_s = now_s
-        self._pins.look(PROBES_A_BEAT)
-        self._statistics.set("bytes_pinned", self._pins.pinned_bytes)
-        self._statistics.set("segments_pinned", self._pins.pinned_count)
+        if self._cache.survey.idle:  # else the serving loop is at it
+            self._cache.survey.step()
         values = self._statistics.values
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):

@@ -7,34 +7,18 @@ daemon's own user always may; so may members of the configured administrators' g
 
 from __future__ import annotations
 
-import grp
 import os
 import pwd
 from typing import Final
 
+from shmmap.daemon.host.groups import group_id
 from shmmap.daemon.transport.sessions import Peer
-from shmmap.errors import ConfigError, NotPermitted
+from shmmap.errors import NotPermitted
 
-__all__ = ["Privileges", "group_id"]
+__all__ = ["Privileges"]
 
 MEMORY_S: Final = 10.0
 """How long a user's groups are remembered: asking may mean asking a server far away."""
-
-
-def group_id(name: str, key: str) -> int:
-    """Return the id of a group given by name or number; ``key`` is the setting it comes from.
-
-    Raises
-    ------
-    ConfigError
-        There is no such group.
-    """
-    try:
-        return grp.getgrnam(name).gr_gid
-    except KeyError:
-        if name.isdigit():
-            return int(name)
-        raise ConfigError(f"there is no group {name!r}", key=key, hint=f"groupadd --system {name}") from None
 
 
 class Privileges:

@@ -10,7 +10,7 @@ from typing import Final
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Resident
-from shmmap.daemon.cache.pin_survey import Pinned, Share
+from shmmap.daemon.cache.survey import Share, Usage
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
@@ -164,20 +164,19 @@ class Admin:
                 removed.pop(cell, None)
         return changed, list(removed)
 
-    def stats(self, message: messages.Stats, pinned: Pinned, now_s: float) -> messages.StatsReply:
-        """Answer a request for statistics with what a survey of pins found."""
-        self._statistics.set("bytes_pinned", pinned.pinned_bytes)
+    def stats(self, message: messages.Stats, usage: Usage, now_s: float) -> messages.StatsReply:
+        """Answer a request for statistics with what a survey found."""
         return messages.StatsReply(
             request=message.request,
             epoch=self._epoch,
             map_version=self._cache.catalogue.map_version,
             counters=dict(self._statistics.values),
             sessions=tuple(
-                self._session_row(session, pinned.shares.get(session.slot, Share()), now_s)
+                self._session_row(session, usage.shares.get(session.slot, Share()), now_s)
                 for session in self._sessions
             ),
-            unknown_holders=pinned.unknown,
-            unknown_bytes=pinned.unknown_bytes,
+            unknown_holders=usage.unknown,
+            unknown_bytes=usage.unknown_bytes,
         )
 
     def _session_row(self, session: Session, share: Share, now_s: float) -> messages.SessionRow:

@@ -10,19 +10,20 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.daemon.host import inotify
 from shmmap.daemon.map import file_watch
-from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, MapWatch
+from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch
 from shmmap.errors import ConfigError
 
 
 @pytest.fixture
-def watch(tmp_path: Path) -> Iterator[MapWatch]:
-    one = MapWatch([str(tmp_path)])
+def watch(tmp_path: Path) -> Iterator[FileWatch]:
+    one = FileWatch([str(tmp_path)])
     yield one
     one.close()
 
 
-def test_it_is_due_once_the_files_were_left_alone(watch: MapWatch, tmp_path: Path) -> None:
+def test_it_is_due_once_the_files_were_left_alone(watch: FileWatch, tmp_path: Path) -> None:
     assert not watch.due(100.0)
     (tmp_path / "a.pcd").write_bytes(b"a")
     watch.drain(100.0)
@@ -34,7 +35,7 @@ def test_it_is_due_once_the_files_were_left_alone(watch: MapWatch, tmp_path: Pat
     assert not watch.due(200.0)  # once
 
 
-def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: MapWatch, tmp_path: Path) -> None:
+def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: FileWatch, tmp_path: Path) -> None:
     now_s = 100.0
     while now_s < 100.0 + MOST_S:
         (tmp_path / "a.pcd").write_bytes(b"a")
@@ -64,7 +65,7 @@ def test_changes(tmp_path: Path, how: str) -> None:
     (tmp_path / "outside2").mkdir()
     (tmp_path / "outside" / "n").write_bytes(b"n")
     (tmp_path / "a.pcd").write_bytes(b"a")
-    watch = MapWatch([str(tmp_path)])
+    watch = FileWatch([str(tmp_path)])
     change = changes(tmp_path)[how]
     assert callable(change)
     change()
@@ -73,7 +74,7 @@ def test_changes(tmp_path: Path, how: str) -> None:
     watch.close()
 
 
-def test_reading_is_no_change(watch: MapWatch, tmp_path: Path) -> None:
+def test_reading_is_no_change(watch: FileWatch, tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_bytes(b"a")
     watch.drain(1.0)
     assert watch.due(2.0)
@@ -83,7 +84,7 @@ def test_reading_is_no_change(watch: MapWatch, tmp_path: Path) -> None:
     assert not watch.due(9.0)
 
 
-def test_a_directory_that_comes_later_is_followed(watch: MapWatch, tmp_path: Path) -> None:
+def test_a_directory_that_comes_later_is_followed(watch: FileWatch, tmp_path: Path) -> None:
     later = tmp_path / "later"
     watch.follow([str(later)])  # not there yet
     later.mkdir()
@@ -95,7 +96,7 @@ def test_a_directory_that_comes_later_is_followed(watch: MapWatch, tmp_path: Pat
     assert watch.due(4.0)
 
 
-def test_a_directory_that_may_not_be_watched_ends_nothing(watch: MapWatch, tmp_path: Path) -> None:
+def test_a_directory_that_may_not_be_watched_ends_nothing(watch: FileWatch, tmp_path: Path) -> None:
     """The metadata may name a place that is none: it is looked for again."""
     odd = tmp_path / "odd"
     odd.symlink_to(odd)
@@ -116,7 +117,7 @@ def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
     """Moved aside, it is of no interest any more; what takes its place is, however late it comes."""
     place, aside = tmp_path / "map", tmp_path / "aside"
     place.mkdir()
-    watch = MapWatch([str(place)])
+    watch = FileWatch([str(place)])
     place.rename(aside)
     watch.drain(10.0)
     assert watch.due(11.0)
@@ -132,10 +133,8 @@ def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
     watch.close()
 
 
-def test_a_full_queue_counts_as_a_change(watch: MapWatch, monkeypatch: pytest.MonkeyPatch) -> None:
-    overflow = file_watch._EVENT.pack(-1, 0x4000, 0, 0)
-    told = iter([overflow, b""])
-    monkeypatch.setattr(watch, "_read", lambda: next(told))
+def test_a_full_queue_counts_as_a_change(watch: FileWatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inotify.Inotify, "read", lambda _: [inotify.Event(-1, inotify.OVERFLOW, "")])
     watch.drain(1.0)
     assert watch.due(2.0)
 
@@ -155,9 +154,9 @@ def test_a_limit_of_the_kernel_is_a_matter_of_configuration(
             del fd, path, mask
             return -1
 
-    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: Full())
+    monkeypatch.setattr(inotify, "_libc", Full())
     with pytest.raises(ConfigError, match="No space left") as raised:
-        MapWatch([str(tmp_path)])
+        FileWatch([str(tmp_path)])
     assert "max_user_watches" in raised.value.hint
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import os
 import select
-from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.cache.segment_name_watch import NameWatch
 from shmmap.daemon.pins.probe import PinSupport, Rung, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.segment.attach import attach, unmap
@@ -124,15 +122,3 @@ def test_an_attached_segment_and_its_last_view(directory: ShmDirectory) -> None:
     assert pins.closed() == {NAME}
     assert pins.is_used(NAME) is False
     pins.close()
-
-
-def test_names_that_vanish(directory: ShmDirectory) -> None:
-    names = NameWatch(directory.path, "/shmmap.unit.")
-    assert names.gone() == set()
-    Path(directory.path, "shmmap.other.1").write_bytes(b"")
-    Path(directory.path, "shmmap.other.1").unlink()
-    directory.rename(NAME, NAME + ".zombie")
-    directory.unlink(NAME + ".zombie")
-    assert reported(names.fd)
-    assert names.gone() == {NAME, NAME + ".zombie"}
-    names.close()

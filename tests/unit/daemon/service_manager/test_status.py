@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import math
 import os
+import socket
+from pathlib import Path
 
 import pytest
 
 from shmmap.daemon.service_manager.status import (
     STATUS_EVERY_S,
     ServiceManager,
+    notify,
     status_line,
     watchdog_interval_s,
 )
@@ -93,3 +96,24 @@ def test_the_line_an_operator_reads() -> None:
     assert line == "212 of 4096 cells, 3.0 of 6.0 GiB, 5 clients"
     line = status_line(resident=0, cells=1, used_bytes=0, budget_bytes=64 << 20, clients=1, failed=2)
     assert line == "0 of 1 cells, 0.0 of 64.0 MiB, 1 client, 2 failed loads"
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_notify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool) -> None:
+    name = f"{tmp_path}/notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" + name if abstract else name)
+        monkeypatch.setenv("NOTIFY_SOCKET", "@" + name if abstract else name)
+        notify("READY=1", "STATUS=serving 5 cells of a\nMAINPID=1")
+        manager.settimeout(10)
+        assert manager.recv(100) == b"READY=1\nSTATUS=serving 5 cells of a MAINPID=1"
+
+
+@pytest.mark.parametrize(
+    "address", ["", "/nowhere/notify", "@nobody-listens-here", "relative", "@" + "x" * 300]
+)
+def test_nobody_listens(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", address)
+    notify("READY=1")
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    notify("READY=1")

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory is pinned, and how much of it by nobody known: asked of the kernel bit by bit.
+"""Who maps how much of the memory: asked of the kernel a few segments at a time.
 
-One look at a segment takes about 30 us, and there may be thousands: the serving loop does a few per
-turn, and everybody who asked meanwhile gets the result of one survey.
+Only the kernel knows.  One look at a segment takes about 30 us, and there may be thousands: there is one
+walk over all of them, in slices.  A slice a beat keeps the gauges of the statistics up to date; when
+somebody asks, a new walk begins and the serving loop does a slice a turn, and everybody who asked before
+it began gets its result.
 """
 
 from __future__ import annotations
@@ -17,20 +19,22 @@ from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import Busy
 
-__all__ = ["PinSurvey", "Pinned", "Share"]
+__all__ = ["Share", "Survey", "Usage"]
 
 LOOKS_AT_ONCE: Final = 16
 """Half a millisecond of the serving loop."""
 ASKING_S: Final = 0.2
-"""Time of the processor that asking who holds what may take in one survey; 2048 segments take 0.03 s."""
+"""Time of the processor that asking who holds what may take in one walk; 2048 segments take 0.03 s."""
 STEP_S: Final = 0.001
 LONG_STEP_S: Final = 0.003
 SHARE: Final = 0.1
 """Part of the loop's time that steps get when they take long (somebody holds very many locks)."""
 MOST_SEGMENTS: Final = 2048
-"""The largest are looked at."""
+"""Where somebody waits for the result, the largest are looked at."""
 MOST_ASKED: Final = 16
 """Answers one session may wait for."""
+REFRESH_S: Final = 0.03
+"""Time of the processor that looking at what one session holds may take."""
 
 
 @dataclass(slots=True)
@@ -43,23 +47,30 @@ class Share:
 
 
 @dataclass(slots=True)
-class Pinned:
-    """What the largest segments come to; ``unknown`` ones are mapped by nobody who told.
+class Usage:
+    """What the segments come to that somebody maps; ``unknown`` ones are mapped by nobody who told.
 
     ``shares`` goes by the slots of the sessions that map anything.
     """
 
-    pinned_bytes: int = 0
+    count: int = 0
+    nbytes: int = 0
     unknown: int = 0
     unknown_bytes: int = 0
     shares: dict[int, Share] = field(default_factory=dict)
 
 
-Answer = Callable[[Pinned], None]
+Answer = Callable[[Usage], None]
 
 
-class PinSurvey:
-    """Looks at all segments, a few per `step`."""
+class Survey:
+    """Looks at all segments, a few per `step`.
+
+    Attributes
+    ----------
+    usage : Usage
+        What the last whole walk found.
+    """
 
     def __init__(self, reclaimer: Reclaimer, *, in_service: Callable[[Resident], bool]) -> None:
         self._reclaimer = reclaimer
@@ -67,13 +78,13 @@ class PinSurvey:
         self._asked: list[tuple[Session, Answer]] = []
         self._running: list[tuple[Session, Answer]] = []
         self._left: list[Resident] = []
-        self._found = Pinned()
+        self.usage = self._found = Usage()
         self._rests_until_s = 0.0
         self._asking_s = 0.0
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether nobody waits for a result."""
         return not (self._asked or self._running)
 
     @property
@@ -82,7 +93,7 @@ class PinSurvey:
         return float("inf") if self.idle else self._rests_until_s
 
     def ask(self, session: Session, answer: Answer) -> None:
-        """Have ``answer`` called with the result of a survey that begins after now.
+        """Have ``answer`` called with the result of a walk that begins after now.
 
         Raises
         ------
@@ -94,7 +105,7 @@ class PinSurvey:
         self._asked.append((session, answer))
 
     def turn(self, now_s: float) -> None:
-        """Do a step, unless the one before took so long that others come first."""
+        """Do a step if somebody waits, unless the one before took so long that others come first."""
         if self.idle or now_s < self._rests_until_s:
             return
         self.step()
@@ -103,17 +114,34 @@ class PinSurvey:
 
     def step(self) -> None:
         """Look at a few segments, or hand the result to one who asked."""
-        if self._left:
-            self._look()
-        elif self._running:
-            _, answer = self._running.pop()
-            answer(self._found)
-        elif self._asked:
+        if self._asked and not self._running:
             self._running, self._asked = self._asked[::-1], []
-            self._left = self._reclaimer.everything()[:MOST_SEGMENTS]
-            self._found = Pinned()
-            self._asking_s = 0.0
-            self._look()
+            self._begin(MOST_SEGMENTS)
+        elif self._running and not self._left:
+            _, answer = self._running.pop()
+            answer(self.usage)
+            return
+        elif not self._left:
+            self._begin(None)
+        self._look()
+
+    def drop_unused(self, session: Session, before_s: float) -> None:
+        """Take off a session's ledger what it does not map any more, for a bounded time, largest first.
+
+        Of what was handed out at ``before_s`` or later it may be about to open.
+        """
+        end_s = time.thread_time() + REFRESH_S
+        for resident in sorted(session.residents(), key=lambda resident: -resident.nbytes):
+            if time.thread_time() > end_s:
+                break
+            slots = self._reclaimer.slots_of(resident) if resident.last_use_s < before_s else None
+            if slots is not None and session.slot not in slots:
+                session.drop_segment(resident)
+
+    def _begin(self, most: int | None) -> None:
+        self._left = self._reclaimer.ledger.everything()[:most]
+        self._found = Usage()
+        self._asking_s = 0.0
 
     def _slots_of(self, resident: Resident) -> list[int]:
         """Who has a segment locked, as far as there is time to ask: else its pin counts as unknown."""
@@ -132,13 +160,16 @@ class PinSurvey:
             resident = self._left.pop()
             users = self._reclaimer.users_among(resident, self._slots_of(resident))
             if users:
-                found.pinned_bytes += resident.nbytes
+                found.count += 1
+                found.nbytes += resident.nbytes
             for slot in users:
                 if slot == UNKNOWN_SLOT:
                     found.unknown += 1
                     found.unknown_bytes += resident.nbytes
                 else:
                     self._add(found.shares.setdefault(slot, Share()), resident)
+        if not self._left:
+            self.usage = found
 
     def _add(self, share: Share, resident: Resident) -> None:
         share.mapped_bytes += resident.nbytes

@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes to the log and to the service manager."""
+"""What goes to the log."""
 
 from __future__ import annotations
 
 import logging
 import re
-import socket
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from shmmap.daemon.host.logs import set_up_logging
-from shmmap.daemon.service_manager.notify import notify
 
 
 @pytest.fixture
@@ -58,24 +55,3 @@ def test_under_systemd(
     assert len(lines) > 8
     assert all(line.startswith("<3>") for line in lines[5:])
     assert lines[-1] == "<3>ValueError: no"
-
-
-@pytest.mark.parametrize("abstract", [False, True])
-def test_notify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool) -> None:
-    name = f"{tmp_path}/notify"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind("\0" + name if abstract else name)
-        monkeypatch.setenv("NOTIFY_SOCKET", "@" + name if abstract else name)
-        notify("READY=1", "STATUS=serving 5 cells of a\nMAINPID=1")
-        manager.settimeout(10)
-        assert manager.recv(100) == b"READY=1\nSTATUS=serving 5 cells of a MAINPID=1"
-
-
-@pytest.mark.parametrize(
-    "address", ["", "/nowhere/notify", "@nobody-listens-here", "relative", "@" + "x" * 300]
-)
-def test_nobody_listens(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
-    monkeypatch.setenv("NOTIFY_SOCKET", address)
-    notify("READY=1")
-    monkeypatch.delenv("NOTIFY_SOCKET")
-    notify("READY=1")

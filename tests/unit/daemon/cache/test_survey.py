@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The survey looks at a few segments a step, and whoever asks hears of a walk that began afterwards."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+
+from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.cache.reclaimer import UNKNOWN_SLOT, Reclaimer
+from shmmap.daemon.cache.survey import LOOKS_AT_ONCE, MOST_ASKED, Survey, Usage
+from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+from shmmap.errors import Busy
+
+SEGMENTS = 3 * LOOKS_AT_ONCE
+
+
+def resident(number: int) -> Resident:
+    return Resident(
+        f"{number}", Key(f"{number}", "points"), number, 100 + number, 1, (0.0, 0.0, 1.0, 1.0), 0.0, 1.0
+    )
+
+
+class Memory:
+    """Segments and who maps them; stands for the reclaimer."""
+
+    def __init__(self, count: int = SEGMENTS) -> None:
+        self.segments = [resident(number) for number in range(count)]
+        self.users: dict[str, list[int]] = {}
+        self.looked = 0
+
+    def everything(self) -> list[Resident]:
+        return sorted(self.segments, key=lambda one: -one.nbytes)
+
+    def slots_of(self, one: Resident) -> list[int] | None:
+        if one not in self.segments:
+            return None
+        return [slot for slot in self.users.get(one.name, []) if slot != UNKNOWN_SLOT]
+
+    def users_among(self, one: Resident, slots: list[int]) -> list[int]:
+        del slots
+        self.looked += 1
+        return self.users.get(one.name, [])
+
+
+def survey_of(memory: Memory, *, superseded: frozenset[str] = frozenset()) -> Survey:
+    return Survey(cast("Reclaimer", memory), in_service=lambda one: one.name not in superseded)
+
+
+def session() -> Session:
+    return Sessions().open(b"12345", Peer(), "", 0.0)
+
+
+def test_the_gauges_follow_one_walk_behind() -> None:
+    memory = Memory()
+    survey = survey_of(memory)
+    memory.users = {"1": [7], "2": [UNKNOWN_SLOT], "40": [7, 8]}
+    survey.step()
+    survey.step()
+    assert memory.looked == 2 * LOOKS_AT_ONCE
+    assert survey.usage == Usage()
+    survey.step()
+    assert (survey.usage.count, survey.usage.nbytes) == (3, 101 + 102 + 140)
+    memory.users = {"2": [UNKNOWN_SLOT]}
+    for _ in range(3):
+        survey.step()
+    assert (survey.usage.count, survey.usage.nbytes) == (1, 102)
+    memory.segments.clear()
+    survey.step()
+    assert survey.usage == Usage()
+
+
+def test_who_asks_hears_of_a_walk_that_began_afterwards() -> None:
+    memory = Memory()
+    survey = survey_of(memory, superseded=frozenset({"3"}))
+    survey.step()  # a walk is under way
+    memory.users = {"47": [7], "3": [7, UNKNOWN_SLOT]}
+    told: list[Usage] = []
+    assert survey.next_step_s == float("inf")
+    survey.turn(0.0)
+    assert memory.looked == LOOKS_AT_ONCE, "nobody asked"
+    survey.ask(session(), told.append)
+    survey.ask(session(), told.append)
+    while not survey.idle:
+        survey.step()
+    assert memory.looked == LOOKS_AT_ONCE + SEGMENTS
+    assert told[0] is told[1] is survey.usage
+    share = told[0].shares[7]
+    assert (share.mapped_bytes, share.superseded, share.superseded_bytes) == (147 + 103, 1, 103)
+    assert (told[0].unknown, told[0].unknown_bytes, told[0].count) == (1, 103, 2)
+
+
+def test_without_segments_the_answer_comes_all_the_same() -> None:
+    survey, told = survey_of(Memory(0)), list[Usage]()
+    survey.ask(session(), told.append)
+    while not survey.idle:
+        survey.step()
+    assert told == [Usage()]
+
+
+def test_one_session_waits_for_so_many_answers() -> None:
+    survey, mine = survey_of(Memory()), session()
+
+    def nothing(usage: Any) -> None:
+        del usage
+
+    for _ in range(MOST_ASKED):
+        survey.ask(mine, nothing)
+    with pytest.raises(Busy):
+        survey.ask(mine, nothing)
+    survey.ask(session(), nothing)
+
+
+def test_a_session_keeps_what_it_maps_or_was_just_given() -> None:
+    memory, mine = Memory(4), session()
+    mapped, dropped, fresh, gone = memory.segments
+    mine.hold(memory.segments)
+    memory.users = {mapped.name: [mine.slot]}
+    fresh.last_use_s = 99.5
+    memory.segments.remove(gone)
+    survey_of(memory).drop_unused(mine, 99.0)
+    assert dropped not in mine.residents()
+    assert {one.name for one in mine.residents()} == {mapped.name, fresh.name, gone.name}
