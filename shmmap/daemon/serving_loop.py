@@ -1,62 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The serving loop: one thread, one ROUTER socket, nothing in it that waits for a disk.
 
-Requests come first; between them the loop hears its workers, watches its clients' processes and
-frees memory.  Files are read and layers built elsewhere (`workers`).
+Requests come first; between them the loop hears its loaders, watches its clients' processes and
+frees memory.  Files are read and layers built elsewhere (`shmmap.daemon.loading.worker_main`).
 """
 
 from __future__ import annotations
 
-import logging
-import math
-import select
 import time
-from collections.abc import Callable
 from typing import Final
 
 import zmq
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Resident
-from shmmap.daemon.cache.pin_survey import Pinned, PinSurvey
-from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.events.map_events import tell_reload, tell_reload_failed
-from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.requests.cell_requests import CellRequests
-from shmmap.daemon.requests.handshake import Handshake
-from shmmap.daemon.requests.limits import bounded_intent
-from shmmap.daemon.requests.operators.authorization import Privileges
-from shmmap.daemon.requests.operators.operator_requests import Admin
-from shmmap.daemon.telemetry.sampler import BEAT_S, Heartbeat
+from shmmap.daemon.requests.dispatch import Dispatch
+from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
+from shmmap.daemon.telemetry.sampler import BEAT_S, Sampler
 from shmmap.daemon.transport.crowd_control import CrowdControl
-from shmmap.daemon.transport.inbox import Heard, Inbox, peer_of
-from shmmap.daemon.transport.listen_gate import ListenGate
-from shmmap.daemon.transport.outbox import Outbox
-from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
-from shmmap.origin.catalogue import Catalogue, compare
-from shmmap.protocol import messages
-from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
+from shmmap.daemon.transport.inbox import Inbox
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["ServingLoop"]
 
-_log = logging.getLogger(__name__)
-
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
-FAREWELL_S: Final = 1.0
-"""How long a stop waits for the one who asked for it: libzmq drops a reply that was not read when the
-connection ends (ZMQ_IMMEDIATE)."""
-WORTH_AN_ANSWER_BYTES: Final = 1 << 16
-"""A longer request that is refused unread is dropped: finding its number takes too long."""
-_PRIVILEGED: Final = (
-    messages.Reload,
-    messages.Evict,
-    messages.Pin,
-    messages.Unpin,
-    messages.Shutdown,
-)
 
 
 class ServingLoop:
@@ -66,160 +36,82 @@ class ServingLoop:
     ----------
     socket
         Bound ROUTER socket; closed by the caller.
-    admin
-        Everything that is not a request for cells.
-    on_beat
-        Called a few times a second, from the loop itself: whoever is hung does not beat.
     """
 
     def __init__(
         self,
         socket: zmq.Socket[bytes],
+        watched: WatchedDescriptors,
+        inbox: Inbox,
+        dispatch: Dispatch,
+        operators: OperatorRequests,
+        cells: CellRequests,
         cache: CellCache,
-        sessions: Sessions,
+        scheduler: Scheduler,
+        crowd: CrowdControl,
+        sampler: Sampler,
         statistics: StatisticsWriter,
-        admin: Admin,
-        reloader: Reloader,
-        privileges: Privileges,
-        event_log: EventLog,
-        *,
-        epoch: int,
-        quota_bytes: int,
-        on_beat: Callable[[], None],
     ) -> None:
         self._socket = socket
+        self._watched = watched
+        self._inbox = inbox
+        self._dispatch = dispatch
+        self._operators = operators
+        self._cells = cells
         self._cache = cache
-        self._sessions = sessions
+        self._scheduler = scheduler
+        self._crowd = crowd
+        self._sampler = sampler
         self._statistics = statistics
-        self._admin = admin
-        self._reloader = reloader
-        self._privileges = privileges
-        self._event_log = event_log
-        self._epoll = select.epoll()
-        self._events: dict[int, Callable[[], None]] = {}
-        self._stopping = False
-        self._asked_to_stop: Session | None = None
-        self._stop_by_s = math.inf
         self._answer_at_end = True
-        self.cells = CellRequests(
-            cache, statistics, epoch=epoch, quota_bytes=quota_bytes, send=self._send, clock=time.monotonic
-        )
-        self._handshake = Handshake(
-            sessions,
-            self.cells,
-            statistics,
-            event_log,
-            watch=self.watch,
-            unwatch=self.unwatch,
-            on_left=self._left,
-        )
-        self._heartbeat = Heartbeat(
-            cache, statistics, event_log, sessions=sessions, waiting=self.cells, on_beat=on_beat
-        )
-        self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
-        self._outbox = Outbox(socket, statistics)
-        self._inbox = Inbox(socket, sessions, statistics, self._refuse_unread)
-        self._survey = PinSurvey(cache.reclaimer, in_service=cache.is_in_service)
-        self._gate = ListenGate(self.watch, self.unwatch)
-        self._crowd = CrowdControl(
-            self._gate,
-            waiting_bytes=self._inbox.waiting_bytes,
-            unread_bytes=lambda: self._outbox.unread(list(sessions)),
-            session_descriptors=lambda: [session.fd for session in sessions],
-        )
-        for fd, hear in ((cache.reclaimer.pins.fd, cache.loads.hear), (cache.names.fd, cache.hear_of_names)):
-            if fd >= 0:
-                self.watch(fd, lambda hear=hear: hear(time.monotonic()))  # type: ignore[misc]
+        self.stopping = False
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
-        self._poller.register(self._epoll.fileno(), zmq.POLLIN)
-
-    # --- other sources of events ------------------------------------------------------------------
-
-    def watch(self, fd: int, callback: Callable[[], None]) -> None:
-        """Call ``callback`` from the loop whenever ``fd`` is readable."""
-        self._events[fd] = callback
-        self._epoll.register(fd, select.EPOLLIN)
-
-    def unwatch(self, fd: int) -> None:
-        """Stop watching; before the descriptor is closed."""
-        if self._events.pop(fd, None) is not None:
-            self._epoll.unregister(fd)
-
-    def watch_worker(self, fd: int) -> None:
-        """Hear a loader worker."""
-        self.watch(fd, lambda: self._on_worker(fd))
-
-    def _on_worker(self, fd: int) -> None:
-        worker = self._cache.loads.pool.by_fd(fd)
-        if worker is not None:
-            self._cache.loads.on_worker(worker, time.monotonic())
-
-    @property
-    def stopping(self) -> bool:
-        """Whether the loop ends after this turn."""
-        return self._stopping
-
-    def guard(self) -> None:
-        """From now on descriptors and memory are watched; call it when everything is bound."""
-        self._gate.close_behind()
-        self._outbox.paths = self._gate.paths
-        self._crowd.begin()
-
-    def watch_crowd(self, now_s: float) -> None:
-        """Look whether clients take more than there is; called a few times a second."""
-        self._crowd.beat(now_s)
+        self._poller.register(watched.fd, zmq.POLLIN)
 
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
-        self._stopping = True
+        self.stopping = True
         self._answer_at_end = answer
-
-    # --- the loop ---------------------------------------------------------------------------------
 
     def run(self) -> None:
         """Serve until `stop`; then answer those who still wait."""
-        while not self._stopping:
-            now_s = time.monotonic()
-            until_s = min(
-                self._cache.loads.next_event_s(),
-                self.cells.next_deadline_s(),
-                self._heartbeat.next_s,
-                self._survey.next_step_s,
-            )
-            timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
-            busy = len(self._inbox) or not self._crowd.idle
-            ready = self._poller.poll(0 if busy else min(timeout_ms, int(BEAT_S * 1000)))
-            self._turn(ready)
-        self._gate.release()
-        if self._answer_at_end:
-            self.cells.answer_all(time.monotonic())
-            while not self._survey.idle:
-                self._survey.step()
+        while not self.stopping:
+            self._turn(self._poller.poll(self._patience_ms()))
 
-    def close(self) -> None:
-        """Stop watching; after everything watched is gone."""
-        self._epoll.close()
+    def answer_waiting(self) -> None:
+        """Answer those who still wait, unless they are left to the next life."""
+        if self._answer_at_end:
+            self._cells.answer_all(time.monotonic())
+            while not self._cache.survey.idle:
+                self._cache.survey.step()
+
+    def _patience_ms(self) -> int:
+        """How long nothing has to be done if nothing comes."""
+        if len(self._inbox) or not self._crowd.idle:
+            return 0
+        until_s = min(
+            self._scheduler.next_event_s(),
+            self._cells.next_deadline_s(),
+            self._sampler.next_s,
+            self._cache.survey.next_step_s,
+        )
+        wait_s = min(max(0.0, until_s - time.monotonic()), BEAT_S)
+        return -int(-wait_s * 1000 // 1)
 
     def _turn(self, ready: list[tuple[object, int]]) -> None:
         for source, _events in ready:
             if source is not self._socket:
-                for fd, _mask in self._epoll.poll(0):
-                    callback = self._events.get(fd)
+                for fd, _mask in self._watched.poll(0):
+                    callback = self._watched.callbacks.get(fd)
                     if callback is not None:
                         callback()
+        self._cache.tell_all()
         self._serve()
         now_s = time.monotonic()
-        self._survey.turn(now_s)
-        self._crowd.step()
-        self._cache.loads.end_overdue(now_s)
-        self._cache.loads.pump(now_s)
-        self.cells.answer_overdue(now_s)
-        self._heartbeat.turn(now_s)
-        if now_s >= self._stop_by_s:
-            self.stop()
-
-    # --- requests -----------------------------------------------------------------------------------
+        self._scheduler.end_overdue(now_s)
+        self._scheduler.pump(now_s)
+        self._look_after_the_rest(now_s)
 
     def _serve(self) -> None:
         """Hear everybody, serve those whose turn it is; for a bounded time."""
@@ -233,132 +125,18 @@ class ServingLoop:
                 if not more:
                     return
                 continue
-            self._handle(heard)
+            self._dispatch.handle(heard)
             now_s = time.monotonic()
             self._inbox.served(heard, now_s - start_s)
             self._statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s, more = now_s, True
 
-    def _handle(self, heard: Heard) -> None:
-        """Answer one request, or say why not."""
-        data = heard.frame.buffer
-        request = 0
-        try:
-            if heard.several_frames:
-                raise BadRequest("a request is one frame")
-            message = decode_request(data)
-            request = message.request
-            self._dispatch(heard.identity, heard.frame, message)
-        except ShmmapError as error:
-            self._refuse(heard.identity, request or request_number(data), error)
-        except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
-            _log.exception("a request could not be handled; this is a defect in shmmap")
-            self._refuse(heard.identity, request, InternalError("the daemon failed on this request"))
-
-    def _refuse_unread(self, heard: Heard) -> None:
-        """A process has too many requests waiting to have this one served, ever."""
-        data = heard.frame.buffer
-        if len(data) <= WORTH_AN_ANSWER_BYTES:
-            error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
-            self._refuse(heard.identity, request_number(data), error)
-
-    def _dispatch(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
-        now_s = time.monotonic()
-        if isinstance(message, messages.Hello):
-            entered = self._handshake.enter(identity, frame, message, now_s)
-            self._send(entered, encode(self._admin.welcome(entered, message)))
-            return
-        session = self._sessions.get(identity)
-        if session is None:
-            raise NoSession("this daemon does not know the session", hint="send hello first")
-        session.requests += 1
-        session.last_request_s = now_s
-        if isinstance(message, messages.Differential | messages.Area | messages.Selected):
-            if message.intent is not None:
-                session.intent, session.says_where = bounded_intent(message.intent), True
-            if isinstance(message, messages.Differential):
-                self.cells.differential(session, message, now_s)
-            elif isinstance(message, messages.Area):
-                self.cells.area(session, message, now_s)
-            else:
-                self.cells.selected(session, message, now_s)
-        elif isinstance(message, messages.Release):
-            self.cells.let_go(self._released(session, message))
-            self._send(session, encode(messages.Released(message.request)))
-        elif isinstance(message, messages.Bye):
-            self._handshake.leave(session)
-        else:
-            if isinstance(message, _PRIVILEGED):
-                self._privileges.require(peer_of(frame), now_s)
-            if isinstance(message, messages.Shutdown):
-                _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
-                self._send(session, encode(messages.Stopping(message.request)))
-                self._asked_to_stop, self._stop_by_s = session, now_s + FAREWELL_S
-            elif isinstance(message, messages.Reload):
-                self._reload_for(session, message)
-            elif isinstance(message, messages.Stats):
-                self._survey.ask(session, lambda pinned: self._tell_stats(session, message, pinned))
-            else:
-                self._send(session, encode(self._admin.answer(message, now_s)))
-
-    def _tell_stats(self, session: Session, message: messages.Stats, pinned: Pinned) -> None:
-        self._heartbeat.measure()
-        self._send(session, encode(self._admin.stats(message, pinned, time.monotonic())))
-
-    def _released(self, session: Session, message: messages.Release) -> list[Resident]:
-        if message.packed is None:
-            return session.drop(list(session.held))
-        return session.drop(unpack_versions(message.packed))
-
-    def _left(self, session: Session) -> None:
-        if session is self._asked_to_stop:
+    def _look_after_the_rest(self, now_s: float) -> None:
+        """What has its own time: deadlines, surveys, statistics, and telling what happened."""
+        self._cells.answer_overdue(now_s)
+        self._cache.survey.turn(now_s)
+        self._crowd.step()
+        self._cache.tell_all()
+        self._sampler.turn(now_s)
+        if now_s >= self._operators.stop_by_s:
             self.stop()
-
-    # --- reload -------------------------------------------------------------------------------------
-
-    def _reload_for(self, session: Session, message: messages.Reload) -> None:
-        before = self._cache.catalogue
-
-        def answer(result: Catalogue | ShmmapError) -> None:
-            if isinstance(result, ShmmapError):
-                self._refuse(session.identity, message.request, result)
-                return
-            change = compare(before, result)
-            reloaded = messages.Reloaded(
-                message.request,
-                result.map_version,
-                len(change.changed),
-                len(change.added),
-                len(change.removed),
-                result.problems,
-            )
-            self._send(session, encode(reloaded))
-
-        self._reloader.ask(answer)
-
-    def reload(self, answer: Callable[[Catalogue | ShmmapError], None]) -> None:
-        """Read the map's catalogue again (SIGHUP), and say what came of it."""
-        self._reloader.ask(answer)
-
-    def _change_map(self, catalogue: Catalogue) -> None:
-        old, now_s = self._cache.catalogue, time.monotonic()
-        self.cells.renumber(lambda index: catalogue.find(old.id(index)), old.id)
-        change = self._cache.replace_catalogue(catalogue, now_s)
-        tell_reload(self._event_log, self._statistics, self._cache, change)
-        _log.info(
-            "map read again: %d cells changed, %d added, %d removed",
-            len(change.changed), len(change.added), len(change.removed),
-        )  # fmt: skip
-        for problem in catalogue.problems:
-            _log.warning("%s", problem)
-
-    def _keep_map(self, error: ShmmapError) -> None:
-        tell_reload_failed(self._event_log, self._statistics, self._cache, error)
-
-    # --- replies --------------------------------------------------------------------------------------
-
-    def _send(self, session: Session, reply: bytes) -> None:
-        self._outbox.send(session, reply)
-
-    def _refuse(self, identity: bytes, request: int, error: ShmmapError) -> None:
-        self._outbox.refuse(identity, request, error)

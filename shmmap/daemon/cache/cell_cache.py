@@ -93,7 +93,7 @@ class CellCache:
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
         self.names = SegmentNameWatch(directory.path, self.segment_prefix)
-        self.events = CellEvents(event_log, ledger, statistics, self.wire_id)
+        self.events = CellEvents(event_log, ledger.memory, statistics, self.wire_id)
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
         self._directory = directory

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from shmmap.daemon.cache.ledger import Failure, Key, Ledger, Resident
 from shmmap.daemon.events.eviction_history import EvictionHistory
 from shmmap.daemon.events.log import EventLog, PressureEvents
-from shmmap.daemon.loading.scheduler import SPACE_CODES
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
 from shmmap.protocol import events
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -20,6 +19,8 @@ class CellEvents:
 
     Parameters
     ----------
+    memory
+        Gives budget, used and retired bytes.
     wire_id
         Makes of a cell id what replies and events carry.
 
@@ -32,23 +33,22 @@ class CellEvents:
     def __init__(
         self,
         log: EventLog,
-        ledger: Ledger,
+        memory: Callable[[], tuple[int, int, int]],
         statistics: StatisticsWriter,
         wire_id: Callable[[str], str],
     ) -> None:
         self._log = log
-        self._ledger = ledger
+        self._memory = memory
         self._statistics = statistics
         self._wire_id = wire_id
         self._history = EvictionHistory()
-        self.pressure = PressureEvents(log, self._memory)
+        self.pressure = PressureEvents(log, self._memory_in_use)
 
-    def _memory(self) -> tuple[int, int, int, int]:
-        ledger = self._ledger
-        pinned = self._statistics.values["bytes_pinned"]
-        return ledger.budget_bytes, ledger.used_bytes, pinned, ledger.zombie_bytes
+    def _memory_in_use(self) -> tuple[int, int, int, int]:
+        budget, used, retired = self._memory()
+        return budget, used, self._statistics.values["bytes_pinned"], retired
 
-    def loaded(self, resident: Resident, took_ns: int, *, replaces: int = 0) -> None:
+    def loaded(self, resident: Resident, took_ns: int, replaces: int) -> None:
         """A segment was loaded and published; ``took_ns`` from handing the load to a worker."""
         again = self._history.loaded(resident.key, resident.version)
         self._statistics.add("loads_finished")

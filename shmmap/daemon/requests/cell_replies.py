@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.loading.scheduler import SPACE_CODES
+from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.records import SPACE_CODES, Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.codec import encode_cells
@@ -34,7 +34,7 @@ class Answer:
 
 
 class CellReplies:
-    """Answers with what the cache has.
+    """Answers with what the cache has and what is being loaded.
 
     Parameters
     ----------
@@ -45,12 +45,14 @@ class CellReplies:
     def __init__(
         self,
         cache: CellCache,
+        scheduler: Scheduler,
         statistics: StatisticsWriter,
         *,
         epoch: int,
         send: Callable[[Session, bytes], None],
     ) -> None:
         self._cache = cache
+        self._scheduler = scheduler
         self._statistics = statistics
         self._epoch = epoch
         self._send = send
@@ -112,12 +114,13 @@ class CellReplies:
         self, wanted: PendingRequest, index: int, layer: str, answer: Answer, now_s: float
     ) -> None:
         """Answer for one cell that is not simply warm."""
-        cache = self._cache
+        cache, loads = self._cache, self._scheduler.loads
         key = Key(cache.catalogue.id(index), layer)
         wire_id = cache.wire_id(key.cell_id)
-        slot = cache.ledger.slot(key)
+        failure, promised = loads.failures.get(key), loads.is_promised(key)
         refusal = wanted.refused.get(key)
-        resident = slot.resident if slot.resident is None or slot.resident.checked else None
+        resident = cache.ledger.by_key.get(key)
+        resident = resident if resident is None or resident.checked else None
         current = resident is not None and resident.version == cache.layers.version(index, layer)
         if resident is not None and refusal is None and (current or key.cell_id not in wanted.held_old):
             answer.handles.append(resident.handle if current else resident.stale_handle)
@@ -125,15 +128,14 @@ class CellReplies:
         if refusal is not None:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
             answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,)))
-        elif not current and slot.failure is not None and slot.load is None:
+        elif not current and failure is not None and not promised:
             holders: tuple[Holder, ...] = ()
-            if slot.failure.code in SPACE_CODES:
+            if failure.code in SPACE_CODES:
                 if answer.blockers is None:
                     answer.blockers = cache.reclaimer.holders_of(cache.ledger.everything())
                 holders = answer.blockers
-            answer.failed.append(FailedCell(wire_id, layer, slot.failure.code, slot.failure.message, holders))
+            answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders))
         elif not current:
-            if slot.load is None:  # evicted, or no longer out of room: "pending" promises a load
-                cache.want(index, layer, PROMISED, now_s, wanted.session.asker)
+            if not promised:  # evicted, or no longer out of room: "pending" promises a load
+                self._scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
             answer.pending.append(PendingCell(wire_id, layer))
-        cache.ledger.forget_if_empty(key)

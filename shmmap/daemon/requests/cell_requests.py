@@ -3,7 +3,7 @@
 
 A request first becomes a `PendingRequest`: which cells in which order, minus what the client holds.  If all
 of it is warm the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the
-answer (`cell_answers`) leaves when the last one settled or the client's patience ends, whichever is
+answer (`cell_replies`) leaves when the last one settled or the client's patience ends, whichever is
 first.
 """
 
@@ -15,16 +15,21 @@ from typing import Final
 import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.loading.scheduler import SPACE_CODES
 from shmmap.daemon.requests.cell_replies import Answer, CellReplies
 from shmmap.daemon.requests.differential import difference, warm_difference
-from shmmap.daemon.requests.limits import admitted_layers, check_count, check_held, check_queue
-from shmmap.daemon.requests.pending_request import PendingRequest
-from shmmap.daemon.requests.quota import SessionQuota
-from shmmap.daemon.requests.waiting_list import WaitingList
+from shmmap.daemon.requests.limits import (
+    SessionQuota,
+    admitted_layers,
+    check_count,
+    check_held,
+    check_queue,
+)  # fmt: skip
+from shmmap.daemon.requests.pending_request import PendingRequest, WaitingList
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest
+from shmmap.geometry import Area
 from shmmap.protocol import messages
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -34,7 +39,7 @@ MAX_WAIT_S: Final = 3600.0
 
 
 class CellRequests:
-    """Answers requests for cells from the cache.
+    """Answers requests for cells from the cache, and has loaded what is absent.
 
     Parameters
     ----------
@@ -49,6 +54,7 @@ class CellRequests:
     def __init__(
         self,
         cache: CellCache,
+        scheduler: Scheduler,
         statistics: StatisticsWriter,
         *,
         epoch: int,
@@ -57,12 +63,14 @@ class CellRequests:
         clock: Callable[[], float],
     ) -> None:
         self._cache = cache
+        self._scheduler = scheduler
+        scheduler.on_settled = self.settled
         self._statistics = statistics
         self._now_s = clock
         self._quota = SessionQuota(quota_bytes, cache, statistics, clock)
-        self._answers = CellReplies(cache, statistics, epoch=epoch, send=send)
+        self._answers = CellReplies(cache, scheduler, statistics, epoch=epoch, send=send)
         self._waiting: dict[Key, list[PendingRequest]] = {}
-        self._patient: WaitingList[PendingRequest] = WaitingList()
+        self._patient = WaitingList()
 
     def __len__(self) -> int:
         return len(self._patient)
@@ -73,7 +81,7 @@ class CellRequests:
         """All cells that touch an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        session.asked_about(area)
+        _note_area(session, area)
         layers = admitted_layers(self._cache, message.layers)
         indices = self._cache.at_height(self._cache.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
@@ -100,7 +108,7 @@ class CellRequests:
         check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        session.asked_about(area)
+        _note_area(session, area)
         layers = admitted_layers(self._cache, message.layers)
         found = self._cache.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._quota.is_out_of_reach(session):
@@ -133,9 +141,8 @@ class CellRequests:
             self.let_go(session.drop(dropped))
 
     def let_go(self, residents: Iterable[Resident]) -> None:
-        """Somebody dropped these: what was refused for want of memory may fit now."""
-        self._cache.reclaimer.let_go(residents, self._now_s())
-        self._cache.ledger.clear_failures(SPACE_CODES)
+        """Somebody dropped these."""
+        self._scheduler.let_go(residents, self._now_s())
 
     # --- loading and waiting --------------------------------------------------------------------
 
@@ -151,7 +158,7 @@ class CellRequests:
         self._statistics.add("hits", len(wanted.cells) - len(cold))
         self._quota.check(wanted, cold)
         if cold:
-            check_queue(self._cache, wanted.session, cold)
+            check_queue(self._cache.catalogue, self._scheduler.loads, wanted.session, cold)
             self._statistics.add("misses", len(cold))
             self._load(wanted, cold, now_s)
             if wait_s and wanted.outstanding and self._patient.has_room(wanted.session):
@@ -167,21 +174,21 @@ class CellRequests:
             key = Key(cache.catalogue.id(index), layer)
             if key in wanted.refused:
                 continue
-            if cache.want(index, layer, distance, now_s, wanted.session.asker).load is not None:
+            if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) is not None:
                 wanted.outstanding.add(key)
 
     def _wait(self, wanted: PendingRequest) -> None:
         catalogue = self._cache.catalogue
         wanted.keys = tuple({Key(catalogue.id(index), layer) for index, layer in wanted.cells})
         for key in wanted.keys:
-            self._cache.ledger.slot(key).waiting += 1
+            self._cache.ledger.need(key)
         for key in wanted.outstanding:
             self._waiting.setdefault(key, []).append(wanted)
         self._patient.add(wanted)
 
     def _stop_waiting(self, wanted: PendingRequest) -> None:
         for key in wanted.keys:
-            self._cache.ledger.unwait(key)
+            self._cache.ledger.need_no_more(key)
         for key in wanted.outstanding:
             waiters = self._waiting.get(key)
             if waiters is not None:
@@ -209,8 +216,8 @@ class CellRequests:
                 continue
             if (
                 key not in wanted.outstanding  # it may be asked for twice
-                and self._cache.ledger.slot(key).failure is None
-                and self._cache.want(index, layer, 0.0, now_s, wanted.session.asker).load
+                and key not in self._scheduler.loads.failures
+                and self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker)
             ):
                 wanted.outstanding.add(key)
                 self._waiting.setdefault(key, []).append(wanted)
@@ -256,3 +263,10 @@ class CellRequests:
 def _check_wait(wait_s: float | None) -> None:
     if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
         raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
+
+
+def _note_area(session: Session, area: Area) -> None:
+    """A session asks for an area: in the middle of it is where it is, unless it says."""
+    session.area = area
+    if not session.says_where:
+        session.intent = messages.Intent(*area.center)

@@ -69,7 +69,7 @@ class Handshake:
                 hint="update the older of the two",
             )
         peer = peer_of(frame)
-        old = self._sessions.get(identity)
+        old = self._sessions.by_identity.get(identity)
         if old is not None:
             if old.peer == peer:
                 return old  # a repeated hello: its answer was late or lost

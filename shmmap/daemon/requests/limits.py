@@ -1,23 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much one request may ask for, and one session keep: nobody may take the loop or the memory for long."""
+"""How much one request may ask for, and how much one session keep for itself alone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.records import Key
+from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layers
+from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
+from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MOST_CELLS", "admitted_layers", "bounded_intent", "check_count", "check_held", "check_queue"]
+__all__ = [
+    "MOST_CELLS",
+    "SessionQuota",
+    "admitted_layers",
+    "bounded_intent",
+    "check_count",
+    "check_held",
+    "check_queue",
+]
 
 MOST_CELLS: Final = 20_000
 """Cells, in all layers together, of one request: about half a second of the loop when all are cold."""
@@ -66,7 +80,9 @@ def check_held(message: messages.Differential) -> None:
         raise BadRequest(f"{len(layers)} layers held; {MOST_LAYERS_HELD} is the most one request may name")
 
 
-def check_queue(cache: CellCache, session: Session, cold: Sequence[tuple[int, str]]) -> None:
+def check_queue(
+    catalogue: Catalogue, loads: Loads, session: Session, cold: Sequence[tuple[int, str]]
+) -> None:
     """Refuse to queue more loads for a process that waits for very many; ``cold`` is what they are of.
 
     Raises
@@ -74,12 +90,10 @@ def check_queue(cache: CellCache, session: Session, cold: Sequence[tuple[int, st
     Busy
         It waits for `MOST_QUEUED` loads, and these are others.
     """
-    if cache.ledger.queued_of(session.asker) < MOST_QUEUED:
+    if loads.queued_of(session.asker) < MOST_QUEUED:
         return
-    slots, id_of = cache.ledger.slots, cache.catalogue.id
     for index, layer in cold:
-        slot = slots.get(Key(id_of(index), layer))
-        if slot is None or slot.load is None:
+        if Key(catalogue.id(index), layer) not in loads.by_key:
             raise Busy(f"{MOST_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
@@ -119,3 +133,63 @@ def bounded_intent(intent: messages.Intent) -> messages.Intent:
     if not all(map(math.isfinite, numbers)):
         raise BadRequest("intent: every number in it must be finite")
     return intent
+
+
+class SessionQuota:
+    """Refuses what would exceed it, cell by cell.
+
+    Parameters
+    ----------
+    nbytes
+        Most bytes one session may keep that no other session also holds.
+    clock
+        The serving loop's clock, seconds.
+    """
+
+    def __init__(
+        self, nbytes: int, cache: CellCache, statistics: StatisticsWriter, clock: Callable[[], float]
+    ) -> None:
+        self._nbytes = nbytes
+        self._cache = cache
+        self._statistics = statistics
+        self._now_s = clock
+
+    def is_out_of_reach(self, session: Session) -> bool:
+        """Whether the session could have everything that is in memory."""
+        return session.held_bytes + self._cache.ledger.resident_bytes <= self._nbytes
+
+    def check(self, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> None:
+        """Note in ``wanted.refused`` what is too much, farthest cells first; ``cold`` is not in memory."""
+        session, cache, warm = wanted.session, self._cache, self._cache.warm.layers
+        if self.is_out_of_reach(session) and not cold:
+            return
+        chilled = set(cold)
+        sizes = [
+            cache.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes
+            for index, layer in wanted.cells
+        ]
+        if session.held_bytes + sum(sizes) <= self._nbytes:
+            return
+        cache.survey.drop_unused(session, self._now_s() - HAND_OUT_GRACE_S)
+        left = self._nbytes - session.exclusive_bytes()
+        # a new version takes the place of the old one that its holder is about to drop
+        replaced = {r.key: r.nbytes for r in session.residents() if not cache.is_current(r)}
+        boxes = cache.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
+        counted: set[tuple[int, str]] = set()
+        for position in np.argsort(wanted.distances_m(boxes), kind="stable").tolist():
+            index, layer = wanted.cells[position]
+            if (index, layer) in counted:
+                continue
+            counted.add((index, layer))
+            key = Key(cache.catalogue.id(index), layer)
+            resident = None if (index, layer) in chilled else warm[layer][index]
+            if resident is not None and resident.sessions:
+                continue  # somebody keeps it anyway, perhaps this session itself
+            left -= sizes[position] - replaced.get(key, 0)
+            if left < 0:
+                message = (
+                    f"this client would keep more than {self._nbytes} bytes (its quota) for itself alone"
+                )
+                wanted.refused[key] = ("over_budget", message)
+                self._statistics.add("refused_quota")
+                cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self._now_s())

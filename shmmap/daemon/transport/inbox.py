@@ -88,7 +88,7 @@ class Inbox:
 
     def _process(self, identity: bytes, frame: zmq.Frame) -> Hashable:
         """Whose turn it is: the process's; the connection's where the kernel does not tell which."""
-        session = self._sessions.get(identity)
+        session = self._sessions.by_identity.get(identity)
         pid = session.peer.pid if session is not None else peer_of(frame).pid
         return pid if pid > 0 else identity
 

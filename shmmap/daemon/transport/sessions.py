@@ -50,7 +50,8 @@ class Session:
     naming holders.  Safety never depends on it, pins are the kernel's word.  ``says_where`` tells
     an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
     asked for.  ``fd`` is the connection's descriptor (libzmq's own: never closed here),
-    ``unread_bytes`` what was sent since the client is known to have read everything.
+    ``unread_bytes`` what was sent since the client is known to have read everything.  ``asker`` is whose
+    turn its requests and loads count for: the process's, else the session's own.
     """
 
     slot: int
@@ -66,19 +67,9 @@ class Session:
     area: Area | None = None
     requests: int = 0
     last_request_s: float = 0.0
+    asker: int = 0
     fd: int = -1
     unread_bytes: int = 0
-
-    @property
-    def asker(self) -> int:
-        """Whose turn its requests and loads count for: the process's, else the session's own."""
-        return self.peer.pid or -self.slot
-
-    def asked_about(self, area: Area) -> None:
-        """The session asked for an area: in the middle of it is where it is, unless it says."""
-        self.area = area
-        if not self.says_where:
-            self.intent = Intent(*area.center)
 
     def hold(self, residents: Iterable[Resident]) -> None:
         """The session was handed these segments."""
@@ -154,12 +145,17 @@ class Sessions:
 
     Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
     it maps is locked under its slot, also when a later life of the daemon asks whose that is.
+
+    Attributes
+    ----------
+    by_identity : dict
+        Sessions by the routing identity of their connection.
     """
 
     LIMIT = 4096
 
     def __init__(self) -> None:
-        self._by_identity: dict[bytes, Session] = {}
+        self.by_identity: dict[bytes, Session] = {}
         self._by_slot: dict[int, Session] = {}
 
     def __len__(self) -> int:
@@ -167,10 +163,6 @@ class Sessions:
 
     def __iter__(self) -> Iterator[Session]:
         return iter(self._by_slot.values())
-
-    def get(self, identity: bytes) -> Session | None:
-        """The session of a connection."""
-        return self._by_identity.get(identity)
 
     def by_slot(self, slot: int) -> Session | None:
         """The session whose lock byte is ``slot``."""
@@ -215,17 +207,18 @@ class Sessions:
             except OSError:
                 pidfd = -1  # a kernel without pidfds, or no descriptor left
         session = Session(
-            slot, identity, peer, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s
-        )
-        self._by_identity[identity] = session
+            slot, identity, peer, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s,
+            asker=peer.pid or -slot,
+        )  # fmt: skip
+        self.by_identity[identity] = session
         self._by_slot[slot] = session
         return session
 
     def close(self, session: Session) -> None:
         """End a session and its bookkeeping."""
         session.drop(list(session.held))
-        if self._by_identity.get(session.identity) is session:
-            del self._by_identity[session.identity]
+        if self.by_identity.get(session.identity) is session:
+            del self.by_identity[session.identity]
         self._by_slot.pop(session.slot, None)
         if session.pidfd >= 0:
             os.close(session.pidfd)

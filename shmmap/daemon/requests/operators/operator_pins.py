@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Key
 from shmmap.daemon.loading.load_queue import BACKGROUND
+from shmmap.daemon.records import Key
 from shmmap.errors import OverBudget
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages

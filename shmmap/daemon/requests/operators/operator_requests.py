@@ -9,10 +9,10 @@ from typing import Final
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Resident
 from shmmap.daemon.cache.survey import Share, Usage
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, UnknownCell

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the bytes of a request to whom they concern: decoded, authorised, routed or refused."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Final
+
+import zmq
+
+from shmmap.daemon.cache.survey import Survey, Usage
+from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.requests.handshake import Handshake
+from shmmap.daemon.requests.limits import bounded_intent
+from shmmap.daemon.requests.map_queries import MapQueries
+from shmmap.daemon.requests.operators.authorization import Authorization
+from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
+from shmmap.daemon.telemetry.sampler import Sampler
+from shmmap.daemon.transport.inbox import Heard, peer_of
+from shmmap.daemon.transport.outbox import Outbox
+from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
+from shmmap.protocol import messages
+from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
+
+__all__ = ["Dispatch"]
+
+_log = logging.getLogger(__name__)
+
+WORTH_AN_ANSWER_BYTES: Final = 1 << 16
+"""A longer request that is refused unread is dropped: finding its number takes too long."""
+
+
+class Dispatch:
+    """Hands each request to what answers it; a defect met by one request does not end the others'."""
+
+    def __init__(
+        self,
+        sessions: Sessions,
+        handshake: Handshake,
+        cells: CellRequests,
+        queries: MapQueries,
+        operators: OperatorRequests,
+        authorization: Authorization,
+        survey: Survey,
+        sampler: Sampler,
+        outbox: Outbox,
+    ) -> None:
+        self._sessions = sessions
+        self._handshake = handshake
+        self._cells = cells
+        self._queries = queries
+        self._operators = operators
+        self._authorization = authorization
+        self._survey = survey
+        self._sampler = sampler
+        self._outbox = outbox
+
+    def handle(self, heard: Heard) -> None:
+        """Answer one request, or say why not."""
+        data = heard.frame.buffer
+        request = 0
+        try:
+            if heard.several_frames:
+                raise BadRequest("a request is one frame")
+            message = decode_request(data)
+            request = message.request
+            self._route(heard.identity, heard.frame, message)
+        except ShmmapError as error:
+            self._outbox.refuse(heard.identity, request or request_number(data), error)
+        except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
+            _log.exception("a request could not be handled; this is a defect in shmmap")
+            self._outbox.refuse(heard.identity, request, InternalError("the daemon failed on this request"))
+
+    def refuse_unread(self, heard: Heard) -> None:
+        """A process has too many requests waiting to have this one served, ever."""
+        data = heard.frame.buffer
+        if len(data) <= WORTH_AN_ANSWER_BYTES:
+            error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
+            self._outbox.refuse(heard.identity, request_number(data), error)
+
+    def _route(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
+        now_s = time.monotonic()
+        if isinstance(message, messages.Hello):
+            entered = self._handshake.enter(identity, frame, message, now_s)
+            self._outbox.send(entered, encode(self._queries.welcome(entered, message)))
+            return
+        session = self._sessions.by_identity.get(identity)
+        if session is None:
+            raise NoSession("this daemon does not know the session", hint="send hello first")
+        session.requests += 1
+        session.last_request_s = now_s
+        if isinstance(message, messages.Differential | messages.Area | messages.Selected):
+            if message.intent is not None:
+                session.intent, session.says_where = bounded_intent(message.intent), True
+            if isinstance(message, messages.Differential):
+                self._cells.differential(session, message, now_s)
+            elif isinstance(message, messages.Area):
+                self._cells.area(session, message, now_s)
+            else:
+                self._cells.selected(session, message, now_s)
+        elif isinstance(message, messages.Release):
+            versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
+            self._cells.let_go(session.drop(versions))
+            self._outbox.send(session, encode(messages.Released(message.request)))
+        elif isinstance(message, messages.Bye):
+            self._handshake.leave(session)
+        elif isinstance(message, OPERATOR_REQUESTS):
+            self._authorization.require(peer_of(frame), now_s)
+            self._operators.handle(session, message, now_s)
+        elif isinstance(message, messages.Stats):
+            self._survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
+        else:
+            self._outbox.send(session, encode(self._queries.answer(message)))
+
+    def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
+        self._sampler.measure()
+        self._outbox.send(session, encode(self._queries.stats(message, usage, time.monotonic())))
