@@ -35,8 +35,9 @@ from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.pins.probe import Rung
 from shmmap.daemon.pins.watch import PinWatch
+from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Privileges
-from shmmap.daemon.requests.operators.operator_requests import Admin
+from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import Server
@@ -178,26 +179,29 @@ class Life:
         socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
         socket.setsockopt(zmq.RCVHWM, RECEIVE_QUEUE)
         self._manager = manager
+        self._reloader = reloader
         self._owns_socket = activated is None
         quota = self._config.session_quota
         budget = self._store.books.budget_bytes
         events = EventSocket(context, self._event_log.beat)
-        admin = Admin(
+        self._pins = OperatorPins(self._store)
+        queries = MapQueries(
             self._config,
             self._store,
             self._sessions,
             self._statistics,
+            self._pins,
             epoch=self._epoch,
             event_log=self._event_log,
             events_path=events_path(self._socket_path),
         )
-        self._pins = admin.pins
         server = self._server = Server(
             socket,
             self._store,
             self._sessions,
             self._statistics,
-            admin,
+            queries,
+            self._pins,
             reloader,
             self._privileges,
             self._event_log,
@@ -244,11 +248,13 @@ class Life:
             remove_socket(events_path(self._socket_path))
 
     def _watch_map(self, server: Server) -> None:
-        config = self._config
-        if config.watch:
-            watch = FileWatch(directories_of(config.map_path, config.metadata, self._store.catalogue))
+        if self._config.watch:
+            watch = FileWatch(self._directories(self._store.catalogue.id_prefix))
             server.watch(watch.fd, lambda: watch.drain(time.monotonic()))
             self._map_watch = watch
+
+    def _directories(self, id_prefix: str) -> set[str]:
+        return directories_of(self._config.map_path, self._config.metadata, id_prefix)
 
     def _tell_epoch(self, what: str) -> None:
         catalogue = self._store.catalogue
@@ -281,14 +287,16 @@ class Life:
     def _reload(self) -> None:
         """Read the map again because of a signal; the service manager waits for the end."""
         self._manager.reloading()
-        self._running.reload(self._reloaded)
+        self._reloader.ask(self._reloaded)
 
     def _reloaded(self, result: Catalogue | ShmmapError) -> None:
         if isinstance(result, ShmmapError):
             self._manager.reloaded(f"reload failed, the old map stays: {result.message}")
         else:
             if self._map_watch is not None:  # the metadata may name another directory now
-                self._map_watch.follow(directories_of(self._config.map_path, self._config.metadata, result))
+                self._map_watch.follow(
+                    directories_of(self._config.map_path, self._config.metadata, result.id_prefix)
+                )
             self._manager.reloaded(f"map read again: {len(result)} cells")
 
     # --- signals ----------------------------------------------------------------------------------

@@ -25,8 +25,10 @@ from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Reception
 from shmmap.daemon.requests.limits import bounded_intent
+from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Privileges
-from shmmap.daemon.requests.operators.operator_requests import Admin
+from shmmap.daemon.requests.operators.operator_pins import OperatorPins
+from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
 from shmmap.daemon.telemetry.sampler import BEAT_S, Heartbeat
 from shmmap.daemon.transport.crowd_control import CrowdControl
 from shmmap.daemon.transport.inbox import Heard, Hearing, peer_of
@@ -34,7 +36,7 @@ from shmmap.daemon.transport.listen_gate import ListenGate
 from shmmap.daemon.transport.outbox import Replies
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 from shmmap.statistics.writer import StatisticsWriter
@@ -50,13 +52,6 @@ FAREWELL_S: Final = 1.0
 connection ends (ZMQ_IMMEDIATE)."""
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 """A longer request that is refused unread is dropped: finding its number takes too long."""
-_PRIVILEGED: Final = (
-    messages.Reload,
-    messages.Evict,
-    messages.Pin,
-    messages.Unpin,
-    messages.Shutdown,
-)
 
 
 class Server:
@@ -66,8 +61,10 @@ class Server:
     ----------
     socket
         Bound ROUTER socket; closed by the caller.
-    admin
-        Everything that is not a request for cells.
+    queries
+        Everything that is no request for cells and no operator's.
+    pins
+        The cells that operators pinned.
     on_beat
         Called a few times a second, from the loop itself: whoever is hung does not beat.
     """
@@ -78,7 +75,8 @@ class Server:
         store: Store,
         sessions: Sessions,
         statistics: StatisticsWriter,
-        admin: Admin,
+        queries: MapQueries,
+        pins: OperatorPins,
         reloader: Reloader,
         privileges: Privileges,
         event_log: EventLog,
@@ -91,8 +89,10 @@ class Server:
         self._store = store
         self._sessions = sessions
         self._statistics = statistics
-        self._admin = admin
-        self._reloader = reloader
+        self._queries = queries
+        self._operators = OperatorRequests(
+            store, pins, reloader, send=self._send, refuse=self._refuse, stop_for=self._stop_for
+        )
         self._privileges = privileges
         self._event_log = event_log
         self._epoll = select.epoll()
@@ -266,7 +266,7 @@ class Server:
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
             entered = self._reception.enter(identity, frame, message, now_s)
-            self._send(entered, encode(self._admin.welcome(entered, message)))
+            self._send(entered, encode(self._queries.welcome(entered, message)))
             return
         session = self._sessions.get(identity)
         if session is None:
@@ -287,23 +287,20 @@ class Server:
             self._send(session, encode(messages.Released(message.request)))
         elif isinstance(message, messages.Bye):
             self._reception.leave(session)
+        elif isinstance(message, OPERATOR_REQUESTS):
+            self._privileges.require(peer_of(frame), now_s)
+            self._operators.handle(session, message, now_s)
+        elif isinstance(message, messages.Stats):
+            self._survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
         else:
-            if isinstance(message, _PRIVILEGED):
-                self._privileges.require(peer_of(frame), now_s)
-            if isinstance(message, messages.Shutdown):
-                _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
-                self._send(session, encode(messages.Stopping(message.request)))
-                self._asked_to_stop, self._stop_by_s = session, now_s + FAREWELL_S
-            elif isinstance(message, messages.Reload):
-                self._reload_for(session, message)
-            elif isinstance(message, messages.Stats):
-                self._survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
-            else:
-                self._send(session, encode(self._admin.answer(message, now_s)))
+            self._send(session, encode(self._queries.answer(message)))
+
+    def _stop_for(self, session: Session) -> None:
+        self._asked_to_stop, self._stop_by_s = session, time.monotonic() + FAREWELL_S
 
     def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
         self._heartbeat.measure()
-        self._send(session, encode(self._admin.stats(message, usage, time.monotonic())))
+        self._send(session, encode(self._queries.stats(message, usage, time.monotonic())))
 
     def _released(self, session: Session, message: messages.Release) -> list[Resident]:
         if message.packed is None:
@@ -315,30 +312,6 @@ class Server:
             self.stop()
 
     # --- reload -------------------------------------------------------------------------------------
-
-    def _reload_for(self, session: Session, message: messages.Reload) -> None:
-        before = self._store.catalogue
-
-        def answer(result: Catalogue | ShmmapError) -> None:
-            if isinstance(result, ShmmapError):
-                self._refuse(session.identity, message.request, result)
-                return
-            change = compare(before, result)
-            reloaded = messages.Reloaded(
-                message.request,
-                result.map_version,
-                len(change.changed),
-                len(change.added),
-                len(change.removed),
-                result.problems,
-            )
-            self._send(session, encode(reloaded))
-
-        self._reloader.ask(answer)
-
-    def reload(self, answer: Callable[[Catalogue | ShmmapError], None]) -> None:
-        """Read the map's catalogue again (SIGHUP), and say what came of it."""
-        self._reloader.ask(answer)
 
     def _change_map(self, catalogue: Catalogue) -> None:
         old, now_s = self._store.catalogue, time.monotonic()

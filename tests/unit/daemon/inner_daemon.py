@@ -25,7 +25,8 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.requests.cell_requests import CellRequests
-from shmmap.daemon.requests.operators.operator_requests import Admin
+from shmmap.daemon.requests.map_queries import MapQueries
+from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
@@ -102,10 +103,10 @@ class InnerDaemon:
             send=lambda session, data: self.replies.append((session, decode_reply(data))),
             clock=self.now_s,
         )
-        config = DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir)
-        self.admin = Admin(
-            config, self.store, self.sessions, self.statistics, epoch=EPOCH, event_log=self.event_log
-        )
+        self.queries = MapQueries(
+            DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir), self.store,
+            self.sessions, self.statistics, OperatorPins(self.store), epoch=EPOCH, event_log=self.event_log,
+        )  # fmt: skip
 
     def _on_settled(self, key: Key) -> None:
         self.settled.append(key)

@@ -64,7 +64,7 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     reply = one.cells_of(1)
     assert [cell.points for cell in reply.cells] == [33]
     assert reply.map_version != before
-    page = one.admin.answer(Metadata(2, since=before), one.now_s())
+    page = one.queries.answer(Metadata(2, since=before))
     assert [Path(row.id).name for row in page.rows] == ["0_0.pcd"]  # type: ignore[union-attr]
     assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
     one.reload()
@@ -174,7 +174,7 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.cells.differential(one.session(), Differential(3, EVERYWHERE, packed=packed), one.now_s())
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
-    welcome = one.admin.welcome(one.session(), Hello(4, 1, 0))
+    welcome = one.queries.welcome(one.session(), Hello(4, 1, 0))
     assert (welcome.cells, welcome.bounds) == (0, None)
     one.run_until(lambda: one.books.used_bytes == one.books.overhead_bytes)
     one.reload()
