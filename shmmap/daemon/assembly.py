@@ -23,7 +23,7 @@ from shmmap.daemon.cache.ledger import Residency
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog, nowhere
-from shmmap.daemon.events.publisher import EventSocket, events_path
+from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.budget import choose_budget
 from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.host.instance_names import lock_name, lock_path, take_away
@@ -183,7 +183,7 @@ class Life:
         self._owns_socket = activated is None
         quota = self._config.session_quota
         budget = self._store.books.budget_bytes
-        events = EventSocket(context, self._event_log.beat)
+        events = EventPublisher(context, self._event_log.beat)
         self._pins = OperatorPins(self._store)
         queries = MapQueries(
             self._config,

@@ -29,7 +29,7 @@ from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Privileges
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
-from shmmap.daemon.telemetry.sampler import BEAT_S, Heartbeat
+from shmmap.daemon.telemetry.sampler import BEAT_S, Sampler
 from shmmap.daemon.transport.crowd_control import CrowdControl
 from shmmap.daemon.transport.inbox import Heard, Hearing, peer_of
 from shmmap.daemon.transport.listen_gate import ListenGate
@@ -113,7 +113,7 @@ class Server:
             unwatch=self.unwatch,
             on_left=self._left,
         )
-        self._heartbeat = Heartbeat(
+        self._sampler = Sampler(
             store, statistics, event_log, sessions=sessions, waiting=self.cells, on_beat=on_beat
         )
         self.watch(reloader.fd, lambda: reloader.collect(self._change_map, self._keep_map))
@@ -184,7 +184,7 @@ class Server:
             until_s = min(
                 self._store.loads.next_event_s(),
                 self.cells.next_deadline_s(),
-                self._heartbeat.next_s,
+                self._sampler.next_s,
                 self._survey.next_step_s,
             )
             timeout_ms = max(0, -int(-(until_s - now_s) * 1000 // 1))
@@ -215,7 +215,7 @@ class Server:
         self._store.loads.end_overdue(now_s)
         self._store.loads.pump(now_s)
         self.cells.answer_overdue(now_s)
-        self._heartbeat.turn(now_s)
+        self._sampler.turn(now_s)
         if now_s >= self._stop_by_s:
             self.stop()
 
@@ -299,7 +299,7 @@ class Server:
         self._asked_to_stop, self._stop_by_s = session, time.monotonic() + FAREWELL_S
 
     def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
-        self._heartbeat.measure()
+        self._sampler.measure()
         self._send(session, encode(self._queries.stats(message, usage, time.monotonic())))
 
     def _released(self, session: Session, message: messages.Release) -> list[Resident]:
@@ -317,7 +317,7 @@ class Server:
         old, now_s = self._store.catalogue, time.monotonic()
         self.cells.renumber(lambda index: catalogue.find(old.id(index)), old.id)
         change = self._store.replace_catalogue(catalogue, now_s)
-        tell_reload(self._event_log, self._statistics, self._store, change)
+        tell_reload(self._event_log, self._statistics, catalogue, change, self._store.wire_id)
         _log.info(
             "map read again: %d cells changed, %d added, %d removed",
             len(change.changed), len(change.added), len(change.removed),
@@ -326,7 +326,7 @@ class Server:
             _log.warning("%s", problem)
 
     def _keep_map(self, error: ShmmapError) -> None:
-        tell_reload_failed(self._event_log, self._statistics, self._store, error)
+        tell_reload_failed(self._event_log, self._statistics, self._store.catalogue.map_version, error)
 
     # --- replies --------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from shmmap.statistics.client_rows import MAX_CLIENTS
 from shmmap.statistics.counters import SPANS, WINDOWED
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["BEAT_S", "Heartbeat"]
+__all__ = ["BEAT_S", "Sampler"]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
@@ -29,7 +29,7 @@ USED_ROWS_A_BEAT: Final = 64
 """Rows of the statistics whose hits are brought up to date at a beat: about half a millisecond."""
 
 
-class Heartbeat:
+class Sampler:
     """Measures and beats.
 
     Parameters
