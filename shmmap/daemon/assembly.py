@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one life of the daemon has between its locks and its end: the map in memory, sockets, a loop."""
+"""One run of the daemon put together: on the map in memory stand sockets, requests and the loop."""
 
 from __future__ import annotations
 
@@ -9,51 +9,46 @@ import dataclasses
 import gc
 import logging
 import os
-import secrets
 import signal
 import time
 from typing import Final
 
 import zmq
 
-from shmmap import __version__
-from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.eviction_policy import POLICIES
-from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.events.log import EventLog, nowhere
-from shmmap.daemon.events.publisher import EventSocket, events_path
-from shmmap.daemon.host.budget import choose_budget
-from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
+from shmmap.daemon.events.log import nowhere
+from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.instance_names import lock_name, lock_path, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import KEEP_SIGNAL, RELOAD_SIGNAL, STOP_SIGNALS, ServingSignals, StartSignals
-from shmmap.daemon.loading.adoption import Adoption
-from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.file_watch import MapWatch, directories_of
-from shmmap.daemon.pins.probe import Rung
-from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.requests.operators.authorization import Privileges
-from shmmap.daemon.requests.operators.operator_requests import Admin
+from shmmap.daemon.map.file_watch import FileWatch, directories_of
+from shmmap.daemon.map_in_memory import MapInMemory
+from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.requests.dispatch import Dispatch
+from shmmap.daemon.requests.handshake import Handshake
+from shmmap.daemon.requests.map_change import MapChange
+from shmmap.daemon.requests.map_queries import MapQueries
+from shmmap.daemon.requests.operators.authorization import Authorization
+from shmmap.daemon.requests.operators.operator_pins import OperatorPins
+from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import ServingLoop
-from shmmap.daemon.transport.outbox import SEND_QUEUE
-from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.telemetry.sampler import Sampler
+from shmmap.daemon.transport.crowd_control import CrowdControl
+from shmmap.daemon.transport.inbox import Inbox
+from shmmap.daemon.transport.listen_gate import ListenGate
+from shmmap.daemon.transport.outbox import SEND_QUEUE, Outbox
 from shmmap.daemon.transport.socket_file import bind_socket, remove_socket
-from shmmap.errors import ConfigError, InternalError, ShmmapError
+from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.names import segment_prefix
-from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
-from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Assembly"]
+__all__ = ["Service"]
 
 _log = logging.getLogger(__name__)
 
@@ -61,253 +56,206 @@ RECEIVE_QUEUE: Final = 32
 """Requests that libzmq reads ahead from one connection, of up to `MAX_REQUEST_BYTES` each."""
 
 
-class Assembly:
-    """Everything the daemon has between its locks and its end."""
+class Service:
+    """What clients and the service manager talk to.
+
+    Raises
+    ------
+    ConfigError
+        There is no such group of administrators.
+    """
 
     def __init__(
         self,
         config: DaemonConfig,
-        catalogue: Catalogue,
-        directory: ShmDirectory,
-        pins: PinWatch,
-        socket_path: str,
-        mode: int,
-        gid: int,
-    ) -> None:
-        self._config = config
-        self._socket_path = socket_path
-        self._gid = gid
-        self._privileges = Privileges(config.admin_group)
-        self._epoch = secrets.randbits(63) | 1
-        self._event_log = EventLog(self._epoch)
-        self._map_watch: MapWatch | None = None
-        self._directory = directory
-        self._catalogue = catalogue
-        self._identity = DaemonIdentity(
-            pid=os.getpid(),
-            start_time_ticks=start_time_ticks(os.getpid()),
-            pid_namespace=pid_namespace(),
-            epoch=self._epoch,
-            instance=config.instance,
-            endpoint=socket_path,
-            map_path=config.map_path,
-            map_version=catalogue.map_version,
-            shm_dir=directory.path,
-            id_prefix=catalogue.id_prefix,
-            library_version=__version__,
-            started_unix_ns=time.time_ns(),
-            frame_id=catalogue.frame_id,
-        )
-        budget = choose_budget(  # may refuse: before anything has a name
-            config.budget_bytes,
-            directory,
-            ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
-            limit_bytes=memory_limit_bytes(),
-        )
-        try:
-            self._statistics = StatisticsWriter(
-                directory, config.instance, self._identity, mode=mode, gid=gid
-            )
-        except OSError as error:
-            raise ConfigError(
-                f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}",
-                key="shm_dir",
-                hint="make room, and lift limits on the size of files (ulimit -f, LimitFSIZE=)",
-            ) from error
-        self._sessions = Sessions()
-        ledger = Ledger(budget)
-        ledger.overhead_bytes = self._statistics.size_bytes
-
-        def grow_statistics(nbytes: int) -> bool:
-            fits = ledger.shortage(nbytes) <= 0
-            ledger.overhead_bytes += nbytes if fits else 0
-            return fits
-
-        self._statistics.reserve = grow_statistics
-        reclaimer = Reclaimer(ledger, directory, self._sessions, POLICIES[config.eviction], pins)
-        self._statistics.set("pin_source", list(Rung).index(pins.rung))
-        self._statistics.set("last_reload_unix_ns", time.time_ns())
-        pool = WorkerPool(
-            config.loaders(),
-            directory.path,
-            config.load_timeout_s,
-            watch=lambda fd: self._running.watch_worker(fd),
-            unwatch=lambda fd: self._running.unwatch(fd),
-            cache_dir=config.cache_dir,
-            cache_bytes=config.cache_bytes,
-        )
-        self._cache = CellCache(
-            catalogue,
-            ledger,
-            reclaimer,
-            pool,
-            directory,
-            self._statistics,
-            instance=config.instance,
-            epoch=self._epoch,
-            id_prefix=catalogue.id_prefix,
-            mode=mode,
-            gid=gid,
-            on_settled=lambda key: self._running.cells.settled(key),
-            event_log=self._event_log,
-        )
-        leftovers = Adoption(directory, config.instance, self._cache, reclaimer, mode=mode, gid=gid)
-        leftovers.take_over(time.monotonic())
-        self._server: ServingLoop | None = None
-
-    @property
-    def _running(self) -> ServingLoop:
-        if self._server is None:
-            raise InternalError("the server does not run yet")
-        return self._server
-
-    def serve(
-        self,
+        memory: MapInMemory,
         reloader: Reloader,
-        started_s: float,
-        signals: StartSignals,
         manager: ServiceManager,
+        socket_path: str,
+        gid: int,
+        signals: StartSignals,
         activated: ActivatedSocket | None,
     ) -> None:
-        """Bind, say READY, answer requests until told to stop."""
-        take_slices(SERVING_SLICE_NS)  # ZeroMQ's thread inherits it
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        socket: zmq.Socket[bytes] = context.socket(zmq.ROUTER)
-        socket.setsockopt(zmq.LINGER, 200)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
-        socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
-        socket.setsockopt(zmq.RCVHWM, RECEIVE_QUEUE)
+        self._config = config
+        self._memory = memory
+        self._reloader = reloader
         self._manager = manager
+        self._socket_path = socket_path
+        self._gid = gid
+        self._signals = signals
         self._owns_socket = activated is None
-        quota = self._config.session_quota
-        budget = self._cache.ledger.budget_bytes
-        events = EventSocket(context, self._event_log.beat)
-        admin = Admin(
-            self._config,
-            self._cache,
-            self._sessions,
-            self._statistics,
-            epoch=self._epoch,
-            event_log=self._event_log,
-            events_path=events_path(self._socket_path),
-        )
-        self._pins = admin.pins
-        server = self._server = ServingLoop(
-            socket,
-            self._cache,
-            self._sessions,
-            self._statistics,
-            admin,
-            reloader,
-            self._privileges,
-            self._event_log,
-            epoch=self._epoch,
+        self._file_watch: FileWatch | None = None
+        authorization = Authorization(config.admin_group)
+        take_slices(SERVING_SLICE_NS)  # ZeroMQ's thread inherits it
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 200)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        self._socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
+        self._socket.setsockopt(zmq.RCVHWM, RECEIVE_QUEUE)
+        if activated is not None:
+            self._socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
+        self._events = EventPublisher(self._context, memory.event_log.beat)
+        cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
+        scheduler, watched = memory.scheduler, memory.watched
+        quota, budget = config.session_quota, cache.ledger.budget_bytes
+        self._outbox = Outbox(self._socket, statistics)
+        cells = CellRequests(
+            cache, scheduler, statistics, epoch=memory.epoch,
             quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
+            send=self._outbox.send, clock=time.monotonic,
+        )  # fmt: skip
+        sampler = Sampler(
+            cache,
+            scheduler,
+            statistics,
+            memory.event_log,
+            sessions=sessions,
+            waiting=cells,
             on_beat=self._beat,
         )
+        self._pins = OperatorPins(cache, scheduler)
+        queries = MapQueries(
+            config, cache, sessions, statistics, self._pins, memory.map_switch, scheduler.loads,
+            epoch=memory.epoch, event_log=memory.event_log, events_path=events_path(socket_path),
+        )  # fmt: skip
+        operators = OperatorRequests(cache, self._pins, reloader, self._outbox)
+        handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, watched)
+        change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log, statistics)
+        watched.watch(reloader.fd, change.collect)
+        dispatch = Dispatch(
+            sessions, handshake, cells, queries, operators, authorization, cache.survey, sampler, self._outbox
+        )
+        inbox = Inbox(self._socket, sessions, statistics, dispatch.refuse_unread)
+        self._gate = ListenGate(watched.watch, watched.unwatch)
+        self._crowd = CrowdControl(
+            self._gate,
+            waiting_bytes=inbox.waiting_bytes,
+            unread_bytes=lambda: self._outbox.unread(list(sessions)),
+            session_descriptors=lambda: [session.fd for session in sessions],
+        )
+        self._loop = ServingLoop(
+            self._socket, watched, inbox, dispatch, operators, cells, cache, scheduler, self._crowd, sampler,
+            statistics,
+        )  # fmt: skip
+
+    def run(self, started_s: float) -> None:
+        """Bind, say READY, answer requests until told to stop."""
+        memory, watched = self._memory, self._memory.watched
         try:
-            self._watch_map(server)
+            self._watch_map()
             with contextlib.closing(ServingSignals()) as heard:
-                server.watch(heard.fd, lambda: self._on_signals(heard, signals))
-                if activated is not None:
-                    socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
-                bind_socket(socket, self._socket_path, self._gid, own=self._owns_socket)
+                watched.watch(heard.fd, lambda: self._on_signals(heard))
+                bind_socket(self._socket, self._socket_path, self._gid, own=self._owns_socket)
                 step("daemon.bind")
-                bind_socket(events.socket, events_path(self._socket_path), self._gid)
-                server.guard()
-                server.watch(events.fd, events.drain)
-                self._event_log.send = events.send
+                bind_socket(self._events.socket, events_path(self._socket_path), self._gid)
+                self._gate.close_behind()
+                self._outbox.paths = self._gate.paths
+                self._crowd.begin()
+                watched.watch(self._events.fd, self._events.drain)
+                memory.event_log.send = self._events.send
                 self._tell_epoch("started")
-                self._cache.loads.pool.start_one()
+                memory.scheduler.pool.start_one()
+                cells = len(memory.cache.catalogue)
                 _log.info(
                     "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
-                    self._socket_path, self._config.instance, self._config.map_path,
-                    len(self._catalogue), budget, time.monotonic() - started_s,
+                    self._socket_path, self._config.instance, self._config.map_path, cells,
+                    memory.cache.ledger.budget_bytes, time.monotonic() - started_s,
                 )  # fmt: skip
-                manager.ready(f"serving {len(self._catalogue)} cells")
+                self._manager.ready(f"serving {cells} cells")
                 _settle_memory()
-                if signals.reload_wanted:
+                if self._signals.reload_wanted:
                     self._reload()
-                server.run()
+                self._loop.run()
+                self._gate.release()
+                self._loop.answer_waiting()
         finally:
-            manager.stopping("keeping memory for the next start" if signals.keep else "freeing memory")
-            self._tell_epoch("stopping")
-            self._event_log.send = nowhere
-            events.close()
-            socket.close()
-            context.term()
-            reloader.close()
-            if self._map_watch is not None:
-                self._map_watch.close()
-            if self._owns_socket:
-                remove_socket(self._socket_path)
-            remove_socket(events_path(self._socket_path))
+            self._end()
 
-    def _watch_map(self, server: ServingLoop) -> None:
-        config = self._config
-        if config.watch:
-            watch = MapWatch(directories_of(config.map_path, config.metadata, self._cache.catalogue))
-            server.watch(watch.fd, lambda: watch.drain(time.monotonic()))
-            self._map_watch = watch
+    def _end(self) -> None:
+        keep = self._signals.keep
+        self._manager.stopping("keeping memory for the next start" if keep else "freeing memory")
+        self._tell_epoch("stopping")
+        self._memory.event_log.send = nowhere
+        self._events.close()
+        self._socket.close()
+        self._context.term()
+        self._reloader.close()
+        if self._file_watch is not None:
+            self._file_watch.close()
+        if self._owns_socket:
+            remove_socket(self._socket_path)
+        remove_socket(events_path(self._socket_path))
 
     def _tell_epoch(self, what: str) -> None:
-        catalogue = self._cache.catalogue
-        self._event_log.publish(
-            Epoch, what, catalogue.map_version, len(catalogue), self._cache.ledger.resident_count
+        cache = self._memory.cache
+        self._memory.event_log.publish(
+            Epoch, what, cache.catalogue.map_version, len(cache.catalogue), cache.ledger.resident_count
         )
 
     def _beat(self) -> None:
-        self._manager.beat(time.monotonic(), self._status)
-        self._pins.keep(time.monotonic())
-        self._running.watch_crowd(time.monotonic())
-        if self._map_watch is not None and self._map_watch.due(time.monotonic()):
+        """A few times a second, from the loop itself: whoever is hung does not beat."""
+        memory, now_s = self._memory, time.monotonic()
+        self._manager.beat(now_s, self._status)
+        self._pins.keep(now_s)
+        self._crowd.beat(now_s)
+        if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
-        version = self._cache.catalogue.map_version
-        if version != self._identity.map_version:
-            self._identity = dataclasses.replace(self._identity, map_version=version)
-            self._statistics.update_identity(self._identity)
+        version = memory.cache.catalogue.map_version
+        if version != memory.identity.map_version:
+            memory.identity = dataclasses.replace(memory.identity, map_version=version)
+            memory.statistics.update_identity(memory.identity)
 
     def _status(self) -> str:
-        ledger = self._cache.ledger
+        cache = self._memory.cache
         return status_line(
-            resident=len({resident.key.cell_id for resident in ledger.residents()}),  # some have layers, too
-            cells=len(self._cache.catalogue),
-            used_bytes=ledger.used_bytes,
-            budget_bytes=ledger.budget_bytes,
-            clients=len(self._sessions),
-            failed=self._statistics.values["loads_failed"],
+            resident=len({key.cell_id for key in cache.ledger.by_key}),  # some have layers, too
+            cells=len(cache.catalogue),
+            used_bytes=cache.ledger.used_bytes,
+            budget_bytes=cache.ledger.budget_bytes,
+            clients=len(self._memory.sessions),
+            failed=self._memory.statistics.values["loads_failed"],
         )
 
+    # --- reload -----------------------------------------------------------------------------------
+
+    def _watch_map(self) -> None:
+        if self._config.watch:
+            watch = FileWatch(self._directories(self._memory.cache.catalogue.id_prefix))
+            self._memory.watched.watch(watch.fd, lambda: watch.drain(time.monotonic()))
+            self._file_watch = watch
+
+    def _directories(self, id_prefix: str) -> set[str]:
+        return directories_of(self._config.map_path, self._config.metadata, id_prefix)
+
     def _reload(self) -> None:
-        """Read the map again because of a signal; the service manager waits for the end."""
+        """Read the map again because of a signal or a change; the service manager waits for the end."""
         self._manager.reloading()
-        self._running.reload(self._reloaded)
+        self._reloader.ask(self._reloaded)
 
     def _reloaded(self, result: Catalogue | ShmmapError) -> None:
         if isinstance(result, ShmmapError):
             self._manager.reloaded(f"reload failed, the old map stays: {result.message}")
-        else:
-            if self._map_watch is not None:  # the metadata may name another directory now
-                self._map_watch.follow(directories_of(self._config.map_path, self._config.metadata, result))
-            self._manager.reloaded(f"map read again: {len(result)} cells")
+            return
+        if self._file_watch is not None:  # the metadata may name another directory now
+            self._file_watch.follow(self._directories(result.id_prefix))
+        self._manager.reloaded(f"map read again: {len(result)} cells")
 
     # --- signals ----------------------------------------------------------------------------------
 
-    def _on_signals(self, heard: ServingSignals, signals: StartSignals) -> None:
+    def _on_signals(self, heard: ServingSignals) -> None:
         for number in heard.take():
             if number == RELOAD_SIGNAL:
                 self._reload()
-            elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._running.stopping:
-                signals.keep = number == KEEP_SIGNAL
+            elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._loop.stopping:
+                keep = self._signals.keep = number == KEEP_SIGNAL
                 _log.info(
-                    "stopping on %s%s",
-                    number.name,
-                    ", the segments stay for the next start" if signals.keep else "",
+                    "stopping on %s%s", number.name, ", the segments stay for the next start" if keep else ""
                 )
-                if not signals.keep:
+                if not keep:
                     for again in STOP_SIGNALS:
                         signal.signal(again, self._quick_exit)
-                self._running.stop(answer=not signals.keep)
+                self._loop.stop(answer=not keep)
 
     def _quick_exit(self, number: int, frame: object) -> None:
         """A second signal: take the names away and go.
@@ -315,18 +263,11 @@ class Assembly:
         It may come in the middle of the first one's work, so it trusts the disk alone.
         """
         del number, frame
-        directory, instance = self._directory, self._config.instance
+        directory, instance = ShmDirectory(self._config.shm_dir), self._config.instance
         locks = (directory.path + lock_name(instance), lock_path(self._socket_path))
         ours = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]
         take_away(directory, instance, (*ours, *locks))
         os._exit(0)  # the loaders die with this process
-
-    def close(self, *, keep: bool) -> None:
-        """Take every name away, or leave those of the segments to the next life."""
-        self._cache.close(keep=keep)
-        self._statistics.close()
-        if self._server is not None:
-            self._server.close()
 
 
 def _settle_memory() -> None:

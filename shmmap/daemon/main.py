@@ -28,13 +28,14 @@ import time
 from functools import partial
 from pathlib import Path
 
-from shmmap.daemon.assembly import Assembly
+from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_name, lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
 from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.prerequisites import (
     access_of_segments,
     choose_pins,
@@ -110,9 +111,10 @@ def run(config: DaemonConfig) -> int:
         for problem in catalogue.problems:
             _log.warning("%s", problem)
         with signals.held():
-            life = Assembly(config, catalogue, directory, pins, path, mode, gid)
-            stack.callback(lambda: life.close(keep=signals.keep))
-        life.serve(Reloader(origin), started_s, signals, ServiceManager(), activated)
+            memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
+            stack.callback(lambda: memory.close(keep=signals.keep))
+        service = Service(config, memory, Reloader(origin), ServiceManager(), path, gid, signals, activated)
+        service.run(started_s)
     return 0
 
 

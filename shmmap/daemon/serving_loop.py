@@ -108,10 +108,9 @@ class ServingLoop:
                         callback()
         self._cache.tell_all()
         self._serve()
-        now_s = time.monotonic()
-        self._scheduler.end_overdue(now_s)
-        self._scheduler.pump(now_s)
-        self._look_after_the_rest(now_s)
+        self._look_after_the_rest(time.monotonic())
+        self._scheduler.pump(time.monotonic())
+        self._cache.tell_all()
 
     def _serve(self) -> None:
         """Hear everybody, serve those whose turn it is; for a bounded time."""
@@ -132,11 +131,11 @@ class ServingLoop:
             start_s, more = now_s, True
 
     def _look_after_the_rest(self, now_s: float) -> None:
-        """What has its own time: deadlines, surveys, statistics, and telling what happened."""
+        """What has its own time: deadlines, surveys, overload, statistics."""
+        self._scheduler.lost.end_overdue(now_s)
         self._cells.answer_overdue(now_s)
         self._cache.survey.turn(now_s)
         self._crowd.step()
-        self._cache.tell_all()
         self._sampler.turn(now_s)
         if now_s >= self._operators.stop_by_s:
             self.stop()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,6 +115,15 @@ class Catalogue:
     def boxes(self) -> NDArray[np.float64]:
         """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame; do not write."""
         return self._index.boxes
+
+    @cached_property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Box around all cells, metres, map frame; None where there are none."""
+        if not len(self):
+            return None
+        min_x, min_y = self.boxes[:, :2].min(axis=0).tolist()
+        max_x, max_y = self.boxes[:, 2:].max(axis=0).tolist()
+        return min_x, min_y, max_x, max_y
 
     @property
     def stamps(self) -> NDArray[np.int64]:

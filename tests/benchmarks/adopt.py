@@ -32,7 +32,7 @@ __all__ = ["main"]
 
 def publish_all(one: InnerDaemon, count: int) -> list[str]:
     """Publish the segments of the first ``count`` cells, as an earlier life would have."""
-    catalogue, names = one.store.catalogue, []
+    catalogue, names = one.cache.catalogue, []
     for index in range(count):
         fd = one.directory.create()
         cell = catalogue.id(index)
@@ -76,9 +76,9 @@ def main() -> None:
             life = InnerDaemon(
                 str(made.root), budget_bytes=4 << 30, cache_dir=scratch, shm_dir=first.shm_dir, name="next"
             )
-            leftovers = Adoption(life.directory, "inner", life.store, life.reclaimer, mode=0o400, gid=-1)
-            spent = milliseconds(lambda: leftovers.take_over(life.now_s()))
-            assert life.books.resident_count == options.segments
+            adoption = Adoption(life.directory, "inner", life.cache, life.loads, mode=0o400, gid=-1)
+            spent = milliseconds(lambda: adoption.take_over(life.now_s()))
+            assert life.ledger.resident_count == options.segments
             life.leave()
             return spent
 

@@ -66,6 +66,12 @@ class Ledger:
         self.reserved_bytes += nbytes if fits else 0
         return fits
 
+    def add_overhead(self, nbytes: int) -> bool:
+        """The daemon itself keeps more; False if that does not fit."""
+        fits = self.shortage(nbytes) <= 0
+        self.overhead_bytes += nbytes if fits else 0
+        return fits
+
     def memory(self) -> tuple[int, int, int]:
         """Budget, used and retired bytes."""
         return self.budget_bytes, self.used_bytes, self.retired_bytes

@@ -9,7 +9,6 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
-from shmmap.origin.stamp import Stamp
 from shmmap.segment.layout import SourceStamp
 
 __all__ = ["MapSwitch"]
@@ -61,11 +60,14 @@ class MapSwitch:
             if now != read:
                 if now != before:
                     return False  # another state was found since: what was read may have been replaced
-                self._learn(index, Stamp(*read))
+                self.learn(index, read)
         return True
 
-    def _learn(self, index: int, stamp: Stamp) -> None:
+    def learn(self, index: int, stamp: SourceStamp) -> None:
+        """A loader found that a cell's file is in this state."""
         cache = self._cache
+        if cache.catalogue.stamp(index) == stamp:
+            return
         cell_id = cache.catalogue.id(index)
         self._remember({cell_id}, ())
         cache.catalogue.set_stamp(index, stamp)

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Final
 
-from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.errors import ShmmapError
 from shmmap.origin.catalogue import CatalogueChange
 from shmmap.protocol import events
@@ -20,9 +21,13 @@ CELLS_TOLD: Final = 256
 
 
 def tell_reload(
-    log: EventLog, statistics: StatisticsWriter, cache: CellCache, change: CatalogueChange
+    log: EventLog,
+    statistics: StatisticsWriter,
+    catalogue: CatalogueView,
+    change: CatalogueChange,
+    wire_id: Callable[[str], str],
 ) -> None:
-    """Say that the cache serves another state of the map, and what is new in it."""
+    """Say that another state of the map is served, and what is new in it; ``wire_id`` shortens cell ids."""
     statistics.add("reloads")
     statistics.set("last_reload_unix_ns", time.time_ns())
     statistics.set("last_reload_failed", 0)
@@ -32,25 +37,19 @@ def tell_reload(
         "added": change.added,
         "removed": change.removed,
     }
-    named = [(how, cell) for how, cells in kinds.items() for cell in list(cells)[:CELLS_TOLD]][:CELLS_TOLD]
-    log.publish(
-        events.Reloaded,
-        cache.catalogue.map_version,
-        len(change.changed) + len(change.moved),
-        len(change.added),
-        len(change.removed),
-        len(named),
-    )
+    named = [(how, cell) for how, cells in kinds.items() for cell in cells[:CELLS_TOLD]][:CELLS_TOLD]
+    changed, added, removed = len(change.changed) + len(change.moved), len(change.added), len(change.removed)
+    log.publish(events.Reloaded, catalogue.map_version, changed, added, removed, len(named))
     for how, cell in named:
-        index = cache.index_of(cell) if how != "removed" else None
-        version = cache.catalogue.version(index) if index is not None else 0
-        log.publish(events.Changed, cache.wire_id(cell), version, how)
+        index = catalogue.find(cell) if how != "removed" else None
+        version = catalogue.version(index) if index is not None else 0
+        log.publish(events.Changed, wire_id(cell), version, how)
 
 
 def tell_reload_failed(
-    log: EventLog, statistics: StatisticsWriter, cache: CellCache, error: ShmmapError
+    log: EventLog, statistics: StatisticsWriter, map_version: int, error: ShmmapError
 ) -> None:
     """Say that the map could not be read again; the old state of it stays."""
     statistics.add("reloads_failed")
     statistics.set("last_reload_failed", 1)
-    log.publish(events.Reloaded, cache.catalogue.map_version, 0, 0, 0, 0, error.message)
+    log.publish(events.Reloaded, map_version, 0, 0, 0, 0, error.message)

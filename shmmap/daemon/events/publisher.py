@@ -12,7 +12,7 @@ from typing import Final
 
 import zmq
 
-__all__ = ["EventSocket", "events_path"]
+__all__ = ["EventPublisher", "events_path"]
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ def events_path(request_path: str) -> str:
     return request_path.removesuffix(".sock") + ".events.sock"
 
 
-class EventSocket:
+class EventPublisher:
     """An XPUB socket; bound by the caller.
 
     Parameters

@@ -15,11 +15,11 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Hashable, Iterable
-from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import (
     Check,
@@ -44,9 +44,6 @@ __all__ = ["Scheduler"]
 
 _log = logging.getLogger(__name__)
 
-START_ATTEMPTS: Final = 3
-"""After this many loaders in a row that could not start, loads fail instead of waiting."""
-
 
 def _nobody(key: Key) -> None:
     del key
@@ -59,11 +56,15 @@ class Scheduler:
     ----------
     pool
         The workers.
+    clock
+        The serving loop's clock, seconds.
 
     Attributes
     ----------
     loads
         What is wanted, queued and under way, and what failed.
+    room, lost
+        Asks the cache for room; replaces workers.
     on_settled
         Called with a key when its load ended, in whichever way.
     """
@@ -75,16 +76,20 @@ class Scheduler:
         map_switch: MapSwitch,
         pool: WorkerPool,
         statistics: StatisticsWriter,
+        *,
+        clock: Callable[[], float],
     ) -> None:
         self._cache = cache
         self._map_switch = map_switch
         self._statistics = statistics
         self.loads = loads
         self.pool = pool
+        pool.on_message = lambda worker: self.on_worker(worker, clock())
         self.on_settled: Callable[[Key], None] = _nobody
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
-        self._room = Room(cache, loads, pool)
+        self.room = Room(cache, loads, pool)
+        self.lost = LostWorkers(pool, self._jobs, loads, self.room, statistics, self._fail)
 
     # --- being asked ----------------------------------------------------------------------------
 
@@ -123,8 +128,8 @@ class Scheduler:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.clear_failures(SPACE_CODES)
-        if self._room.hungry:
-            self._room.feed(self._jobs, now_s)
+        if self.room.hungry:
+            self.room.feed(self._jobs, now_s)
         while self.pool.has_room:
             load = self.loads.next_queued()
             if load is None:
@@ -135,7 +140,7 @@ class Scheduler:
                 continue
             shortage = self._cache.ledger.shortage(load.estimate)
             if load.estimate and shortage > 0:
-                refusal = self._room.refusal(load, shortage, now_s)
+                refusal = self.room.refusal(load, shortage, now_s)
                 if not refusal:
                     return
                 self._fail(load, "over_budget", refusal, None, now_s)
@@ -190,15 +195,15 @@ class Scheduler:
 
     # --- what workers say -----------------------------------------------------------------------
 
-    def on_worker(self, worker: Worker, now_s: float) -> bool:
-        """Handle one message of a worker; False when there is none left now."""
+    def on_worker(self, worker: Worker, now_s: float) -> None:
+        """Handle one message of a worker."""
         try:
             received = self.pool.receive(worker)
         except EOFError:
-            self._on_worker_end(worker, now_s)
-            return False
+            self.lost.ended(worker, now_s)
+            return
         if received is None:
-            return False
+            return
         message, fd = received
         if isinstance(message, Segment):
             step("daemon.received")
@@ -210,23 +215,22 @@ class Scheduler:
             worker.head_since_s = now_s
             self.pool.failed_starts = 0
         elif isinstance(message, Need):
-            self._room.ask(worker, message)
-            self._room.feed(self._jobs, now_s)
+            self.room.ask(worker, message)
+            self.room.feed(self._jobs, now_s)
         elif not isinstance(message, Segment):
             self._on_end(worker, message, now_s)
-        return True
 
     def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
         """A worker is done with a job, in whichever way."""
         self.pool.finished(worker, message.number, now_s)
-        self._room.hungry.pop(message.number, None)
+        self.room.hungry.pop(message.number, None)
         load = self._jobs.pop(message.number, None)
         fd, worker.segment_fd = worker.segment_fd, -1
         try:
             if load is None:
                 return
             if isinstance(message, Checked):
-                self._on_checked(load, message.wrong, now_s)
+                self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
                 self._fail(load, message.code, message.message, message.stamp, now_s)
             elif fd >= 0:
@@ -271,25 +275,28 @@ class Scheduler:
             _log.info("%s: %d points left out, not finite", key.cell_id, done.dropped)
         self._end(load)
 
-    def _on_checked(self, load: Load, wrong: str, now_s: float) -> None:
+    def _on_checked(self, load: Load, message: Checked, now_s: float) -> None:
         """A worker compared an adopted segment with its checksums, or a file with the state it failed for."""
         if load.unless is not None:
-            self._on_looked(load, changed=bool(wrong))
+            self._on_looked(load, message)
             return
         resident, load.adopted = load.adopted, None
-        if resident is not None and not wrong and self._cache.accept(resident):
+        if resident is not None and not message.wrong and self._cache.accept(resident):
             self._end(load)
             return
-        if resident is not None and wrong:
-            self._cache.reject(resident, wrong, now_s)
+        if resident is not None and message.wrong:
+            self._cache.reject(resident, message.wrong, now_s)
         self._load_after_all(load)
 
-    def _on_looked(self, load: Load, *, changed: bool) -> None:
+    def _on_looked(self, load: Load, message: Checked) -> None:
         """A worker compared a file with the state it failed for: another state is tried at once."""
         failure, load.unless = self.loads.failures.get(load.key), None
-        if not changed:
+        if not message.wrong:
             self._end(load, failure)
             return
+        index = self._cache.index_of(load.key.cell_id)
+        if index is not None and message.stamp is not None:
+            self._map_switch.learn(index, message.stamp)
         if failure is not None:
             self._cache.tell(self._cache.events.retried, load.key, failure)
         self._load_after_all(load)
@@ -302,50 +309,10 @@ class Scheduler:
         else:
             self._end(load)
 
-    def _on_worker_end(self, worker: Worker, now_s: float) -> None:
-        if not worker.ready:
-            self.pool.failed_starts += 1
-        at_fault = worker.ready or self.pool.failed_starts >= START_ATTEMPTS
-        how = self._replace(worker, "load_failed" if at_fault else "", now_s)
-        self._statistics.add("worker_crashes")
-        if not worker.ready:
-            _log.error("a loader could not start: %s", how)
-
-    def end_overdue(self, now_s: float) -> None:
-        """Kill workers whose load took too long; only the cell they worked on fails."""
-        for worker in self.pool.overdue(now_s):
-            if worker.ready:
-                self._statistics.add("loads_timed_out")
-                self._replace(worker, "load_timeout", now_s)
-            else:
-                self._on_worker_end(worker, now_s)
-
-    def _replace(self, worker: Worker, code: str, now_s: float) -> str:
-        """Forget a worker; with a code the job it worked on fails, the others are queued again.
-
-        Returns how it ended, for people.
-        """
-        unfinished, how = self.pool.remove(worker)
-        for position, job in enumerate(unfinished):
-            self._room.hungry.pop(job.number, None)
-            load = self._jobs.pop(job.number, None)
-            if position == 0 and code:
-                why = (
-                    f"the loader died of it ({how})"
-                    if code == "load_failed"
-                    else "loading took longer than allowed"
-                )
-                _log.error("a loader was replaced: %s: %s", job.path, why)
-                if load is not None:
-                    self._fail(load, code, f"{job.path}: {why}", None, now_s)
-            elif load is not None:
-                self.loads.requeue(load)
-        return how
-
     def _fail(self, load: Load, code: str, message: str, stamp: SourceStamp | None, now_s: float) -> None:
         """The load ended without a segment; the back-off doubles when it failed the same way before."""
         if load.adopted is not None or load.unless is not None:
-            self._on_checked(load, message if load.unless is None else "", now_s)
+            self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return
         if code in SPACE_CODES:
             self._statistics.add("refused_over_budget")

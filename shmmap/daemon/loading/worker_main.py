@@ -172,9 +172,10 @@ class _Worker:
             os.close(fd)
 
     def _check(self, job: worker_messages.Check) -> None:
-        wrong = ""
+        wrong, stamp = "", None
         try:
-            if SourceStamp.of(os.stat(job.path)) != job.stamp:
+            stamp = SourceStamp.of(os.stat(job.path))
+            if stamp != job.stamp:
                 wrong = "its source has changed"
             elif job.segment:
                 fd = self._directory.open(job.segment)
@@ -186,7 +187,7 @@ class _Worker:
                     os.close(fd)
         except (OSError, SegmentCorrupt) as error:
             wrong = str(error)
-        self._send(worker_messages.Checked(job.number, wrong[:500]))
+        self._send(worker_messages.Checked(job.number, wrong[:500], stamp))
 
     def _fail(self, job: worker_messages.Job, code: str, message: str) -> None:
         stamp = None

@@ -109,10 +109,14 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
-    """File and segment are what they should be, or ``wrong`` says why not; the worker has closed both."""
+    """File and segment are what they should be, or ``wrong`` says why not; the worker has closed both.
+
+    ``stamp`` is the file's state, if it could be looked at.
+    """
 
     number: int
     wrong: str = ""
+    stamp: SourceStamp | None = None
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.processes.start_child import MAX_PACKET_BYTES, start_worker
 
 __all__ = ["Worker", "WorkerPool"]
@@ -52,6 +53,10 @@ class Worker:
         return self.channel.fileno()
 
 
+def _unheard(worker: Worker) -> None:
+    del worker
+
+
 class WorkerPool:
     """Up to ``limit`` worker processes.
 
@@ -65,11 +70,13 @@ class WorkerPool:
         How long one load may take; then its worker is killed.
     cache_dir, cache_bytes
         Where finished layers are kept, and at most how much of them; empty or 0: nowhere.
-    watch, unwatch
-        Called with a worker's descriptor when it comes and goes, for the caller's poller.
+    watched
+        Told of the workers' descriptors.
 
     Attributes
     ----------
+    on_message
+        Called with a worker that has something to say.
     failed_starts
         Workers in a row that ended before they were ready: not their job's fault.
     """
@@ -79,17 +86,16 @@ class WorkerPool:
         limit: int,
         shm_dir: str,
         deadline_s: float,
+        watched: WatchedDescriptors,
         *,
-        watch: Callable[[int], None],
-        unwatch: Callable[[int], None],
         cache_dir: str = "",
         cache_bytes: int = 0,
     ) -> None:
         self._limit = limit
         self._shm_dir = shm_dir
         self._deadline_s = deadline_s
-        self._watch = watch
-        self._unwatch = unwatch
+        self._watched = watched
+        self.on_message: Callable[[Worker], None] = _unheard
         self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
         self._workers: dict[int, Worker] = {}
         self._ending: list[subprocess.Popen[bytes]] = []
@@ -100,10 +106,6 @@ class WorkerPool:
 
     def __iter__(self) -> Iterator[Worker]:
         return iter(list(self._workers.values()))
-
-    def by_fd(self, fd: int) -> Worker | None:
-        """The worker whose channel has this descriptor."""
-        return self._workers.get(fd)
 
     @property
     def has_room(self) -> bool:
@@ -126,7 +128,7 @@ class WorkerPool:
         ours.setblocking(False)
         worker = Worker(process, ours)
         self._workers[worker.fd] = worker
-        self._watch(worker.fd)
+        self._watched.watch(worker.fd, lambda: self.on_message(worker))
         return worker
 
     def submit(self, job: worker_messages.Job | worker_messages.Check, now_s: float) -> bool:
@@ -193,7 +195,7 @@ class WorkerPool:
 
     def remove(self, worker: Worker) -> tuple[list[worker_messages.Job | worker_messages.Check], str]:
         """Forget a dead worker; returns its unfinished jobs, and how it ended, for people."""
-        self._unwatch(worker.fd)
+        self._watched.unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
         if worker.segment_fd >= 0:

@@ -16,7 +16,6 @@ from typing import Final
 
 from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
 from shmmap.errors import ConfigError
-from shmmap.origin.catalogue import Catalogue
 
 __all__ = ["FileWatch", "directories_of"]
 
@@ -44,12 +43,12 @@ _REMOTE: Final = frozenset(
 )
 
 
-def directories_of(map_path: str, metadata: str, catalogue: Catalogue) -> set[str]:
-    """Return the directories whose files make up a map."""
+def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
+    """Return the directories whose files make up a map; all its cells' ids start with ``id_prefix``."""
     found = {map_path if os.path.isdir(map_path) else os.path.dirname(map_path)}
     if metadata:
         found.add(os.path.dirname(os.path.abspath(metadata)))
-    prefix = os.path.dirname(catalogue.id_prefix)
+    prefix = os.path.dirname(id_prefix)
     if os.path.isdir(prefix):
         found.add(prefix)
     return {directory or "." for directory in found}

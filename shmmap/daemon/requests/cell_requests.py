@@ -33,7 +33,7 @@ from shmmap.geometry import Area
 from shmmap.protocol import messages
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["CellRequests"]
+__all__ = ["CellRequests", "note_area"]
 
 MAX_WAIT_S: Final = 3600.0
 
@@ -81,7 +81,7 @@ class CellRequests:
         """All cells that touch an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        _note_area(session, area)
+        note_area(session, area)
         layers = admitted_layers(self._cache, message.layers)
         indices = self._cache.at_height(self._cache.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
@@ -108,7 +108,7 @@ class CellRequests:
         check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        _note_area(session, area)
+        note_area(session, area)
         layers = admitted_layers(self._cache, message.layers)
         found = self._cache.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._quota.is_out_of_reach(session):
@@ -265,7 +265,7 @@ def _check_wait(wait_s: float | None) -> None:
         raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
 
 
-def _note_area(session: Session, area: Area) -> None:
+def note_area(session: Session, area: Area) -> None:
     """A session asks for an area: in the middle of it is where it is, unless it says."""
     session.area = area
     if not session.says_where:

@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 import zmq
 
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.transport.inbox import peer_of
 from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch
 from shmmap.protocol import events
 from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
@@ -27,10 +28,8 @@ class Handshake:
 
     Parameters
     ----------
-    watch, unwatch
-        Have a callback called when a descriptor is readable, and no longer.
-    on_left
-        Called with a session that has ended.
+    operators
+        Told of a session that has ended.
     """
 
     def __init__(
@@ -39,18 +38,15 @@ class Handshake:
         cells: CellRequests,
         statistics: StatisticsWriter,
         event_log: EventLog,
-        *,
-        watch: Callable[[int, Callable[[], None]], None],
-        unwatch: Callable[[int], None],
-        on_left: Callable[[Session], None],
+        operators: OperatorRequests,
+        watched: WatchedDescriptors,
     ) -> None:
         self._sessions = sessions
         self._cells = cells
         self._statistics = statistics
         self._event_log = event_log
-        self._watch = watch
-        self._unwatch = unwatch
-        self._on_left = on_left
+        self._operators = operators
+        self._watched = watched
 
     def enter(self, identity: bytes, frame: zmq.Frame, message: Hello, now_s: float) -> Session:
         """Return the session of who says hello.
@@ -84,7 +80,7 @@ class Handshake:
         self._statistics.add("sessions_opened")
         self._event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
         if session.pidfd >= 0:
-            self._watch(session.pidfd, lambda: self.leave(session))
+            self._watched.watch(session.pidfd, lambda: self.leave(session))
         return session
 
     def leave(self, session: Session) -> None:
@@ -95,10 +91,10 @@ class Handshake:
         )
         self._cells.forget(session)
         if session.pidfd >= 0:
-            self._unwatch(session.pidfd)
+            self._watched.unwatch(session.pidfd)
         self._sessions.close(session)
         self._cells.let_go(held)
-        self._on_left(session)
+        self._operators.left(session)
 
 
 def _descriptor(frame: zmq.Frame) -> int:

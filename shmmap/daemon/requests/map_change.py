@@ -54,7 +54,7 @@ class MapChange:
         change = self._map_switch.switch(catalogue, now_s)
         self._scheduler.drop(change.removed)
         cache.tell_all()
-        tell_reload(self._event_log, self._statistics, cache, change)
+        tell_reload(self._event_log, self._statistics, catalogue, change, cache.wire_id)
         _log.info(
             "map read again: %d cells changed, %d added, %d removed",
             len(change.changed), len(change.added), len(change.removed),
@@ -63,4 +63,4 @@ class MapChange:
             _log.warning("%s", problem)
 
     def _keep(self, error: ShmmapError) -> None:
-        tell_reload_failed(self._event_log, self._statistics, self._cache, error)
+        tell_reload_failed(self._event_log, self._statistics, self._cache.catalogue.map_version, error)

@@ -12,6 +12,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import client_row
 from shmmap.daemon.transport.sessions import Sessions
@@ -19,7 +20,7 @@ from shmmap.statistics.client_rows import MAX_CLIENTS
 from shmmap.statistics.counters import SPANS, WINDOWED
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["BEAT_S", "Heartbeat"]
+__all__ = ["BEAT_S", "Sampler"]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
@@ -29,7 +30,7 @@ USED_ROWS_A_BEAT: Final = 64
 """Rows of the statistics whose hits are brought up to date at a beat: about half a millisecond."""
 
 
-class Heartbeat:
+class Sampler:
     """Measures and beats.
 
     Parameters
@@ -45,6 +46,7 @@ class Heartbeat:
     def __init__(
         self,
         cache: CellCache,
+        scheduler: Scheduler,
         statistics: StatisticsWriter,
         event_log: EventLog,
         *,
@@ -53,6 +55,7 @@ class Heartbeat:
         on_beat: Callable[[], None],
     ) -> None:
         self._cache = cache
+        self._scheduler = scheduler
         self._statistics = statistics
         self._sessions = sessions
         self._waiting = waiting
@@ -77,13 +80,13 @@ class Heartbeat:
         ledger, set_value = self._cache.ledger, self._statistics.set
         set_value("sessions", len(self._sessions))
         set_value("waiting_requests", len(self._waiting))
-        set_value("workers", len(self._cache.loads.pool))
-        set_value("load_queue", ledger.queued)
+        set_value("workers", len(self._scheduler.pool))
+        set_value("load_queue", len(self._scheduler.loads))
         set_value("cells_resident", ledger.resident_count)
         set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(self._cache.warm))
         set_value("bytes_resident", ledger.resident_bytes)
-        set_value("zombies", len(ledger.zombies))
-        set_value("bytes_zombie", ledger.zombie_bytes)
+        set_value("zombies", len(ledger.retired))
+        set_value("bytes_zombie", ledger.retired_bytes)
         set_value("bytes_pinned", self._cache.survey.usage.nbytes)
         set_value("segments_pinned", self._cache.survey.usage.count)
         set_value("bytes_reserved", ledger.reserved_bytes)

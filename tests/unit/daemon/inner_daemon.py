@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import shutil
 import signal
 import tempfile
@@ -19,14 +18,20 @@ from typing import Any
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.eviction_policy import POLICIES
-from shmmap.daemon.cache.ledger import Key, Ledger
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
+from shmmap.daemon.records import Key
 from shmmap.daemon.requests.cell_requests import CellRequests
-from shmmap.daemon.requests.operators.operator_requests import Admin
+from shmmap.daemon.requests.map_queries import MapQueries
+from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
@@ -76,36 +81,42 @@ class InnerDaemon:
         self.ledger = Ledger(budget_bytes)
         self.ledger.overhead_bytes = self.statistics.size_bytes
         self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, POLICIES["distance"])
-        self._poll = select.epoll()
+        self.watched = WatchedDescriptors()
         self.pool = WorkerPool(
             workers,
             self.shm_dir,
             load_timeout_s,
-            watch=lambda fd: self._poll.register(fd, select.EPOLLIN),
-            unwatch=self._poll.unregister,
+            self.watched,
         )
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
-            catalogue, self.ledger, self.reclaimer, self.pool, self.directory, self.statistics,
-            instance="inner", epoch=EPOCH, id_prefix=catalogue.id_prefix, mode=0o400, gid=-1,
-            on_settled=self._on_settled, event_log=self.event_log,
+            catalogue, self.ledger, self.reclaimer, self.directory, self.statistics,
+            instance="inner", epoch=EPOCH, mode=0o400, gid=-1, event_log=self.event_log,
         )  # fmt: skip
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
+        self.loads = Loads(self.ledger)
+        self.map_switch = MapSwitch(self.cache)
+        self.scheduler = Scheduler(
+            self.cache, self.loads, self.map_switch, self.pool, self.statistics, clock=self.now_s
+        )
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.cache,
+            self.scheduler,
             self.statistics,
             epoch=EPOCH,
             quota_bytes=quota_bytes,
             send=lambda session, data: self.replies.append((session, decode_reply(data))),
             clock=self.now_s,
         )
-        config = DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir)
-        self.admin = Admin(
-            config, self.cache, self.sessions, self.statistics, epoch=EPOCH, event_log=self.event_log
-        )
+        self.scheduler.on_settled = self._on_settled
+        self.queries = MapQueries(
+            DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir), self.cache,
+            self.sessions, self.statistics, OperatorPins(self.cache, self.scheduler), self.map_switch,
+            self.loads, epoch=EPOCH, event_log=self.event_log,
+        )  # fmt: skip
 
     def _on_settled(self, key: Key) -> None:
         self.settled.append(key)
@@ -126,14 +137,15 @@ class InnerDaemon:
 
     def turn(self, timeout_s: float = 0.02) -> None:
         """One turn of the serving loop."""
-        for fd, _ in self._poll.poll(timeout_s):
-            worker = self.pool.by_fd(fd)
-            if worker is not None:
-                self.cache.loads.on_worker(worker, self.now_s())
+        for fd, _ in self.watched.poll(timeout_s):
+            callback = self.watched.callbacks.get(fd)
+            if callback is not None:
+                callback()
         now_s = self.now_s()
-        self.cache.loads.end_overdue(now_s)
-        self.cache.loads.pump(now_s)
+        self.scheduler.lost.end_overdue(now_s)
+        self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
+        self.cache.tell_all()
 
     def run_until(self, done: Callable[[], object]) -> None:
         """Turn until ``done()``."""
@@ -190,16 +202,18 @@ class InnerDaemon:
         old = self.cache.catalogue
         new = self.origin.load(fresh=True)
         self.cells.renumber(lambda index: new.find(old.id(index)), old.id)
-        self.cache.replace_catalogue(new, self.now_s())
+        self.scheduler.drop(self.map_switch.switch(new, self.now_s()).removed)
+        self.cache.tell_all()
         return new
 
     def leave(self) -> None:
         """End everything but the segments, as before a restart."""
         for session in list(self.sessions):
             self.sessions.close(session)
+        self.pool.close()
         self.cache.close(keep=True)
         self.statistics.close()
-        self._poll.close()
+        self.watched.close()
         self.directory.close()
 
     def close(self) -> None:

@@ -15,13 +15,13 @@ from shmmap.daemon.host.groups import group_id
 from shmmap.daemon.transport.sessions import Peer
 from shmmap.errors import NotPermitted
 
-__all__ = ["Privileges"]
+__all__ = ["Authorization"]
 
 MEMORY_S: Final = 10.0
 """How long a user's groups are remembered: asking may mean asking a server far away."""
 
 
-class Privileges:
+class Authorization:
     """Decides who may administer the daemon.
 
     Parameters

@@ -12,7 +12,8 @@ from collections.abc import Iterable
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.loading.load_queue import BACKGROUND
+from shmmap.daemon.loading.loads import BACKGROUND
+from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import Key
 from shmmap.errors import OverBudget
 from shmmap.layers.spec import canonical_layers
@@ -32,8 +33,9 @@ class OperatorPins:
     of the candidates for eviction.
     """
 
-    def __init__(self, cache: CellCache) -> None:
+    def __init__(self, cache: CellCache, scheduler: Scheduler) -> None:
         self._cache = cache
+        self._scheduler = scheduler
         self._keys: set[Key] = set()
         self._round: deque[Key] = deque()
 
@@ -64,7 +66,7 @@ class OperatorPins:
                 hint="unpin others, or serve with a larger --budget",
             )
         for key in wanted - self._keys:
-            self._cache.ledger.slot(key).waiting += 1
+            self._cache.ledger.need(key)
             self._keys.add(key)
             self._round.append(key)
         for key in wanted:
@@ -80,7 +82,7 @@ class OperatorPins:
             gone, unknown = self._keys_of(message.ids, None)
         for key in gone & self._keys:
             self._keys.remove(key)
-            self._cache.ledger.unwait(key)
+            self._cache.ledger.need_no_more(key)
         self._round = deque(key for key in self._round if key in self._keys)
         return self._answer(message.request, self._keys, unknown)
 
@@ -95,7 +97,7 @@ class OperatorPins:
         cache = self._cache
         index = cache.index_of(key.cell_id)
         if index is not None and cache.find_warm(index, key.layer, now_s) is None:
-            cache.want(index, key.layer, BACKGROUND, now_s)
+            self._scheduler.want(index, key.layer, BACKGROUND, now_s)
 
     def _keys_of(self, ids: Iterable[str], layers: tuple[str, ...] | None) -> tuple[set[Key], list[str]]:
         """Keys of cells by id, in these layers (None: in those that are pinned), and ids unknown."""
@@ -112,9 +114,9 @@ class OperatorPins:
         return keys, unknown
 
     def _size(self, key: Key) -> int:
-        slot = self._cache.ledger.slots.get(key)
-        if slot is not None and slot.resident is not None:
-            return slot.resident.nbytes
+        resident = self._cache.ledger.by_key.get(key)
+        if resident is not None:
+            return resident.nbytes
         index = self._cache.index_of(key.cell_id)
         return 0 if index is None else self._cache.estimate(index, key.layer)
 
@@ -123,13 +125,12 @@ class OperatorPins:
         return messages.Pinned(request, tuple(rows), tuple(unknown))
 
     def _row(self, key: Key) -> PinnedCell:
-        slot = self._cache.ledger.slot(key)
-        resident = slot.resident
+        resident, failure = self._cache.ledger.by_key.get(key), self._scheduler.loads.failures.get(key)
         if resident is not None:
             state = "resident" if self._cache.is_current(resident) else "stale"
-        elif slot.load is not None:
+        elif self._scheduler.loads.is_promised(key):
             state = "loading"
         else:
-            state = slot.failure.code if slot.failure is not None else "absent"
+            state = failure.code if failure is not None else "absent"
         nbytes = resident.nbytes if resident is not None else 0
         return PinnedCell(self._cache.wire_id(key.cell_id), key.layer, state, nbytes)

@@ -1,260 +1,103 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that are not for cells: hello, metadata, stats, show, evict, pin."""
+"""What operators alone may ask: read the map again, evict, pin, stop."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+import logging
+import math
 from typing import Final
 
-from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.survey import Share, Usage
-from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.errors import BadRequest, UnknownCell
-from shmmap.layers.registry import kinds
-from shmmap.origin.catalogue import Catalogue
+from shmmap.daemon.transport.outbox import Outbox
+from shmmap.daemon.transport.sessions import Session
+from shmmap.errors import ShmmapError
+from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol import messages
-from shmmap.protocol.events import Recent
-from shmmap.statistics.writer import StatisticsWriter
+from shmmap.protocol.codec import encode
 
-__all__ = ["Admin"]
+__all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
 
-PAGE_ROWS: Final = 500
-"""Longest metadata page: making one takes the serving loop about a millisecond."""
+_log = logging.getLogger(__name__)
+
+OPERATOR_REQUESTS: Final = (
+    messages.Reload,
+    messages.Evict,
+    messages.Pin,
+    messages.Unpin,
+    messages.Shutdown,
+)
 
 
-class Admin:
-    """Answers what operators and helpers ask."""
+FAREWELL_S: Final = 1.0
+"""How long a stop waits for the one who asked for it: libzmq drops a reply that was not read when the
+connection ends (ZMQ_IMMEDIATE)."""
+
+
+class OperatorRequests:
+    """Does what an operator asks; whether one may ask was found out before.
+
+    Attributes
+    ----------
+    stop_by_s
+        When the daemon stops; infinity if nobody asked for that.
+    """
 
     def __init__(
         self,
-        config: DaemonConfig,
         cache: CellCache,
-        sessions: Sessions,
-        statistics: StatisticsWriter,
-        *,
-        epoch: int,
-        event_log: EventLog,
-        events_path: str = "",
+        pins: OperatorPins,
+        reloader: Reloader,
+        outbox: Outbox,
     ) -> None:
-        self._config = config
         self._cache = cache
-        self._sessions = sessions
-        self._statistics = statistics
-        self._epoch = epoch
-        self._event_log = event_log
-        self._events_path = events_path
-        self.pins = OperatorPins(cache)
-        self._kinds = tuple(kind.describe() for kind in kinds())
-        self._bounds_of: Catalogue | None = None
-        self._known_bounds: tuple[float, float, float, float] | None = None
+        self._pins = pins
+        self._reloader = reloader
+        self._outbox = outbox
+        self._asked_to_stop: Session | None = None
+        self.stop_by_s = math.inf
 
-    def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
-        """Tell a new client where everything is."""
-        catalogue = self._cache.catalogue
-        return messages.Welcome(
-            request=message.request,
-            major=messages.PROTOCOL_VERSION[0],
-            minor=messages.PROTOCOL_VERSION[1],
-            daemon=__version__,
-            instance=self._config.instance,
-            epoch=self._epoch,
-            session=session.slot,
-            map_version=catalogue.map_version,
-            map_path=self._config.map_path,
-            frame_id=catalogue.frame_id,
-            shm_dir=self._config.shm_dir,
-            id_prefix=self._cache.id_prefix,
-            segment_prefix=self._cache.segment_prefix,
-            cells=len(catalogue),
-            bounds=self._bounds(),
-            layers=self._kinds,
-            budget_bytes=self._cache.ledger.budget_bytes,
-            pid=os.getpid(),
-            events=self._events_path,
-        )
+    def handle(self, session: Session, message: messages.Request, now_s: float) -> None:
+        """Carry out one request and answer it, a reload when it is over."""
+        if isinstance(message, messages.Reload):
+            self._reload(session, message)
+        elif isinstance(message, messages.Evict):
+            self._outbox.send(session, encode(self._evict(message, now_s)))
+        elif isinstance(message, messages.Pin):
+            self._outbox.send(session, encode(self._pins.pin(message, now_s)))
+        elif isinstance(message, messages.Unpin):
+            self._outbox.send(session, encode(self._pins.unpin(message)))
+        elif isinstance(message, messages.Shutdown):
+            _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
+            self._outbox.send(session, encode(messages.Stopping(message.request)))
+            self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
-    def _bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all cells; looked for once per catalogue, there may be a million of them."""
-        catalogue = self._cache.catalogue
-        if self._bounds_of is not catalogue:
-            self._bounds_of, self._known_bounds = catalogue, None
-            if len(catalogue):
-                low = catalogue.boxes[:, :2].min(axis=0).tolist()
-                high = catalogue.boxes[:, 2:].max(axis=0).tolist()
-                self._known_bounds = (low[0], low[1], high[0], high[1])
-        return self._known_bounds
+    def left(self, session: Session) -> None:
+        """A session ended: if it is the one that the daemon stops for, it has read its answer."""
+        if session is self._asked_to_stop:
+            self.stop_by_s = -math.inf
 
-    def answer(self, message: messages.Request, now_s: float) -> messages.Reply:
-        """Answer one request."""
-        if isinstance(message, messages.Metadata):
-            return self._metadata(message)
-        if isinstance(message, Recent):
-            return self._event_log.page(message)
-        if isinstance(message, messages.Show):
-            return self._show(message)
-        if isinstance(message, messages.Evict):
-            return self._evict(message, now_s)
-        if isinstance(message, messages.Pin):
-            return self.pins.pin(message, now_s)
-        if isinstance(message, messages.Unpin):
-            return self.pins.unpin(message)
-        raise BadRequest(f"a {type(message).__name__} cannot be answered here")
+    def _reload(self, session: Session, message: messages.Reload) -> None:
+        before = self._cache.catalogue
 
-    def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
-        cache, catalogue = self._cache, self._cache.catalogue
-        indices: Sequence[int]
-        indices = (
-            range(len(catalogue))
-            if message.area is None
-            else catalogue.query(messages.area_from_message(message.area)).tolist()
-        )
-        removed: tuple[str, ...] = ()
-        known = True
-        if message.since is not None:
-            change = self._changes_since(message.since)
-            known = change is not None
-            if change is not None:
-                touched = {i for cell in change[0] if (i := cache.index_of(cell)) is not None}
-                indices = [i for i in indices if i in touched] if message.area else sorted(touched)
-                removed = tuple(cache.wire_id(cell) for cell in change[1]) if message.start == 0 else ()
-        start = max(0, message.start)
-        end = start + max(1, min(message.limit, PAGE_ROWS))
-        return messages.MetadataPage(
-            request=message.request,
-            epoch=self._epoch,
-            map_version=catalogue.map_version,
-            rows=tuple(self._row(index) for index in indices[start:end]),
-            next=end if end < len(indices) else None,
-            since_known=known,
-            removed=removed,
-        )
-
-    def _row(self, index: int) -> messages.MetadataRow:
-        catalogue = self._cache.catalogue
-        heights = self._cache.heights.get(index, (None, None))
-        return messages.MetadataRow(
-            self._cache.wire_id(catalogue.id(index)),
-            catalogue.version(index),
-            *catalogue.box(index),
-            catalogue.stamp(index).size,
-            *heights,
-        )
-
-    def _changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
-        """Ids that changed or appeared, and that vanished, since a map version; None: not known."""
-        if map_version == self._cache.catalogue.map_version:
-            return set(), []
-        history = list(self._cache.history)
-        starts = [number for number, entry in enumerate(history) if entry[0] == map_version]
-        if not starts:
-            return None
-        changed: set[str] = set()
-        removed: dict[str, None] = {}
-        for _version, touched, vanished in history[starts[-1] :]:
-            changed |= touched
-            changed -= set(vanished)
-            removed.update(dict.fromkeys(vanished))
-            for cell in touched:
-                removed.pop(cell, None)
-        return changed, list(removed)
-
-    def stats(self, message: messages.Stats, usage: Usage, now_s: float) -> messages.StatsReply:
-        """Answer a request for statistics with what a survey found."""
-        return messages.StatsReply(
-            request=message.request,
-            epoch=self._epoch,
-            map_version=self._cache.catalogue.map_version,
-            counters=dict(self._statistics.values),
-            sessions=tuple(
-                self._session_row(session, usage.shares.get(session.slot, Share()), now_s)
-                for session in self._sessions
-            ),
-            unknown_holders=usage.unknown,
-            unknown_bytes=usage.unknown_bytes,
-        )
-
-    def _session_row(self, session: Session, share: Share, now_s: float) -> messages.SessionRow:
-        intent = session.intent
-        return messages.SessionRow(
-            session.slot,
-            session.peer.pid,
-            session.peer.uid,
-            session.peer.gid,
-            session.client,
-            session.command,
-            len(session.held),
-            session.held_bytes,
-            session.requests,
-            now_s - session.last_request_s,
-            (intent.x, intent.y) if intent is not None else None,
-            share.mapped_bytes,
-            share.superseded,
-            share.superseded_bytes,
-        )
-
-    def _show(self, message: messages.Show) -> messages.ShownCell:
-        cache = self._cache
-        index = cache.index_of(message.id)
-        if index is None:
-            return self._show_gone(message)
-        cell_id = cache.catalogue.id(index)
-        version = cache.catalogue.version(index)
-        slots = {key: slot for key, slot in cache.ledger.slots.items() if key.cell_id == cell_id}
-        zombies = cache.ledger.zombies
-        shown = []
-        for resident in cache.ledger.everything():
-            if resident.key.cell_id == cell_id:
-                state = (
-                    "zombie"
-                    if resident.name in zombies
-                    else "resident" if cache.is_current(resident) else "stale"
-                )  # fmt: skip
-                shown.append(self._segment(resident, state))
-        z_min, z_max = cache.heights.get(index, (None, None))
-        return messages.ShownCell(
-            message.request,
-            cell_id,
-            version,
-            *cache.catalogue.box(index),
-            cache.catalogue.stamp(index).size,
-            tuple(shown),
-            tuple(key.layer for key, slot in slots.items() if slot.load is not None),
-            "; ".join(
-                f"{s.failure.code}: {s.failure.message}" for s in slots.values() if s.failure is not None
-            ),
-            z_min=z_min,
-            z_max=z_max,
-            pinned=self.pins.layers_of(cell_id),
-        )
-
-    def _show_gone(self, message: messages.Show) -> messages.ShownCell:
-        """A cell that left the map while somebody maps it: version 0."""
-        everything = self._cache.ledger.everything()
-        names = (message.id, self._cache.id_prefix + message.id)
-        left = [resident for resident in everything if resident.key.cell_id in names and message.id]
-        if not left:
-            raise UnknownCell(
-                f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is resident"
+        def answer(result: Catalogue | ShmmapError) -> None:
+            if isinstance(result, ShmmapError):
+                self._outbox.refuse(session.identity, message.request, result)
+                return
+            change = compare(before, result)
+            reloaded = messages.Reloaded(
+                message.request,
+                result.map_version,
+                len(change.changed),
+                len(change.added),
+                len(change.removed),
+                result.problems,
             )
-        shown = tuple(self._segment(resident, "zombie") for resident in left)
-        return messages.ShownCell(message.request, left[0].key.cell_id, 0, *left[0].box, 0, shown)
+            self._outbox.send(session, encode(reloaded))
 
-    def _segment(self, resident: Resident, state: str) -> messages.ShownSegment:
-        return messages.ShownSegment(
-            resident.key.layer,
-            resident.version,
-            resident.name,
-            state,
-            resident.nbytes,
-            resident.points,
-            self._cache.reclaimer.holders_of([resident]),
-        )
+        self._reloader.ask(answer)
 
     def _evict(self, message: messages.Evict, now_s: float) -> messages.Evicted:
         cache = self._cache
@@ -271,7 +114,7 @@ class Admin:
                 else:
                     asked.add(cache.catalogue.id(index))
             chosen = [r for r in cache.ledger.residents() if r.key.cell_id in asked]
-        loose = [resident for resident in chosen if resident.key not in self.pins]
+        loose = [resident for resident in chosen if resident.key not in self._pins]
         freed = sum(cache.evict(resident, now_s) for resident in loose)
         kept = len(chosen) - len(loose)
         return messages.Evicted(message.request, freed, len(loose) - freed, tuple(unknown), kept)

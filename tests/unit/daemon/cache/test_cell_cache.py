@@ -12,13 +12,15 @@ import sys
 
 import pytest
 
-from shmmap.daemon.cache import ledger
-from shmmap.daemon.records import Key
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.worker_pool import Worker
+from shmmap.daemon.records import Failure, Key
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.processes.start_child import MAX_PACKET_BYTES, channel
 from shmmap.protocol.messages import Area, CircleMessage, Selected
+from shmmap.segment.layout import SourceStamp
 from tests.support.daemon_process import wait_readable
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon
@@ -75,21 +77,22 @@ def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
 
 def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last ones of each kind; of those forgotten nothing stays."""
-    monkeypatch.setattr(ledger, "MOST_FAILURES", 3)
-    ledger = ledger.Ledger(1 << 20)
+    monkeypatch.setattr("shmmap.daemon.loading.loads.MOST_FAILURES", 3)
+    loads = Loads(Ledger(1 << 20))
 
     def fail(number: int, code: str) -> Key:
         key = Key(f"/{number}.pcd", "points")
-        load = ledger.want(key, 0, 1.0)
-        ledger.start(load, 0.0)
-        ledger.failed(load, ledger.Failure(code, "", None, 0.0, 0.0))
+        load = loads.want(key, 0, 1.0)
+        assert loads.start(load, 0.0)
+        loads.finish(load, Failure(code, "", None, 0.0, 0.0))
         return key
 
     broken = [fail(number, "load_failed") for number in (0, 1, 2, 0, 3, 4)]
     full = [fail(number, "no_space") for number in (5, 6)]
-    assert set(ledger.slots) == {broken[0], broken[4], broken[5], *full}
-    ledger.clear_failures(frozenset({"no_space"}))
-    assert set(ledger.slots) == {broken[0], broken[4], broken[5]}
+    assert set(loads.failures) == {broken[0], broken[4], broken[5], *full}
+    loads.clear_failures(frozenset({"no_space"}))
+    assert set(loads.failures) == {broken[0], broken[4], broken[5]}
+    assert not loads.by_key
 
 
 class Puppet:
@@ -102,7 +105,7 @@ class Puppet:
         process = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
         self.worker = Worker(process, ours, ready=True)
         one.pool._workers[self.worker.fd] = self.worker
-        one.pool._watch(self.worker.fd)
+        one.pool._watched.watch(self.worker.fd, lambda: one.pool.on_message(self.worker))
 
     def queue(self, count: int) -> list[worker_messages.Job]:
         """Run the daemon until it has handed out this many jobs."""
@@ -114,7 +117,7 @@ class Puppet:
 
     def done(self, job: worker_messages.Job) -> worker_messages.Done:
         status = os.stat(job.path)
-        stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+        stamp = SourceStamp.of(status)
         return worker_messages.Done(job.number, 4096, 1, 0, 0.0, 1.0, stamp, 1)
 
     def segment(self) -> int:
@@ -168,22 +171,18 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     assert len(reply.cells) == 3
 
 
-def test_a_load_that_took_too_long_is_not_tried_again_at_once(
-    puppet: Puppet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nor is its file looked at: the file system may be what hangs, and would take the loop with it."""
+def test_a_load_that_took_too_long_is_not_tried_again_at_once(puppet: Puppet) -> None:
+    """Nor does a loader look at its file: the file system may be what hangs."""
     one = puppet.one
     one.stop_clock()
     session = one.session()
     one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
     puppet.queue(1)
-    monkeypatch.setattr(
-        "shmmap.daemon.loading.scheduler._stamp_of", lambda path: pytest.fail(f"looks at {path}")
-    )
     one.offset_s += 31.0
     for request in (1, 2):
         one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=300.0), one.now_s())
         assert [failure.code for failure in one.cells_of(request).failed] == ["load_timeout"]
+        assert not one.loads.by_key
     one.offset_s += 1.01
     one.cells.selected(session, Selected(3, ("0_0.pcd",), wait=300.0), one.now_s())
     assert len(one.cells_of(3).cells) == 1
@@ -257,7 +256,7 @@ def test_done_without_a_segment(puppet: Puppet) -> None:
     puppet.say(puppet.done(job))
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_failed"]
     assert one.ledger.reserved_bytes == 0
-    assert one.ledger.slots[Key(job.cell_id, "points")].load is None
+    assert Key(job.cell_id, "points") not in one.loads.by_key
     puppet.channel.close()
 
 
@@ -279,7 +278,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
         next(d for d in iter(lambda: puppet.channel.recv(65536), b"") if b"grant" in d)
     )
     assert granted == worker_messages.Grant(queue[0].number)
-    assert (one.ledger.reserved_bytes, one.cache.loads.hungry) == (0, {})
+    assert (one.ledger.reserved_bytes, one.scheduler.room.hungry) == (0, {})
     puppet.channel.close()
 
 
@@ -310,8 +309,8 @@ def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     try:
         one.offset_s += 5.0
         one.turn()
-        assert len(one.ledger.zombies) == 16, "freed without a look"
+        assert len(one.ledger.retired) == 16, "freed without a look"
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     one.offset_s += 5.0
-    one.run_until(lambda: not one.ledger.zombies)
+    one.run_until(lambda: not one.ledger.retired)

@@ -28,7 +28,7 @@ def test_ndt_is_served_where_its_points_would_never_fit(tmp_path: Path, inner: I
     reply = ask(one, session, 1, NDT)
     assert (len(reply.cells), reply.failed) == (4, ())
     assert one.ledger.used_bytes <= one.ledger.budget_bytes
-    assert {key.layer for key in one.ledger.slots} == {NDT}
+    assert {key.layer for key in {*one.ledger.by_key, *one.loads.by_key, *one.loads.failures}} == {NDT}
 
 
 def test_forgotten_layers_leave_no_tables(tmp_path: Path, inner: Inner) -> None:

@@ -7,9 +7,9 @@ from typing import Any, cast
 
 import pytest
 
-from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.cache.reclaimer import UNKNOWN_SLOT, Reclaimer
 from shmmap.daemon.cache.survey import LOOKS_AT_ONCE, MOST_ASKED, Survey, Usage
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions
 from shmmap.errors import Busy
 
@@ -23,12 +23,13 @@ def resident(number: int) -> Resident:
 
 
 class Memory:
-    """Segments and who maps them; stands for the reclaimer."""
+    """Segments and who maps them; stands for the reclaimer and its ledger."""
 
     def __init__(self, count: int = SEGMENTS) -> None:
         self.segments = [resident(number) for number in range(count)]
         self.users: dict[str, list[int]] = {}
         self.looked = 0
+        self.ledger = self
 
     def everything(self) -> list[Resident]:
         return sorted(self.segments, key=lambda one: -one.nbytes)

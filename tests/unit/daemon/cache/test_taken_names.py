@@ -54,8 +54,8 @@ def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> N
         assert shown(one) == {first.name.rpartition(".")[2]: "resident"}
         assert Path(f"{one.shm_dir}{first.name}").exists()
     one.cache.evict(first, one.now_s())
-    one.run_until(lambda: not one.ledger.zombies)
-    assert (one.ledger.zombie_bytes, one.ledger.resident_bytes, shown(one)) == (0, 0, {})
+    one.run_until(lambda: not one.ledger.retired)
+    assert (one.ledger.retired_bytes, one.ledger.resident_bytes, shown(one)) == (0, 0, {})
     assert [name for name in os.listdir(one.shm_dir) if not name.endswith("statistics")] == []
 
 
@@ -67,5 +67,5 @@ def test_the_name_it_had_before(inner: Inner, small_map: DividedMap) -> None:
         one.cache.evict(first, one.now_s())
         with taken(one, first.name):
             assert load(one, 2) is not first
-        assert one.ledger.zombies
-    one.run_until(lambda: not one.ledger.zombies)
+        assert one.ledger.retired
+    one.run_until(lambda: not one.ledger.retired)

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from shmmap.daemon.records import Key
 from shmmap.daemon.events.eviction_history import EvictionHistory
+from shmmap.daemon.records import Key
 
 
 def test_what_was_evicted_is_known_once() -> None:

@@ -37,7 +37,7 @@ def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, wait: float
     with pytest.raises(BadRequest, match="wait"):
         one.cells.selected(session, Selected(2, (), wait=wait), one.now_s())
     assert not len(one.cells)
-    assert not one.ledger.queued
+    assert not len(one.loads)
 
 
 def test_waits_that_are_answered_at_once(inner: Inner, small_map: DividedMap) -> None:
@@ -83,19 +83,19 @@ def test_nearest_cells_first(inner: Inner, small_map: DividedMap) -> None:
     session = one.session()
     with one.loaders_standing_still():
         one.cells.area(session, Area(1, EVERYWHERE), one.now_s())
-        nearest = one.ledger.next_queued()
+        nearest = one.loads.next_queued()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-20_-20.pcd"  # of the four that touch the middle
     two = inner(small_map.root)
     two.cells.area(two.session(), Area(1, CircleMessage(35, 35, 300)), two.now_s())
-    nearest = two.ledger.next_queued()
+    nearest = two.loads.next_queued()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "20_20.pcd"
     two = inner(small_map.root)
     session = two.session()
     session.intent, session.says_where = Intent(-35.0, 35.0), True
     two.cells.area(session, Area(1, CircleMessage(35, 35, 300)), two.now_s())
-    nearest = two.ledger.next_queued()
+    nearest = two.loads.next_queued()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-40_20.pcd"
 
@@ -111,7 +111,7 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
         one.cells.forget(session)
         assert len(one.cells) == 0
     one.run_until(lambda: one.ledger.resident_count == 16)
-    assert all(slot.waiting == 0 for slot in one.ledger.slots.values())
+    assert not one.ledger._needed
     assert one.cells.next_deadline_s() == math.inf
     assert 9 not in [reply.request for _, reply in one.replies]
     assert all(isinstance(key, Key) for key in one.settled)

@@ -29,8 +29,8 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
         one.cache.evict(first, one.now_s() - 1.0)
         one.cache.evict(second, one.now_s() - 1.0)
-        one.run_until(lambda: first.name not in one.ledger.zombies)
-        assert second.name in one.ledger.zombies, "somebody has it open"
+        one.run_until(lambda: first.name not in one.ledger.retired)
+        assert second.name in one.ledger.retired, "somebody has it open"
         os.kill(next(iter(one.pool)).process.pid, signal.SIGCONT)
         reply = one.cells_of(2)
     assert names(reply) == list(wanted)
@@ -118,7 +118,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 4
     one.cells.selected(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0), one.now_s())
-    one.run_until(lambda: one.cache.loads.hungry)
+    one.run_until(lambda: one.scheduler.room.hungry)
     (worker,) = one.pool
     worker.process.kill()
     one.run_until(lambda: worker not in list(one.pool))
@@ -127,7 +127,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert "SIGKILL" in reply.failed[0].message
     one.run_until(lambda: not one.ledger.reserved_bytes)
-    assert one.cache.loads.hungry == {}
+    assert one.scheduler.room.hungry == {}
 
 
 def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
@@ -140,10 +140,10 @@ def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map:
     one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 4
     one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=30.0), one.now_s())
-    one.run_until(lambda: one.cache.loads.hungry)
+    one.run_until(lambda: one.scheduler.room.hungry)
     one.offset_s += 0.6
     assert [failure.code for failure in one.cells_of(2).failed] == ["load_timeout"]
-    assert (one.ledger.reserved_bytes, one.cache.loads.hungry, len(one.pool)) == (0, {}, 0)
+    assert (one.ledger.reserved_bytes, one.scheduler.room.hungry, len(one.pool)) == (0, {}, 0)
 
 
 def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:
@@ -172,7 +172,7 @@ def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
     with one.loaders_standing_still():
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
         one.cache.evict(first, one.now_s() - 1.0)
-        one.run_until(lambda: first.name not in one.ledger.zombies)
+        one.run_until(lambda: first.name not in one.ledger.retired)
     assert names(one.cells_of(2)) == list(wanted)
     assert sum(reply.request == 2 for _, reply in one.replies) == 1
     assert len(one.cells) == 0

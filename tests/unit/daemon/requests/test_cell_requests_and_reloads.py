@@ -50,7 +50,9 @@ def test_indices_change_while_requests_wait(inner: Inner, small_map: DividedMap)
     for cell in (*one.cells_of(1).cells, *reply.cells):
         assert (cell.min_x, cell.min_y) == small_map.corners[Path(cell.id).name]
     one.run_until(lambda: not one.ledger.reserved_bytes)
-    assert {Path(key.cell_id).name for key in one.ledger.slots} == set(names(one.cells_of(1))) | {"20_20.pcd"}
+    assert {
+        Path(key.cell_id).name for key in {*one.ledger.by_key, *one.loads.by_key, *one.loads.failures}
+    } == set(names(one.cells_of(1))) | {"20_20.pcd"}
 
 
 def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: DividedMap) -> None:
@@ -64,7 +66,7 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     reply = one.cells_of(1)
     assert [cell.points for cell in reply.cells] == [33]
     assert reply.map_version != before
-    page = one.admin.answer(Metadata(2, since=before), one.now_s())
+    page = one.queries.answer(Metadata(2, since=before))
     assert [Path(row.id).name for row in page.rows] == ["0_0.pcd"]  # type: ignore[union-attr]
     assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
     one.reload()
@@ -108,7 +110,7 @@ def test_a_map_that_comes_and_goes(inner: Inner, small_map: DividedMap, tmp_path
                 with open(one.path_of(cell.segment), "rb") as file:
                     mapped.append(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
         assert one.ledger.resident_count == 16
-        assert {slot.resident.name for slot in one.ledger.slots.values() if slot.resident} == {
+        assert {resident.name for resident in one.ledger.by_key.values()} == {
             resident.name for resident in one.ledger.residents()
         }
         (small_map.root / "link").symlink_to(other if turn % 2 == 0 else first)
@@ -169,12 +171,12 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     before = one.everything()
     empty = Catalogue.from_cells([])
     one.cells.renumber(nowhere, one.cache.catalogue.id)
-    one.cache.replace_catalogue(empty, one.now_s())
+    one.scheduler.drop(one.map_switch.switch(empty, one.now_s()).removed)
     assert one.everything(2) == Cells(2, 77, empty.map_version)
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.cells.differential(one.session(), Differential(3, EVERYWHERE, packed=packed), one.now_s())
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
-    welcome = one.admin.welcome(one.session(), Hello(4, 1, 0))
+    welcome = one.queries.welcome(one.session(), Hello(4, 1, 0))
     assert (welcome.cells, welcome.bounds) == (0, None)
     one.run_until(lambda: one.ledger.used_bytes == one.ledger.overhead_bytes)
     one.reload()

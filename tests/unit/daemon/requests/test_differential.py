@@ -64,7 +64,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     after = ask(inner, 2, EVERYWHERE)
     names = sorted(made.corners)
     inner.cache.evict(inner.cache.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
-    inner.run_until(lambda: not inner.ledger.zombies)
+    inner.run_until(lambda: not inner.ledger.retired)
     assert set(before) == set(names)
     assert set(after) == set(names) - {BROKEN}
     assert [name for name in names if after.get(name) != before[name]] == [CHANGED, BROKEN]

@@ -22,7 +22,8 @@ def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: 
         one.cells.area(one.session(), Area(1, EVERYWHERE), one.now_s())
     with pytest.raises(BadRequest, match="16 cells"):  # known or not
         one.cells.selected(one.session(), Selected(2, ("nowhere",) * 16), one.now_s())
-    assert one.ledger.slots == {}
+    assert not one.loads.by_key
+    assert not one.ledger.by_key
     assert one.replies == []
 
 
@@ -59,7 +60,7 @@ def test_loads_that_one_process_waits_for(
             one.cells.area(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
         one.cells.area(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
         assert len(one.cells_of(4).pending) == 16
-    one.run_until(lambda: not one.ledger.queued)
+    one.run_until(lambda: not len(one.loads))
     one.cells.area(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0), one.now_s())
     assert len(one.cells_of(5).cells) == 16
 

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.requests.cell_requests import note_area
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions, command_of, predicted_path
 from shmmap.errors import NoSession
 from shmmap.geometry import Circle
@@ -89,11 +90,11 @@ def test_a_watched_process() -> None:
     assert f"Pid:\t{os.getpid()}" in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
     assert session.client == "x" * 64
     assert session.command == command_of(os.getpid()) != ""
-    assert sessions.get(b"1") is sessions.by_slot(session.slot) is session
+    assert sessions.by_identity.get(b"1") is sessions.by_slot(session.slot) is session
     sessions.close(session)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(pidfd)
-    assert (sessions.get(b"1"), sessions.by_slot(session.slot)) == (None, None)
+    assert (sessions.by_identity.get(b"1"), sessions.by_slot(session.slot)) == (None, None)
     sessions.close(session)  # twice does no harm
 
 
@@ -138,10 +139,10 @@ def test_where_a_client_is() -> None:
     sessions.open(b"2", Peer(), "", 0.0)
     assert sessions.poses() == []
     for at in ((1.0, 2.0), (300.0, 4.0)):
-        session.asked_about(Circle(*at, 5.0))
+        note_area(session, Circle(*at, 5.0))
         assert sessions.poses() == [at]
     session.intent, session.says_where = Intent(7.0, 8.0), True
-    session.asked_about(Circle(1.0, 1.0, 5.0))
+    note_area(session, Circle(1.0, 1.0, 5.0))
     assert sessions.poses() == [(7.0, 8.0)]
 
 

@@ -8,7 +8,7 @@ import pwd
 
 import pytest
 
-from shmmap.daemon.requests.operators.authorization import Privileges
+from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.transport.sessions import Peer
 from shmmap.errors import ConfigError, NotPermitted
 
@@ -18,23 +18,23 @@ NO_ACCOUNT = 61999
 
 def test_root_and_the_daemons_own_user() -> None:
     for uid in (0, os.geteuid()):
-        assert Privileges().allow(Peer(uid, OTHERS, 1), 0.0)
+        assert Authorization().allow(Peer(uid, OTHERS, 1), 0.0)
 
 
 @pytest.mark.parametrize("peer", [Peer(NO_ACCOUNT, OTHERS, 1), Peer(), Peer(NO_ACCOUNT, -1, 0)])
 def test_nobody_else_without_a_group(peer: Peer) -> None:
     with pytest.raises(NotPermitted, match="only root"):
-        Privileges().require(peer, 0.0)
+        Authorization().require(peer, 0.0)
     with pytest.raises(NotPermitted, match=f"members of group {ADMINS}"):
-        Privileges(str(ADMINS)).require(peer, 0.0)
+        Authorization(str(ADMINS)).require(peer, 0.0)
 
 
 def test_the_group_of_the_process() -> None:
-    assert Privileges(str(ADMINS)).allow(Peer(NO_ACCOUNT, ADMINS, 1), 0.0)
+    assert Authorization(str(ADMINS)).allow(Peer(NO_ACCOUNT, ADMINS, 1), 0.0)
 
 
 def test_a_peer_whose_user_the_kernel_does_not_tell_is_no_member() -> None:
-    assert not Privileges(str(ADMINS)).allow(Peer(-1, ADMINS, 0), 0.0)
+    assert not Authorization(str(ADMINS)).allow(Peer(-1, ADMINS, 0), 0.0)
 
 
 def test_groups_of_an_account_are_asked_for_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,7 +50,7 @@ def test_groups_of_an_account_are_asked_for_now_and_then(monkeypatch: pytest.Mon
         return groups
 
     monkeypatch.setattr(os, "getgrouplist", lookup)
-    privileges = Privileges(str(ADMINS))
+    privileges = Authorization(str(ADMINS))
     peer = Peer(account.pw_uid, account.pw_gid, 1)
     assert privileges.allow(peer, 0.0)
     assert privileges.allow(peer, 5.0)
@@ -62,4 +62,4 @@ def test_groups_of_an_account_are_asked_for_now_and_then(monkeypatch: pytest.Mon
 
 def test_a_group_that_does_not_exist() -> None:
     with pytest.raises(ConfigError, match="no group 'nosuchgroup'"):
-        Privileges("nosuchgroup")
+        Authorization("nosuchgroup")

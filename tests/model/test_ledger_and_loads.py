@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The books and the reclaimer against a plain model, with real segments and real mappings.
+"""The ledger, the loads and the reclaimer against a plain model, with real segments and real mappings.
 
 The machine plays daemon, loaders and readers in any order: it wants, starts, grows, publishes, fails,
 takes back and cancels loads, hands segments out, maps and unmaps them, evicts, revives, changes
@@ -20,8 +20,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from shmmap.daemon.cache.eviction_policy import POLICIES
-from shmmap.daemon.cache.ledger import Failure, Key, Load, Residency, Resident
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Outcome, Reclaimer
+from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.records import Failure, Key, Load, Resident
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import lock_slot, prepare_process
@@ -63,22 +65,22 @@ class Wanted:
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 class Machine(RuleBasedStateMachine):
-    """One life of the books."""
+    """One life of ledger and loads; as the reclaimer's observer it hears what leaves and what is freed."""
 
     @initialize(policy=st.sampled_from(sorted(POLICIES)))
     def begin(self, policy: str) -> None:
         prepare_process()
         self.path = tempfile.mkdtemp(prefix="shmmap-model-", dir="/dev/shm")
         self.directory = ShmDirectory(self.path)
-        self.books = Residency(BUDGET_PAGES * PAGE)
-        self.books.overhead_bytes = OVERHEAD_PAGES * PAGE
+        self.ledger = Ledger(BUDGET_PAGES * PAGE)
+        self.queue = Loads(self.ledger)
+        self.ledger.overhead_bytes = OVERHEAD_PAGES * PAGE
         self.sessions = Sessions()
         self.clients = [self.sessions.open(bytes([n]), Peer(), f"client {n}", 0.0) for n in range(2)]
-        self.reclaimer = Reclaimer(self.books, self.directory, self.sessions, POLICIES[policy])
-        self.retired: list[str] = []
-        self.freed: list[str] = []
-        self.reclaimer.on_retired = lambda resident, _why: self.retired.append(resident.name)
-        self.reclaimer.on_freed = lambda resident: self.freed.append(resident.name)
+        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, POLICIES[policy])
+        self.names_retired: list[str] = []
+        self.names_freed: list[str] = []
+        self.reclaimer.observer = self
         self.now_s = 100.0
         self.versions = dict.fromkeys(KEYS, 1)
         self.segments: dict[str, Segment] = {}
@@ -99,17 +101,27 @@ class Machine(RuleBasedStateMachine):
         assert len(found) <= 1
         return found[0] if found else None
 
+    def retired(self, resident: Resident, why: str) -> None:
+        del why
+        self.names_retired.append(resident.name)
+
+    def freed(self, resident: Resident) -> None:
+        self.names_freed.append(resident.name)
+
+    def renamed(self, name: str) -> None:
+        raise AssertionError(f"nobody has taken {name}")
+
     def follow(self) -> None:
         """Take over what the reclaimer said it retired and freed; nothing mapped may be among the freed."""
-        for name in self.retired:
+        for name in self.names_retired:
             assert self.segments[name].state == "resident"
             self.segments[name].state = "zombie"
-        for name in self.freed:
+        for name in self.names_freed:
             assert self.segments[name].state == "zombie"
             assert not self.segments[name].maps, "a mapped segment was freed"
             del self.segments[name]
-        self.retired.clear()
-        self.freed.clear()
+        self.names_retired.clear()
+        self.names_freed.clear()
 
     # --- loads --------------------------------------------------------------------------------------
 
@@ -119,7 +131,7 @@ class Machine(RuleBasedStateMachine):
         priority=st.one_of(st.sampled_from([0.0, 5.0, float("inf")]), st.floats(0, 100)),
     )
     def want(self, key: Key, pages: int, priority: float) -> None:
-        load = self.books.want(key, pages * PAGE, priority)
+        load = self.queue.want(key, pages * PAGE, priority)
         known = self.loads.get(key)
         if known is None:
             self.orders += 1
@@ -132,7 +144,7 @@ class Machine(RuleBasedStateMachine):
     @rule()
     def start_next(self) -> None:
         queued = [w for w in self.loads.values() if not w.running]
-        load = self.books.next_queued()
+        load = self.queue.next_queued()
         if not queued:
             assert load is None
             return
@@ -141,14 +153,11 @@ class Machine(RuleBasedStateMachine):
         used = sum(s.pages for s in self.segments.values()) + OVERHEAD_PAGES
         used += sum(w.reserved for w in self.loads.values()) // PAGE
         shortage = used + load.estimate // PAGE - BUDGET_PAGES
-        assert self.books.shortage(load.estimate) == shortage * PAGE
+        assert self.ledger.shortage(load.estimate) == shortage * PAGE
         if shortage > 0:
-            try:
-                self.books.start(load, self.now_s)
-            except ValueError:
-                return
-            raise AssertionError("a load started that does not fit")
-        self.books.start(load, self.now_s)
+            assert not self.queue.start(load, self.now_s), "a load started that does not fit"
+            return
+        assert self.queue.start(load, self.now_s)
         nearest.running, nearest.reserved = True, load.estimate
 
     def running(self, draw: int) -> Wanted | None:
@@ -159,10 +168,10 @@ class Machine(RuleBasedStateMachine):
     def grow(self, draw: int, pages: int) -> None:
         wanted = self.running(draw)
         if wanted is not None:
-            used = self.books.used_bytes
+            used = self.ledger.used_bytes
             extra = pages * PAGE - wanted.reserved
             fits = extra <= 0 or used + extra <= BUDGET_PAGES * PAGE
-            assert self.books.grow(wanted.load, pages * PAGE) is fits
+            assert self.queue.grow(wanted.load, pages * PAGE) is fits
             if fits:
                 wanted.reserved = max(wanted.reserved, pages * PAGE)
 
@@ -186,7 +195,8 @@ class Machine(RuleBasedStateMachine):
             name, key, self.versions[key], pages * PAGE, 0, (float(self.names), 0, 1, 1), 0, 0
         )
         resident.last_use_s = self.now_s
-        superseded = self.books.loaded(wanted.load, resident)
+        superseded = self.ledger.enter(resident)
+        self.queue.finish(wanted.load)
         assert (superseded.name if superseded else None) == (old.name if old else None)
         self.segments[name] = Segment(name, key, self.versions[key], pages, last_use_s=self.now_s)
         self.objects[name] = resident
@@ -201,7 +211,7 @@ class Machine(RuleBasedStateMachine):
     @rule(key=st.sampled_from(KEYS), pages=st.integers(1, 5), maps=st.integers(0, 2))
     def load_at_once(self, key: Key, pages: int, maps: int) -> None:
         """All of it in one step, where it fits, up to readers that map it."""
-        if key not in self.loads and self.books.shortage(pages * PAGE) <= 0:
+        if key not in self.loads and self.ledger.shortage(pages * PAGE) <= 0:
             self.want(key, pages, -1.0)
             self.start_next()
             segment = self.published(self.loads[key], pages)
@@ -212,7 +222,7 @@ class Machine(RuleBasedStateMachine):
     def fail(self, draw: int, code: str) -> None:
         wanted = self.running(draw)
         if wanted is not None:
-            self.books.failed(wanted.load, Failure(code, "", None, self.now_s + 1, 1))
+            self.queue.finish(wanted.load, Failure(code, "", None, self.now_s + 1, 1))
             del self.loads[wanted.load.key]
             self.failures[wanted.load.key] = code
 
@@ -221,28 +231,28 @@ class Machine(RuleBasedStateMachine):
         """Its loader died before its turn."""
         wanted = self.running(draw)
         if wanted is not None:
-            self.books.requeue(wanted.load)
+            self.queue.requeue(wanted.load)
             wanted.running, wanted.reserved = False, 0
 
     @rule(key=st.sampled_from(KEYS))
     def cancel(self, key: Key) -> None:
-        self.books.cancel(key)
+        self.queue.cancel(key)
         self.failures.pop(key, None)
         if key in self.loads and not self.loads[key].running:
             del self.loads[key]
 
     @rule()
     def memory_came_back(self) -> None:
-        self.books.clear_failures(frozenset({"over_budget"}))
+        self.queue.clear_failures(frozenset({"over_budget"}))
         self.failures = {key: code for key, code in self.failures.items() if code != "over_budget"}
 
     @rule(key=st.sampled_from(KEYS), more=st.booleans())
     def wait(self, key: Key, more: bool) -> None:
         if more:
-            self.books.slot(key).waiting += 1
+            self.ledger.need(key)
             self.waiting[key] += 1
         elif self.waiting[key]:
-            self.books.unwait(key)
+            self.ledger.need_no_more(key)
             self.waiting[key] -= 1
 
     # --- readers ------------------------------------------------------------------------------------
@@ -323,31 +333,30 @@ class Machine(RuleBasedStateMachine):
             segment = self.segments[found.name]
             assert (segment.state, segment.key, segment.version) == ("zombie", key, self.versions[key])
             segment.state = "resident"
-            self.failures.pop(key, None)
             if before is not None:
-                assert before.name in self.retired
+                assert before.name in self.names_retired
         self.follow()
 
     @rule(seconds=st.sampled_from([0.0, 0.001, 0.01, 0.3, 2.0]))
     def tick(self, seconds: float) -> None:
         self.now_s += seconds
-        zombies = self.books.zombie_bytes
+        before = self.ledger.retired_bytes
         freed = self.reclaimer.sweep(self.now_s)
-        assert freed == zombies - self.books.zombie_bytes
+        assert freed == before - self.ledger.retired_bytes
         self.follow()
 
     @rule(pages=st.integers(1, BUDGET_PAGES))
     def make_room(self, pages: int) -> None:
         """Asked often enough it comes to an end, and to the right one."""
         self.now_s += 0.25  # nobody remembers older looks at pins
-        self.reclaimer.sweep(self.now_s)  # as the store does before
+        self.reclaimer.sweep(self.now_s)  # as the scheduler does before
         self.follow()
         mapped = sum(s.pages for s in self.segments.values() if s.maps)
         needed = sum(s.pages for s in self.of_state("resident") if not s.maps and self.waiting[s.key])
         reserved = sum(w.reserved for w in self.loads.values()) // PAGE
         room = BUDGET_PAGES - OVERHEAD_PAGES - reserved - mapped - needed
         for _ in range(64):
-            shortage = self.books.shortage(pages * PAGE)
+            shortage = self.ledger.shortage(pages * PAGE)
             if shortage <= 0:
                 assert pages <= room
                 return
@@ -375,40 +384,31 @@ class Machine(RuleBasedStateMachine):
 
     @invariant()
     def bytes_are_in_one_place(self) -> None:
-        books = self.books
-        assert books.resident_bytes == sum(s.pages for s in self.of_state("resident")) * PAGE
-        assert books.zombie_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
-        assert books.reserved_bytes == sum(w.reserved for w in self.loads.values())
-        parts = books.resident_bytes + books.zombie_bytes + books.reserved_bytes + books.overhead_bytes
-        assert books.used_bytes == parts <= books.budget_bytes
-        assert books.resident_count == len(self.of_state("resident"))
-        assert {r.name for r in books.residents()} == {s.name for s in self.of_state("resident")}
-        assert set(books.zombies) == {s.name for s in self.of_state("zombie")}
+        ledger = self.ledger
+        assert ledger.resident_bytes == sum(s.pages for s in self.of_state("resident")) * PAGE
+        assert ledger.retired_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
+        assert ledger.reserved_bytes == sum(w.reserved for w in self.loads.values())
+        parts = ledger.resident_bytes + ledger.retired_bytes + ledger.reserved_bytes + ledger.overhead_bytes
+        assert ledger.used_bytes == parts <= ledger.budget_bytes
+        assert ledger.resident_count == len(self.of_state("resident"))
+        assert {r.name for r in ledger.residents()} == {s.name for s in self.of_state("resident")}
+        assert set(ledger.retired) == {s.name for s in self.of_state("zombie")}
 
     @invariant()
     def the_disk_agrees(self) -> None:
         expected = {s.name + (".zombie" if s.state == "zombie" else "") for s in self.segments.values()}
         found = {"/" + entry.name: entry.stat().st_blocks * 512 for entry in os.scandir(self.path)}
         assert set(found) == expected
-        assert sum(found.values()) == self.books.resident_bytes + self.books.zombie_bytes
+        assert sum(found.values()) == self.ledger.resident_bytes + self.ledger.retired_bytes
 
     @invariant()
-    def slots_say_what_the_model_says(self) -> None:
-        assert self.books.queued == sum(not w.running for w in self.loads.values())
-        for key in KEYS:
-            slot = self.books.slots.get(key)
-            resident, load = self.resident_of(key), self.loads.get(key)
-            failure = self.failures.get(key)
-            if slot is None:
-                assert (resident, load, failure, self.waiting[key]) == (None, None, None, 0)
-            else:
-                assert (slot.resident.name if slot.resident else None) == (
-                    resident.name if resident else None
-                )
-                assert slot.load is (load.load if load else None)
-                assert (slot.failure.code if slot.failure else None) == failure
-                assert slot.waiting == self.waiting[key]
-                assert slot.resident or slot.load or slot.failure or slot.waiting, "a slot that says nothing"
+    def they_say_what_the_model_says(self) -> None:
+        assert len(self.queue) == sum(not w.running for w in self.loads.values())
+        assert self.queue.by_key == {key: wanted.load for key, wanted in self.loads.items()}
+        assert {key: failure.code for key, failure in self.queue.failures.items()} == self.failures
+        named = {key: resident.name for key, resident in self.ledger.by_key.items()}
+        assert named == {s.key: s.name for s in self.of_state("resident")}
+        assert self.ledger._needed == {key: count for key, count in self.waiting.items() if count}
 
     @invariant()
     def sessions_hold_what_exists(self) -> None:
@@ -433,15 +433,15 @@ class Machine(RuleBasedStateMachine):
                 segment.maps.pop().close()
         for key, count in self.waiting.items():
             for _ in range(count):
-                self.books.unwait(key)
+                self.ledger.need_no_more(key)
         for wanted in self.loads.values():
-            self.books.failed(wanted.load, None)
+            self.queue.finish(wanted.load)
         for _ in range(8):
             self.now_s += 2.0
             self.reclaimer.free(BUDGET_PAGES * PAGE, self.now_s)
             self.reclaimer.sweep(self.now_s)
         self.follow()
-        left, used = os.listdir(self.path), self.books.used_bytes
+        left, used = os.listdir(self.path), self.ledger.used_bytes
         for session in self.clients:
             self.sessions.close(session)
         self.directory.close()
@@ -451,4 +451,4 @@ class Machine(RuleBasedStateMachine):
         assert not self.segments
 
 
-TestResidency = Machine.TestCase
+TestLedgerAndLoads = Machine.TestCase

@@ -3,19 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.requests.waiting_list import MOST_OF_A_SESSION, WaitingList
+from shmmap.daemon.requests.pending_request import MOST_OF_A_SESSION, PendingRequest, WaitingList
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions
 
 
-@dataclass(eq=False)
-class Request:
-    session: Session
-    deadline_s: float
+def waiting_request(session: Session, deadline_s: float) -> PendingRequest:
+    return PendingRequest(session, 0, [], deadline_s=deadline_s)
 
 
 def sessions(count: int) -> list[Session]:
@@ -25,8 +21,8 @@ def sessions(count: int) -> list[Session]:
 
 def test_one_session_has_its_share() -> None:
     mine, other = sessions(2)
-    waiting: WaitingList[Request] = WaitingList()
-    requests = [Request(mine, float(n)) for n in range(MOST_OF_A_SESSION)]
+    waiting: WaitingList = WaitingList()
+    requests = [waiting_request(mine, float(n)) for n in range(MOST_OF_A_SESSION)]
     for request in requests:
         assert waiting.has_room(mine)
         waiting.add(request)
@@ -39,10 +35,10 @@ def test_one_session_has_its_share() -> None:
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 50), st.booleans())))
 def test_against_a_plain_list(steps: list[tuple[int, int, bool]]) -> None:
     owners = sessions(3)
-    waiting: WaitingList[Request] = WaitingList()
-    model: list[Request] = []
+    waiting: WaitingList = WaitingList()
+    model: list[PendingRequest] = []
     for owner, deadline, leave in steps:
-        request = Request(owners[owner], float(deadline))
+        request = waiting_request(owners[owner], float(deadline))
         waiting.add(request)
         model.append(request)
         if leave:

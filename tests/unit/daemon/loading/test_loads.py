@@ -9,7 +9,7 @@ from itertools import count
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.loading.load_queue import BACKGROUND, LoadQueue
+from shmmap.daemon.loading.loads import BACKGROUND, LoadQueue
 
 _numbers = count()
 

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Workers that died, could not start or took too long: only the cell they worked on fails."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Final
+
+from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.room import Room
+from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.records import Load
+from shmmap.segment.layout import SourceStamp
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["LostWorkers"]
+
+_log = logging.getLogger(__name__)
+
+START_ATTEMPTS: Final = 3
+"""After this many loaders in a row that could not start, loads fail instead of waiting."""
+
+
+class LostWorkers:
+    """Replaces workers, and queues again what they had not begun.
+
+    Parameters
+    ----------
+    jobs
+        Loads that workers have, by job number.
+    fail
+        Called with a load, a code, a message, the state of the file it failed for, and the time.
+    """
+
+    def __init__(
+        self,
+        pool: WorkerPool,
+        jobs: dict[int, Load],
+        loads: Loads,
+        room: Room,
+        statistics: StatisticsWriter,
+        fail: Callable[[Load, str, str, SourceStamp | None, float], None],
+    ) -> None:
+        self._pool = pool
+        self._jobs = jobs
+        self._loads = loads
+        self._room = room
+        self._statistics = statistics
+        self._fail = fail
+
+    def ended(self, worker: Worker, now_s: float) -> None:
+        """A worker's process ended."""
+        self._statistics.add("worker_crashes")
+        if not worker.ready:
+            self._pool.failed_starts += 1
+        at_fault = worker.ready or self._pool.failed_starts >= START_ATTEMPTS
+        how = self._replace(worker, "load_failed" if at_fault else "", now_s)
+        if not worker.ready:
+            _log.error("a loader could not start: %s", how)
+
+    def end_overdue(self, now_s: float) -> None:
+        """Kill workers whose load, or whose start, took too long."""
+        for worker in self._pool.overdue(now_s):
+            if worker.ready:
+                self._statistics.add("loads_timed_out")
+                self._replace(worker, "load_timeout", now_s)
+            else:
+                self.ended(worker, now_s)
+
+    def _replace(self, worker: Worker, code: str, now_s: float) -> str:
+        """Forget a worker; with a code the job it worked on fails.  Returns how it ended, for people."""
+        unfinished, how = self._pool.remove(worker)
+        died = code == "load_failed"
+        why = f"the loader died of it ({how})" if died else "loading took longer than allowed"
+        for position, job in enumerate(unfinished):
+            self._room.hungry.pop(job.number, None)
+            load = self._jobs.pop(job.number, None)
+            if position == 0 and code:
+                _log.error("a loader was replaced: %s: %s", job.path, why)
+                if load is not None:
+                    # where it took too long nobody looks again: the file system may be what hangs
+                    known = load.sources[0] if died and load.sources else None
+                    self._fail(load, code, f"{job.path}: {why}", known, now_s)
+            elif load is not None:
+                self._loads.requeue(load)
+        return how

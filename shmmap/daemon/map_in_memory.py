@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of one run that have names in shared memory, put together: cache, loaders, statistics."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import time
+
+from shmmap import __version__
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.eviction_policy import POLICIES
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.map_switch import MapSwitch
+from shmmap.daemon.cache.reclaimer import Reclaimer
+from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.host.budget import choose_budget
+from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
+from shmmap.daemon.loading.adoption import Adoption
+from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.loading.worker_pool import WorkerPool
+from shmmap.daemon.pins.probe import Rung
+from shmmap.daemon.pins.watch import PinWatch
+from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.errors import ConfigError
+from shmmap.origin.catalogue import Catalogue
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.names import segment_prefix
+from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["MapInMemory"]
+
+
+class MapInMemory:
+    """What has names in shared memory: the cache with its loaders, and the statistics.
+
+    Leftovers of an earlier life are taken over.  `close` takes the names away again.
+
+    Raises
+    ------
+    ConfigError
+        The budget cannot work on this machine, or nothing can be written to the directory.
+    """
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        catalogue: Catalogue,
+        directory: ShmDirectory,
+        pins: PinWatch,
+        socket_path: str,
+        mode: int,
+        gid: int,
+    ) -> None:
+        self.epoch = secrets.randbits(63) | 1
+        self.identity = DaemonIdentity(
+            pid=os.getpid(),
+            start_time_ticks=start_time_ticks(os.getpid()),
+            pid_namespace=pid_namespace(),
+            epoch=self.epoch,
+            instance=config.instance,
+            endpoint=socket_path,
+            map_path=config.map_path,
+            map_version=catalogue.map_version,
+            shm_dir=directory.path,
+            id_prefix=catalogue.id_prefix,
+            library_version=__version__,
+            started_unix_ns=time.time_ns(),
+            frame_id=catalogue.frame_id,
+        )
+        budget = choose_budget(  # may refuse: before anything has a name
+            config.budget_bytes,
+            directory,
+            ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
+            limit_bytes=memory_limit_bytes(),
+        )
+        try:
+            self.statistics = StatisticsWriter(directory, config.instance, self.identity, mode=mode, gid=gid)
+        except OSError as error:
+            raise ConfigError(
+                f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}",
+                key="shm_dir",
+                hint="make room, and lift limits on the size of files (ulimit -f, LimitFSIZE=)",
+            ) from error
+        self.statistics.set("pin_source", list(Rung).index(pins.rung))
+        self.statistics.set("last_reload_unix_ns", time.time_ns())
+        ledger = Ledger(budget)
+        ledger.overhead_bytes = self.statistics.size_bytes
+        self.statistics.reserve = ledger.add_overhead
+        self.event_log = EventLog(self.epoch)
+        self.sessions = Sessions()
+        reclaimer = Reclaimer(ledger, directory, self.sessions, POLICIES[config.eviction], pins)
+        self.cache = CellCache(
+            catalogue, ledger, reclaimer, directory, self.statistics,
+            instance=config.instance, epoch=self.epoch, mode=mode, gid=gid, event_log=self.event_log,
+        )  # fmt: skip
+        self.watched = WatchedDescriptors()
+        pool = WorkerPool(
+            config.loaders(), directory.path, config.load_timeout_s, self.watched,
+            cache_dir=config.cache_dir, cache_bytes=config.cache_bytes,
+        )  # fmt: skip
+        loads = Loads(ledger)
+        self.map_switch = MapSwitch(self.cache)
+        self.scheduler = Scheduler(
+            self.cache, loads, self.map_switch, pool, self.statistics, clock=time.monotonic
+        )
+        adoption = Adoption(directory, config.instance, self.cache, loads, mode=mode, gid=gid)
+        adoption.take_over(time.monotonic())
+        for fd, hear in (
+            (pins.fd, self.scheduler.hear_of_closes),
+            (self.cache.names.fd, self.cache.hear_of_names),
+        ):
+            if fd >= 0:
+                self.watched.watch(fd, lambda hear=hear: hear(time.monotonic()))  # type: ignore[misc]
+
+    def close(self, *, keep: bool) -> None:
+        """End the loaders, and take every name away or leave those of the segments to the next life."""
+        self.scheduler.pool.close()
+        self.cache.close(keep=keep)
+        self.statistics.close()
+        self.watched.close()
