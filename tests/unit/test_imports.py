@@ -26,6 +26,7 @@ LAYERS = {
     "errors": set[str](),
     "columns": set[str](),
     "failpoints": set[str](),
+    "logfmt": set[str](),
     "processes": set[str](),
     "geometry": {"errors"},
     "formats": {"errors", "columns", "geometry"},
