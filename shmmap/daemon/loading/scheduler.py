@@ -18,7 +18,7 @@ from typing import Final, Protocol
 from shmmap.daemon.cache.ledger import Failure, Key, Load, Residency, Resident
 from shmmap.daemon.cache.reclaimer import Outcome, Reclaimer
 from shmmap.daemon.loading import worker_messages
-from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import RESTART, Worker, WorkerPool
 from shmmap.failpoints import step
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
@@ -244,13 +244,15 @@ class Loading:
         if not worker.ready:
             self.pool.failed_starts += 1
             _log.error("a loader could not start: %s", how)
-        at_fault = worker.ready or self.pool.failed_starts >= START_ATTEMPTS
+        at_fault = worker.ready or how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
         for position, job in enumerate(unfinished):
             self.hungry.pop(job.number, None)
             load = self._jobs.pop(job.number, None)
             if load is None:
                 continue
-            if position == 0 and at_fault:
+            if at_fault and not worker.ready:
+                self.fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
+            elif at_fault and position == 0:
                 _log.error("loader died while it read %s: %s", job.path, how)
                 message = f"{job.path}: the loader died of it ({how})"
                 self.fail(load, "load_failed", message, _stamp_of(job.path), now_s)
