@@ -29,6 +29,7 @@ from xxhash import xxh3_64_hexdigest
 
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.map_layout import absolute_path
@@ -141,7 +142,7 @@ class DividedCloud:
         return MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
 
     def _divide(self, out: str) -> None:
-        _log.info("dividing %s into %s", self.path, out)
+        _log.info(logfmt("dividing", cloud=self.path, into=out))
         command = [sys.executable, "-m", "shmmap.dividing.child_main", self.path, out, str(os.getpid())]
         failure: dict[str, Any] = {}
         with subprocess.Popen(
@@ -163,7 +164,7 @@ class DividedCloud:
                         continue
                     if told["stage"] != stage:
                         stage = told["stage"]
-                        _log.info("%s: %s", os.path.basename(self.path), stage)
+                        _log.info(logfmt("dividing", cloud=self.path, stage=stage))
                     part = f" {told['done'] / told['total']:.0%}" if told["total"] else ""
                     self._tell(f"STATUS={stage} {self.path}{part}", f"EXTEND_TIMEOUT_USEC={_MORE_TIME_USEC}")
                 code = process.wait()
@@ -221,7 +222,7 @@ class DividedCloud:
                 fd = os.open(os.path.join(path, _USE_LOCK), os.O_RDWR | os.O_CLOEXEC)
                 try:
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    _log.info("removing %s from the cache", path)
+                    _log.info(logfmt("divided cloud removed from the cache", path=path))
                     shutil.rmtree(path)
                 finally:
                     os.close(fd)

@@ -28,6 +28,7 @@ from shmmap.layers import (
     voxel,
 )  # fmt: skip
 from shmmap.layers.contract import LayerKind
+from shmmap.logfmt import logfmt
 
 __all__ = ["find_kind", "kinds", "register"]
 
@@ -65,10 +66,10 @@ def _offered() -> dict[str, LayerKind]:
         try:
             kind = entry.load()
         except Exception as error:  # noqa: BLE001  somebody else's module: anything may happen in it
-            _log.error("layer kind %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
+            _log.error(logfmt("layer kind not loaded", kind=entry.name, module=entry.value, error=error))
             continue
         if not isinstance(kind, LayerKind) or kind.name != entry.name or kind.name in _own:
-            _log.error("%s offers no layer kind called %s", entry.value, entry.name)
+            _log.error(logfmt("layer kind not offered by its module", kind=entry.name, module=entry.value))
             continue
         found[kind.name] = kind
     return found

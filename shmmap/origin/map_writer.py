@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest
 from shmmap.formats.durable_file import flush_directory
 from shmmap.formats.pcd_writer import write_pcd
+from shmmap.logfmt import logfmt
 from shmmap.origin.metadata_text import metadata_text
 
 __all__ = ["MapWriter", "WrittenMap"]
@@ -109,7 +110,9 @@ class MapWriter:
         self._out_dir = os.path.abspath(out_dir)
         self._refuse_existing()
         if not float(cell_size).is_integer():
-            _log.warning("cells of %r m have fractional corners, which Autoware's loader refuses", cell_size)
+            _log.warning(
+                logfmt("cell corners are not whole metres, refused by Autoware's loader", cell_size=cell_size)
+            )
         self._size = float(cell_size)
         self._prefix = prefix
         self._encoding = encoding

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from xxhash import xxh3_64, xxh3_64_hexdigest, xxh3_64_intdigest
 
 from shmmap.errors import MapDataError
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue
 
 __all__ = ["Source", "default_cache_directory", "load_sidecar", "save_sidecar", "sidecar_file"]
@@ -104,7 +105,7 @@ def load_sidecar(path: str, key: str) -> Catalogue | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, MapDataError, msgspec.MsgspecError) as error:
-        _log.warning("ignoring the damaged catalogue cache %s: %s", path, error)
+        _log.warning(logfmt("damaged catalogue cache ignored", path=path, error=error))
         return None
 
 
@@ -153,7 +154,6 @@ def save_sidecar(
     """
     newest = max(max(source.mtime_ns, source.ctime_ns) for source in sources)
     if newest > scanned_ns - _SETTLED_NS:
-        _log.debug("not caching the catalogue: the map changed just now")
         return False
     names = np.ascontiguousarray(catalogue.names)
     header = msgspec.json.encode(
@@ -190,7 +190,7 @@ def save_sidecar(
                 os.unlink(file.name)
                 raise
     except OSError as error:
-        _log.warning("cannot cache the catalogue in %s: %s", path, error.strerror)
+        _log.warning(logfmt("catalogue not cached", path=path, error=error.strerror))
         return False
     return True
 

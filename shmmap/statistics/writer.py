@@ -19,6 +19,7 @@ from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 
 from shmmap.errors import ConfigError
+from shmmap.logfmt import logfmt
 from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import statistics_name
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
@@ -279,10 +280,11 @@ class StatisticsWriter:
             if not self._told:
                 self._told = True
                 _log.warning(
-                    "the statistics cannot be written (%s): `shmmap top` and `health` show an older state;"
-                    " cells are served as before",
-                    error.strerror,
-                )
+                    logfmt(
+                        "statistics not written", error=error.strerror,
+                        effect="cells are served as before, `shmmap top` and `health` show an older state",
+                    )
+                )  # fmt: skip
             return False
         return True
 

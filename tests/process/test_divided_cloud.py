@@ -59,7 +59,7 @@ def points(columns: Columns) -> list[tuple[float, ...]]:
 
 def divisions(one: DaemonProcess) -> int:
     """How often it divided a cloud, in all its lives."""
-    return len(re.findall(r"dividing \S+ into", one.log))
+    return len(re.findall(r"dividing cloud=\S+ into=", one.log))
 
 
 def test_a_cloud_is_divided_once_in_its_own_frame(

@@ -205,7 +205,7 @@ def test_statistics_that_cannot_be_written_end_nobody(
     warm = [handle.segment for handle in client.area(circle(0, 0, 5)).cells]
     soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
-    told = "the statistics cannot be written (File too large)"
+    told = 'statistics not written error="File too large"'
     waiting = Patience()
     while waiting(told not in one.log):
         os.sched_yield()

@@ -12,6 +12,8 @@ from typing import Final
 
 import zmq
 
+from shmmap.logfmt import logfmt
+
 __all__ = ["EventPublisher", "events_path"]
 
 _log = logging.getLogger(__name__)
@@ -58,7 +60,7 @@ class EventPublisher:
         try:
             self.socket.send(data, zmq.NOBLOCK)
         except zmq.ZMQError as error:
-            _log.warning("an event was not sent: %s", error)
+            _log.warning(logfmt("event not sent", error=error))
 
     def drain(self) -> None:
         """Hear who subscribed; they are told where the numbers stand."""

@@ -6,7 +6,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from typing import Final
+from typing import Any, Final
+
+from shmmap.logfmt import escaped
 
 __all__ = ["set_up_logging"]
 
@@ -19,7 +21,18 @@ _PRIORITIES: Final = {
 }
 
 
-class _JournalFormatter(logging.Formatter):
+class _Lines(logging.Formatter):
+    """One line each, whatever a message contains; only a traceback has more of them."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  logging's name
+        record.message = escaped(record.message)
+        return super().formatMessage(record)
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802  logging's name
+        return "\n".join(map(escaped, super().formatException(ei).splitlines()))
+
+
+class _JournalLines(_Lines):
     """``<priority>message``: journald adds the time itself; every line carries the prefix."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -31,9 +44,7 @@ def set_up_logging(level: int = logging.INFO) -> None:
     """Send the daemon's log to stderr, in the form its reader expects."""
     handler = logging.StreamHandler(sys.stderr)
     if os.environ.get("JOURNAL_STREAM"):
-        handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
+        handler.setFormatter(_JournalLines("%(message)s"))
     else:
-        handler.setFormatter(
-            logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", datefmt="%H:%M:%S")
-        )
+        handler.setFormatter(_Lines("%(asctime)s %(levelname)-7s %(message)s", datefmt="%H:%M:%S"))
     logging.basicConfig(level=level, handlers=[handler], force=True)

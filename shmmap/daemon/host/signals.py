@@ -10,6 +10,8 @@ import socket
 from collections.abc import Iterator
 from typing import Final
 
+from shmmap.logfmt import logfmt
+
 __all__ = [
     "KEEP_SIGNAL",
     "RELOAD_SIGNAL",
@@ -54,7 +56,7 @@ class StartSignals:
     def _on_stop(self, number: int, frame: object) -> None:
         del frame
         if not self._stop:
-            _log.info("stopping on %s, before serving", signal.Signals(number).name)
+            _log.info(logfmt("stopping", signal=signal.Signals(number).name, during="start"))
         self._stop = True
         if not self._held:
             raise SystemExit(0)

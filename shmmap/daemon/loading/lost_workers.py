@@ -9,8 +9,9 @@ from typing import Final
 
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import RESTART, Worker, WorkerPool
 from shmmap.daemon.records import Load
+from shmmap.logfmt import logfmt
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -52,12 +53,19 @@ class LostWorkers:
     def ended(self, worker: Worker, now_s: float) -> None:
         """A worker's process ended."""
         self._statistics.add("worker_crashes")
-        if not worker.ready:
-            self._pool.failed_starts += 1
-        at_fault = worker.ready or self._pool.failed_starts >= START_ATTEMPTS
-        how = self._replace(worker, "load_failed" if at_fault else "", now_s)
-        if not worker.ready:
-            _log.error("a loader could not start: %s", how)
+        if worker.ready:
+            self._replace(worker, "load_failed", now_s)
+            return
+        self._pool.failed_starts += 1
+        unfinished, how = self._pool.remove(worker)
+        _log.error(logfmt("loader could not start", reason=how))
+        give_up = how == RESTART or self._pool.failed_starts >= START_ATTEMPTS
+        for job in unfinished:
+            load = self._jobs.pop(job.number, None)
+            if load is not None and give_up:
+                self._fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
+            elif load is not None:
+                self._loads.requeue(load)
 
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load, or whose start, took too long."""
@@ -68,20 +76,19 @@ class LostWorkers:
             else:
                 self.ended(worker, now_s)
 
-    def _replace(self, worker: Worker, code: str, now_s: float) -> str:
-        """Forget a worker; with a code the job it worked on fails.  Returns how it ended, for people."""
+    def _replace(self, worker: Worker, code: str, now_s: float) -> None:
+        """Forget a worker that had begun: the job it worked on fails."""
         unfinished, how = self._pool.remove(worker)
         died = code == "load_failed"
         why = f"the loader died of it ({how})" if died else "loading took longer than allowed"
         for position, job in enumerate(unfinished):
             self._room.hungry.pop(job.number, None)
             load = self._jobs.pop(job.number, None)
-            if position == 0 and code:
-                _log.error("a loader was replaced: %s: %s", job.path, why)
+            if position == 0:
+                _log.error(logfmt("loader replaced", path=job.path, reason=why))
                 if load is not None:
                     # where it took too long nobody looks again: the file system may be what hangs
                     known = load.sources[0] if died and load.sources else None
                     self._fail(load, code, f"{job.path}: {why}", known, now_s)
             elif load is not None:
                 self._loads.requeue(load)
-        return how

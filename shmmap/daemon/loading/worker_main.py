@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 from typing import Final
 
+from shmmap import __version__
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
 from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
@@ -57,7 +58,7 @@ class _Worker:
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
-        self._send(worker_messages.Ready())
+        self._send(worker_messages.Ready(__version__))
         while True:
             job = self._waiting.pop(0) if self._waiting else self._receive()
             if job is None:

@@ -73,7 +73,12 @@ class Refuse(msgspec.Struct, array_like=True, tag="refuse"):
 
 
 class Ready(msgspec.Struct, array_like=True, tag="ready"):
-    """The worker has started: from now on its death is its job's fault."""
+    """The worker has started: from now on its death is its job's fault.
+
+    ``version`` of shmmap is the daemon's own, unless there is another on the disk by now.
+    """
+
+    version: str = ""
 
 
 class Need(msgspec.Struct, array_like=True, tag="need"):

@@ -12,9 +12,12 @@ import subprocess
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
 
 import msgspec
 
+from shmmap import __version__
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.processes.start_child import MAX_PACKET_BYTES, start_worker
@@ -33,11 +36,24 @@ START_DEADLINE_S = 60.0
 """How long a worker may take from its first job until it is ready: an interpreter and its imports."""
 
 
+RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
+
+
+def _installed() -> tuple[int, int] | None:
+    """What tells the loader program on the disk from another one; None where there is none any more."""
+    try:
+        status = Path(__file__).with_name("worker_main.py").stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
 @dataclass(eq=False, slots=True)
 class Worker:
     """One worker process; ``queue`` holds its jobs, the first is the one it works on.
 
-    ``segment_fd`` is the segment whose `worker_messages.Done` has yet to come.
+    ``segment_fd`` is the segment whose `worker_messages.Done` has yet to come, ``foreign`` says that it
+    is of another version of shmmap.
     """
 
     process: subprocess.Popen[bytes]
@@ -46,6 +62,7 @@ class Worker:
     head_since_s: float = 0.0
     ready: bool = False
     segment_fd: int = -1
+    foreign: bool = False
 
     @property
     def fd(self) -> int:
@@ -99,6 +116,7 @@ class WorkerPool:
         self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
         self._workers: dict[int, Worker] = {}
         self._ending: list[subprocess.Popen[bytes]] = []
+        self._installed = _installed()
         self.failed_starts = 0
 
     def __len__(self) -> int:
@@ -181,12 +199,16 @@ class WorkerPool:
         try:
             if fd >= 0:
                 os.set_inheritable(fd, False)
-            return worker_messages.decode_from_worker(data), fd
+            message = worker_messages.decode_from_worker(data)
         except msgspec.MsgspecError as error:
             _log.error("a loader sends nonsense and is ended: %s", error)
             if fd >= 0:
                 os.close(fd)
             raise EOFError from error
+        if isinstance(message, worker_messages.Ready) and message.version != __version__:
+            worker.foreign = True
+            raise EOFError
+        return message, fd
 
     def finished(self, worker: Worker, number: int, now_s: float) -> None:
         """The worker is done with a job; its next one begins now."""
@@ -206,6 +228,8 @@ class WorkerPool:
         except subprocess.TimeoutExpired:
             self._ending.append(worker.process)
             how = "killed, and has not ended yet"
+        if not worker.ready and (worker.foreign or _installed() != self._installed):
+            how = RESTART
         return list(worker.queue.values()), how
 
     def overdue(self, now_s: float) -> list[Worker]:

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable
 
 from shmmap.errors import InternalError, ShmmapError
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_origin import MapOrigin
 
@@ -67,7 +68,7 @@ class Reloader:
         except OSError as error:
             self._result = ShmmapError(f"{self._origin.path}: {error}")
         except Exception as error:  # noqa: BLE001  else nobody would ever hear of this reload or a later one
-            _log.exception("the map could not be read again; this is a defect in shmmap")
+            _log.exception(logfmt("reload failed", map=self._origin.path, cause="a defect in shmmap"))
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
@@ -82,7 +83,7 @@ class Reloader:
         if isinstance(result, Catalogue):
             apply(result)
         elif result is not None:
-            _log.error("the map could not be read again, the old state stays: %s", result)
+            _log.error(logfmt("reload failed", map=self._origin.path, message=result, served="the old state"))
             failed(result)
         if result is not None:
             for answer in asked:

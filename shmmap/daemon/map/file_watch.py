@@ -16,6 +16,7 @@ from typing import Final
 
 from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
 from shmmap.errors import ConfigError
+from shmmap.logfmt import logfmt
 
 __all__ = ["FileWatch", "directories_of"]
 
@@ -90,8 +91,10 @@ class FileWatch:
                 raise _refusal(refused)
             if (kind := _file_system_of(directory)) in _REMOTE:
                 _log.warning(
-                    "watch: %s is on %s, which does not tell of changes made elsewhere; reload to see them",
-                    directory, kind,
+                    logfmt(
+                        "changes made on other machines are not noticed", directory=directory,
+                        file_system=kind, hint="shmmap reload",
+                    )
                 )  # fmt: skip
 
     def follow(self, directories: Iterable[str]) -> None:

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Log lines that people search and programs read: what happened, then ``key=value`` for each detail.
+
+::
+
+    evicted cell=city/20_40.pcd layer=points bytes=1261568 reason=room
+    load failed cell="north gate.pcd" code=load_failed message="points are missing"
+
+Names of files and clients are other people's words: what could move a terminal's cursor, or begin
+another line, is written as an escape.
+"""
+
+from __future__ import annotations
+
+__all__ = ["escaped", "logfmt"]
+
+_ESCAPES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
+
+
+def escaped(text: str) -> str:
+    """Return a text with every character that is not printable as a backslash escape."""
+    if text.isprintable():
+        return text
+    return "".join(char if char.isprintable() else _ESCAPES.get(char, _number(char)) for char in text)
+
+
+def logfmt(event: str, **details: object) -> str:
+    """Return a log line.
+
+    Parameters
+    ----------
+    event
+        What happened, in words that are always the same.
+    **details
+        Written in this order; floats to three decimals, None is left out, and a value is quoted where
+        it has blanks, quotes, ``=`` or characters that are not printable, or is empty.
+    """
+    return " ".join(
+        [event, *(f"{key}={_value(value)}" for key, value in details.items() if value is not None)]
+    )
+
+
+def _value(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    text = str(value)
+    if text and text.isprintable() and not any(char in text for char in ' "=\\'):
+        return text
+    return '"' + escaped(text.replace("\\", "\\\\").replace('"', '\\"')) + '"'
+
+
+def _number(char: str) -> str:
+    code = ord(char)
+    if code < 0x100:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
