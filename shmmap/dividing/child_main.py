@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The process that divides a cloud for the daemon: ``python -m shmmap.dividing.child_main``.
 
-It says what it does on stdout, one JSON document a line: ``{"stage", "done", "total"}`` now and then, and
+It says what it does in packets of JSON: ``{"stage", "done", "total"}`` now and then, and
 ``{"error", "message", "hint"}`` before it ends with that error.  It dies with the daemon, and a later one
 goes on where it stopped.
 """
@@ -11,9 +11,10 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import sys
 import time
-from typing import Any, Final
+from typing import Final
 
 from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
@@ -26,10 +27,11 @@ _NICENESS: Final = 10  # whoever is being served goes first
 _TELL_EVERY_S: Final = 1.0
 
 
-class _Lines:
-    """Progress as lines for the daemon."""
+class _Channel:
+    """Progress and errors as packets for the daemon."""
 
-    def __init__(self) -> None:
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
         self._name = ""
         self._done = self._total = 0
         self._told_s = 0.0
@@ -46,28 +48,26 @@ class _Lines:
     def done(self, points: int) -> None:
         del points
 
+    def say(self, **words: object) -> None:
+        self._channel.send(json.dumps(words).encode())
+
     def _tell(self) -> None:
         self._told_s = time.monotonic()
-        _say({"stage": self._name, "done": self._done, "total": self._total})
-
-
-def _say(line: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(line) + "\n")
-    sys.stdout.flush()
+        self.say(stage=self._name, done=self._done, total=self._total)
 
 
 def main(arguments: list[str]) -> int:
-    """Run with ``CLOUD OUT PARENT_PID``; returns the error's exit code."""
-    cloud, out, parent = arguments[0], arguments[1], int(arguments[2])
-    die_with(parent)
+    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT``; returns the error's exit code."""
+    channel = _Channel(socket.socket(fileno=int(arguments[0])))
+    die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     os.nice(_NICENESS)
     # clients ask in the cloud's own coordinates, so it keeps its frame
     settings = DivideSettings(translate="none", resume=True)
     try:
-        divide([cloud], out, settings, progress=_Lines())
+        divide([arguments[2]], arguments[3], settings, progress=channel)
     except ShmmapError as error:
-        _say({"error": error.code, "message": error.message, "hint": error.hint})
+        channel.say(error=error.code, message=error.message, hint=error.hint)
         return error.exit_code
     return 0
 

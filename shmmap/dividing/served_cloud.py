@@ -20,8 +20,6 @@ import json
 import logging
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
@@ -37,6 +35,7 @@ from shmmap.origin.map_origin import MapOrigin
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.origin.single_pcd import is_served_whole
 from shmmap.origin.stamp import Stamp
+from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
 
@@ -143,38 +142,29 @@ class DividedCloud:
 
     def _divide(self, out: str) -> None:
         _log.info(logfmt("dividing", cloud=self.path, into=out))
-        command = [sys.executable, "-m", "shmmap.dividing.child_main", self.path, out, str(os.getpid())]
+        process, channel = start_child("shmmap.dividing.child_main", self.path, out, new_session=False)
         failure: dict[str, Any] = {}
-        with subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            text=True,
-            errors="replace",  # libraries may write there, too
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-            cwd="/",  # nothing is imported from where the daemon happens to run
-        ) as process:
+        stage = ""
+        with process, channel:
             try:
-                stage = ""
-                for line in process.stdout or ():
-                    told = _told(line)
+                while packet := channel.recv(MAX_PACKET_BYTES):
+                    told = json.loads(packet)
                     if "error" in told:
                         failure = told
-                    if "stage" not in told:
                         continue
                     if told["stage"] != stage:
                         stage = told["stage"]
                         _log.info(logfmt("dividing", cloud=self.path, stage=stage))
                     part = f" {told['done'] / told['total']:.0%}" if told["total"] else ""
                     self._tell(f"STATUS={stage} {self.path}{part}", f"EXTEND_TIMEOUT_USEC={_MORE_TIME_USEC}")
-                code = process.wait()
             except BaseException:
                 process.kill()
                 raise
         if failure:
             raise error_from_wire(failure["error"], failure["message"], failure["hint"])
-        if code or not os.path.isdir(out):
-            raise InternalError(f"dividing {self.path} ended with {code}", hint="shmmap divide says more")
+        if process.returncode or not os.path.isdir(out):
+            how = how_ended(process.returncode)
+            raise InternalError(f"dividing {self.path} ended with {how}", hint="shmmap divide says more")
 
     # --- the cache ------------------------------------------------------------------------------
 
@@ -237,12 +227,3 @@ def _point(link: str, name: str) -> None:
         os.unlink(interim)
     os.symlink(name, interim)
     os.replace(interim, link)
-
-
-def _told(line: str) -> dict[str, Any]:
-    """What a line of the divider says, empty if it is not its own."""
-    try:
-        told = json.loads(line)
-    except ValueError:
-        return {}
-    return told if isinstance(told, dict) else {}

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import selectors
-import signal
 import socket
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,7 @@ from shmmap.layers.spec import canonical_layers
 from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.origin.catalogue import Catalogue
 from shmmap.prepare import work
-from shmmap.processes.start_child import MAX_PACKET_BYTES, start_worker
+from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map"]
 
@@ -123,7 +122,7 @@ class _Run:
         return task
 
     def _start(self, task: work.CellWork) -> None:
-        process, ours = start_worker("shmmap.prepare.worker", *self._arguments, new_session=False)
+        process, ours = start_child("shmmap.prepare.worker", *self._arguments, new_session=False)
         worker = _Worker(process, ours)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
@@ -186,8 +185,7 @@ class _Run:
         self._selector.unregister(worker.channel)
         worker.channel.close()
         worker.process.kill()
-        code = worker.process.wait()
-        return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return how_ended(worker.process.wait())
 
 
 def prepare_map(

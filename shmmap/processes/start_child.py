@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting a worker: a process of its own, with a channel of packets to it."""
+"""Starting a child: a process of its own, with a channel of packets to it."""
 
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
 from typing import Final
 
-__all__ = ["MAX_PACKET_BYTES", "channel", "start_worker"]
+__all__ = ["MAX_PACKET_BYTES", "channel", "how_ended", "start_child"]
 
 MAX_PACKET_BYTES: Final = 1 << 19
 """A job may name its cell and 65 neighbours by paths of 4095 bytes each."""
@@ -22,7 +23,7 @@ def channel() -> tuple[socket.socket, socket.socket]:
     return ours, theirs
 
 
-def start_worker(
+def start_child(
     module: str, *arguments: str, new_session: bool
 ) -> tuple[subprocess.Popen[bytes], socket.socket]:
     """Start ``python -m MODULE CHANNEL_FD PARENT_PID ARGUMENT...``.
@@ -61,3 +62,13 @@ def start_worker(
         ours.close()
         raise
     return process, ours
+
+
+def how_ended(code: int) -> str:
+    """What a process's exit code says, for people."""
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return f"signal {signal.Signals(-code).name}"
+    except ValueError:  # those between SIGRTMIN and SIGRTMAX have no names
+        return f"signal {-code}"

@@ -11,6 +11,8 @@ import os
 from pathlib import Path
 from typing import Final
 
+from shmmap.daemon.host.mounts import mounts
+
 __all__ = ["memory_limit_bytes"]
 
 _NO_LIMIT: Final = 1 << 60
@@ -28,11 +30,9 @@ def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
     """
     groups = _groups(f"{proc}/cgroup")
     limits: list[int] = []
-    for kind, root, mount, options in _mounts(f"{proc}/mountinfo"):
-        if kind == "cgroup" and "memory" not in options:
-            continue
+    for kind, root, mount, options in mounts(f"{proc}/mountinfo"):
         group = groups.get(kind)
-        if group is None:
+        if group is None or (kind == "cgroup" and "memory" not in options):
             continue
         inside = os.path.relpath(group, root) if _is_below(group, root) else "."
         place = Path(mount, inside)
@@ -53,17 +53,6 @@ def _groups(path: str) -> dict[str, str]:
             found["cgroup2"] = group
         elif "memory" in controllers.split(","):
             found["cgroup"] = group
-    return found
-
-
-def _mounts(path: str) -> list[tuple[str, str, str, list[str]]]:
-    """Kind, root inside the hierarchy, mount point and options of every mounted hierarchy."""
-    found = []
-    for line in _lines(path):
-        first, _, second = line.partition(" - ")
-        before, after = first.split(), second.split()
-        if len(after) >= 3 and after[0] in _FILES:
-            found.append((after[0], before[3], before[4], after[2].split(",")))
     return found
 
 

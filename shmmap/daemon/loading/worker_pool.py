@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import socket
 import subprocess
 from collections import OrderedDict
@@ -20,7 +19,7 @@ import msgspec
 from shmmap import __version__
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.processes.start_child import MAX_PACKET_BYTES, start_worker
+from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["Worker", "WorkerPool"]
 
@@ -140,7 +139,7 @@ class WorkerPool:
 
     def start_one(self) -> Worker:
         """Start a worker process."""
-        process, ours = start_worker(
+        process, ours = start_child(
             "shmmap.daemon.loading.worker_main", self._shm_dir, *self._cache, new_session=True
         )
         ours.setblocking(False)
@@ -224,7 +223,7 @@ class WorkerPool:
             os.close(worker.segment_fd)
         worker.process.kill()
         try:
-            how = _how(worker.process.wait(END_PATIENCE_S))
+            how = how_ended(worker.process.wait(END_PATIENCE_S))
         except subprocess.TimeoutExpired:
             self._ending.append(worker.process)
             how = "killed, and has not ended yet"
@@ -247,13 +246,3 @@ class WorkerPool:
         """End every worker."""
         for worker in self:
             self.remove(worker)
-
-
-def _how(code: int) -> str:
-    """What an exit code says, for people."""
-    if code >= 0:
-        return f"exit code {code}"
-    try:
-        return f"signal {signal.Signals(-code).name}"
-    except ValueError:  # those between SIGRTMIN and SIGRTMAX have no names
-        return f"signal {-code}"

@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
+from shmmap.daemon.host.mounts import file_system_of
 from shmmap.errors import ConfigError
 from shmmap.logfmt import logfmt
 
@@ -89,7 +90,7 @@ class FileWatch:
             if refused is not None and refused.errno not in (errno.ENOENT, errno.ENOTDIR):
                 self.close()
                 raise _refusal(refused)
-            if (kind := _file_system_of(directory)) in _REMOTE:
+            if (kind := file_system_of(directory)) in _REMOTE:
                 _log.warning(
                     logfmt(
                         "changes made on other machines are not noticed", directory=directory,
@@ -150,19 +151,3 @@ class FileWatch:
 def _refusal(error: OSError) -> ConfigError:
     limits = "raise fs.inotify.max_user_watches and max_user_instances, or leave out --watch"
     return ConfigError(f"cannot watch the map: {error.strerror}", key="watch", hint=limits)
-
-
-def _file_system_of(path: str) -> str:
-    """Return the type of the file system a path is on, as ``/proc/self/mountinfo`` names it."""
-    path = os.path.realpath(path)
-    best, kind = "", ""
-    try:
-        with open("/proc/self/mountinfo", encoding="utf-8", errors="surrogateescape") as file:
-            for line in file:
-                before, _, after = line.partition(" - ")
-                point = before.split()[4].encode().decode("unicode_escape")
-                if len(point) >= len(best) and (path + "/").startswith(point.rstrip("/") + "/"):
-                    best, kind = point, after.split()[0]
-    except (OSError, IndexError, UnicodeError):
-        return ""
-    return kind

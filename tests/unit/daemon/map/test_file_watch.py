@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.host import inotify
-from shmmap.daemon.map import file_watch
 from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch
 from shmmap.errors import ConfigError
 
@@ -158,9 +157,3 @@ def test_a_limit_of_the_kernel_is_a_matter_of_configuration(
     with pytest.raises(ConfigError, match="No space left") as raised:
         FileWatch([str(tmp_path)])
     assert "max_user_watches" in raised.value.hint
-
-
-def test_file_systems_are_told_apart(tmp_path: Path) -> None:
-    assert file_watch._file_system_of("/proc/self") == "proc"
-    assert file_watch._file_system_of("/dev/shm") == "tmpfs"
-    assert file_watch._file_system_of(str(tmp_path)) not in file_watch._REMOTE
