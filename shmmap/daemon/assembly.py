@@ -109,6 +109,7 @@ class Service:
             cache,
             scheduler,
             statistics,
+            memory.rows,
             memory.event_log,
             sessions=sessions,
             waiting=cells,

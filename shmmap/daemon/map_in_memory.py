@@ -23,6 +23,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.pins.probe import Rung
 from shmmap.daemon.pins.watch import PinWatch
+from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import ConfigError
@@ -94,9 +95,11 @@ class MapInMemory:
         self.event_log = EventLog(self.epoch)
         self.sessions = Sessions()
         reclaimer = Reclaimer(ledger, directory, self.sessions, POLICIES[config.eviction], pins)
+        self.rows = CellRows(self.statistics, catalogue.id_prefix, segment_prefix(config.instance))
         self.cache = CellCache(
             catalogue, ledger, reclaimer, directory, self.statistics,
-            instance=config.instance, epoch=self.epoch, mode=mode, gid=gid, event_log=self.event_log,
+            instance=config.instance, epoch=self.epoch, mode=mode, gid=gid, rows=self.rows,
+            event_log=self.event_log,
         )  # fmt: skip
         self.watched = WatchedDescriptors()
         pool = WorkerPool(
@@ -110,6 +113,7 @@ class MapInMemory:
         )
         adoption = Adoption(directory, config.instance, self.cache, loads, mode=mode, gid=gid)
         adoption.take_over(time.monotonic())
+        self.cache.tell_all()
         for fd, hear in (
             (pins.fd, self.scheduler.hear_of_closes),
             (self.cache.names.fd, self.cache.hear_of_names),

@@ -9,7 +9,7 @@ import json
 import pkgutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,8 @@ PACKAGE = Path(shmmap.__file__).parent
 CLIENTS = Path(shmmap_clients.__file__).parent
 TESTS = Path(__file__).parents[1]
 
-LAYERS = {
+BASE = {"errors", "columns", "failpoints", "logfmt", "processes", "geometry"}
+PARTS = {
     # part: what it may import besides itself
     "errors": set[str](),
     "columns": set[str](),
@@ -29,19 +30,42 @@ LAYERS = {
     "logfmt": set[str](),
     "processes": set[str](),
     "geometry": {"errors"},
-    "formats": {"errors", "columns", "geometry"},
+    "formats": {"errors", "columns", "geometry", "logfmt"},
     "segment": {"errors", "columns", "geometry", "failpoints"},
     "protocol": {"errors", "columns", "geometry"},
-    "statistics": {"errors", "logfmt", "columns", "geometry", "segment"},
-    "layers": {"errors", "logfmt", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
-    "origin": {"errors", "logfmt", "columns", "geometry", "formats", "segment", "protocol", "statistics"},
-    "dividing": {"errors", "logfmt", "columns", "geometry", "formats", "layers", "origin", "processes"},
-    "daemon": {
-        "errors", "columns", "failpoints", "logfmt", "processes", "geometry", "formats", "segment",
-        "protocol", "statistics", "layers", "origin", "dividing",
+    "statistics": {"errors", "columns", "geometry", "logfmt", "segment"},
+    "layers": BASE | {"formats", "segment", "protocol", "statistics"},
+    "origin": BASE | {"formats", "segment", "protocol", "statistics"},
+    "dividing": BASE | {"formats", "layers", "origin"},
+    "client": {"errors", "columns", "failpoints", "geometry", "segment", "protocol", "statistics.layout"},
+    "daemon": BASE | {"formats", "segment", "protocol", "statistics", "layers", "origin", "dividing"},
+    "prepare": BASE | {"formats", "layers", "origin"},
+    "service": BASE,
+    "doctor": BASE | {
+        "client", "formats", "origin", "protocol", "segment", "service", "statistics",
+        "daemon.config", "daemon.config_file", "daemon.prerequisites", "daemon.pins.probe",
+        "daemon.service_manager",
     },
-    "client": {"errors", "columns", "failpoints", "geometry", "segment", "protocol"},
+    "simulation": BASE | {"formats", "origin"},
+    "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},
+    "demo": BASE | {
+        "formats", "origin", "layers", "segment", "protocol", "client", "statistics", "simulation", "testing",
+    },
+    "cli": BASE | {
+        "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol", "segment",
+        "service", "statistics", "daemon.config", "daemon.config_file", "daemon.main",
+        "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
+    },
 }  # fmt: skip
+"""What stands below what; a dotted name allows that module or package alone."""
+ROOMS = [
+    {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
+    {"telemetry"}, {"loading"}, {"cache"}, {"events"}, {"transport"}, {"map", "pins"},
+    {"host", "service_manager"}, {"config"}, {"config_file", "records"},
+]  # fmt: skip
+"""The daemon's floors, uppermost first; a room imports from the floors below its own."""
+MOST_MODULES = 12
+MOST_LINES = 350
 
 CLIENT_PACKAGES = {"numpy", "zmq", "posix_ipc", "msgspec"}
 HEAVY = {"open3d", "numba", "laspy", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
@@ -58,17 +82,13 @@ def source(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
-def shmmap_imports(tree: ast.AST) -> Iterator[str]:
-    """Every part of shmmap that a tree imports, wherever in the code; what only types need is left out."""
-    only_types = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        for inner in ast.walk(node)
-    }
-    for node in ast.walk(tree):
-        if id(node) in only_types:
-            continue
+def imported(module: str, *, lazy: bool = True) -> Iterator[str]:
+    """Every module of ours that a module imports; what only types need is left out.
+
+    With ``lazy`` also what it imports in functions.
+    """
+    tree = ast.parse(source(module).read_text(encoding="utf-8"))
+    for node in _run(tree.body, lazy=lazy):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -77,19 +97,64 @@ def shmmap_imports(tree: ast.AST) -> Iterator[str]:
         else:
             continue
         for name in names:
-            parts = name.split(".")
-            if parts[0] == "shmmap" and len(parts) > 1 and not parts[1].startswith("__"):
-                yield parts[1]
+            if name.split(".")[0] in {"shmmap", "shmmap_clients"}:
+                while name not in ALL and "." in name:
+                    name = name.rpartition(".")[0]
+                yield name
+
+
+def _run(body: Iterable[ast.AST], *, lazy: bool) -> Iterator[ast.AST]:
+    """The nodes that run on import, or ever."""
+    for node in body:
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not lazy:
+            continue
+        yield node
+        yield from _run(ast.iter_child_nodes(node), lazy=lazy)
+
+
+ALL = frozenset([*modules(), *modules(CLIENTS), "shmmap", "shmmap_clients"])
 
 
 @pytest.mark.parametrize("module", modules())
 def test_imports_point_one_way(module: str) -> None:
     part = module.split(".")[1]
-    used = set(shmmap_imports(ast.parse(source(module).read_text(encoding="utf-8")))) - {part}
-    if part in LAYERS:
-        assert used <= LAYERS[part], f"{module} may not import {sorted(used - LAYERS[part])}"
-    elif not module.startswith("shmmap.cli.verbs.demo") and part != "testing":
-        assert "testing" not in used, f"{module} may not import shmmap.testing"
+    for name in imported(module):
+        assert not name.startswith("shmmap_clients"), f"{module} may not import {name}: start the program"
+        other = name.partition(".")[2]
+        if other and other.split(".")[0] != part:
+            allowed = PARTS[part]
+            assert any(other == one or other.startswith(one + ".") for one in allowed), f"{module}: {name}"
+
+
+@pytest.mark.parametrize("module", [m for m in modules() if m.startswith("shmmap.daemon.")])
+def test_the_daemon_s_floors(module: str) -> None:
+    floors = {room: number for number, floor in enumerate(ROOMS) for room in floor}
+    room = module.split(".")[2]
+    for name in imported(module):
+        parts = name.split(".")
+        if parts[:2] == ["shmmap", "daemon"] and len(parts) > 2 and parts[2] != room:
+            assert floors[parts[2]] > floors[room], f"{module} imports {name}, which is not below it"
+
+
+def test_no_imports_in_a_circle() -> None:
+    graph = {module: set(imported(module)) - {module} for module in ALL}
+    left = dict(graph)
+    while free := [module for module, others in left.items() if not others & left.keys()]:
+        for module in free:
+            del left[module]
+    assert not left, f"these import one another: {sorted(left)}"
+
+
+def test_modules_and_folders_are_small() -> None:
+    for root in (PACKAGE, CLIENTS):
+        for path in root.rglob("*.py"):
+            lines = path.read_text(encoding="utf-8").count("\n")
+            assert lines <= MOST_LINES, f"{path.relative_to(root)} has {lines} lines: is it one concept?"
+    for folder in [PACKAGE / "daemon", *(path.parent for path in (PACKAGE / "daemon").rglob("__init__.py"))]:
+        count = len([path for path in folder.glob("*.py") if not path.name.startswith("__")])
+        assert count <= MOST_MODULES, f"{folder.relative_to(PACKAGE)} has {count} modules: is it one concept?"
 
 
 @pytest.mark.parametrize("module", modules(CLIENTS))

@@ -11,9 +11,9 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
-from shmmap.daemon.cache.encoded_handles import cell_row
+from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
@@ -33,12 +33,22 @@ from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["CellCache"]
+__all__ = ["CellCache", "Rows"]
 
 _log = logging.getLogger(__name__)
 
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
+
+
+class Rows(Protocol):
+    """Where segments are shown; see `shmmap.daemon.telemetry.cell_rows`."""
+
+    def show(self, resident: Resident, state: str) -> None:
+        """Show a segment as it is now."""
+
+    def hide(self, name: str) -> None:
+        """There is no segment of this name any more."""
 
 
 class CellCache:
@@ -50,6 +60,8 @@ class CellCache:
         Part of every segment's name; part of its publish block.
     mode, gid
         Access of published segments; ``gid`` -1 leaves the group alone.
+    rows
+        Shows segments to operators.
     event_log
         Told what happens to cells.
 
@@ -59,8 +71,8 @@ class CellCache:
         Tells what happens to cells.
     used : set
         Segments handed out since the statistics last showed them.
-    survey
-        Who maps how much of it.
+    holders, survey
+        Who maps a segment; who maps how much in all.
     warm
         The cells that are in memory at their current version.
     heights : dict
@@ -81,13 +93,15 @@ class CellCache:
         epoch: int,
         mode: int,
         gid: int,
+        rows: Rows,
         event_log: EventLog,
     ) -> None:
         self.catalogue = catalogue
         self.ledger = ledger
         self.reclaimer = reclaimer
         self.layers = LayerVersions(lambda: self.catalogue)
-        self.survey = Survey(reclaimer, in_service=self.is_in_service)
+        self.holders = Holders(reclaimer)
+        self.survey = Survey(ledger, self.holders, in_service=self.is_in_service)
         self.warm = WarmIndex(lambda: len(self.catalogue))
         self.id_prefix = catalogue.id_prefix
         self.segment_prefix = segment_prefix(instance)
@@ -96,6 +110,7 @@ class CellCache:
         self.events = CellEvents(event_log, ledger.memory, statistics, self.wire_id)
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
+        self._rows = rows
         self._directory = directory
         self._statistics = statistics
         self._instance = instance
@@ -218,13 +233,14 @@ class CellCache:
         self.index_of_version[resident.version] = index
         current = True
         if resident.checked:
-            self.warm.encode(resident, *self._names_of(resident))
+            segment = resident.name.removeprefix(self.segment_prefix)
+            self.warm.encode(resident, self.wire_id(resident.key.cell_id), segment)
             current = resident.version == self.layers.version(index, resident.key.layer)
             if current:
                 self.warm.enter(resident, index)
                 self.heights[index] = (resident.z_min, resident.z_max)
             self._indices[self.wire_id(resident.key.cell_id)] = index
-        self._show(resident, "resident" if current else "stale")
+        self.tell(self._rows.show, resident, "resident" if current else "stale")
 
     def forget_indices(self) -> None:
         """Catalogue indices mean other cells from now on; what is resident is entered anew."""
@@ -237,21 +253,7 @@ class CellCache:
             if index is not None:
                 self.index_of_version[retired.resident.version] = index
 
-    # --- being shown ----------------------------------------------------------------------------
-
-    def _show(self, resident: Resident, state: str) -> None:
-        self._statistics.cell_changed(resident.name, cell_row(resident, *self._names_of(resident), state))
-
-    def _names_of(self, resident: Resident) -> tuple[str, str]:
-        """Cell id and segment name without their prefixes."""
-        return self.wire_id(resident.key.cell_id), resident.name.removeprefix(self.segment_prefix)
-
-    def show_used(self, limit: int) -> None:
-        """Bring hits and last use of at most ``limit`` segments in ``used`` up to date in the statistics."""
-        for _ in range(min(limit, len(self.used))):
-            resident = self.used.pop()
-            if self.ledger.resident_named(resident.name) is resident:
-                self._show(resident, "resident" if self.is_current(resident) else "stale")
+    # --- telling --------------------------------------------------------------------------------
 
     def tell(self, how: Callable[..., None], *what: Any) -> None:
         """Have listeners told of something once nobody waits for the loop, see `tell_all`."""
@@ -287,15 +289,15 @@ class CellCache:
         index = self.index_of(resident.key.cell_id)
         if index is not None and self.warm.get(index, resident.key.layer) is resident:
             self.warm.leave(index, resident.key.layer)
-        self._show(resident, "zombie")
+        self.tell(self._rows.show, resident, "zombie")
 
     def freed(self, resident: Resident) -> None:
         """Its bytes show no more."""
-        self._statistics.cell_removed(resident.name)
+        self.tell(self._rows.hide, resident.name)
 
     def renamed(self, name: str) -> None:
         """It shows under another name from now on."""
-        self._statistics.cell_removed(name)
+        self.tell(self._rows.hide, name)
 
     def hear_of_names(self, now_s: float) -> None:
         """Names vanished from the directory: what somebody else removed is handed out no more."""

@@ -12,8 +12,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import logging
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Final, Protocol
 
 from shmmap.daemon.cache.eviction_policy import EvictionPolicy
@@ -22,12 +21,10 @@ from shmmap.daemon.pins.probe import Rung
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.protocol.messages import Holder
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, zombie_name
-from shmmap.segment.pins import LOADER_SLOT, holders
 
-__all__ = ["UNKNOWN_SLOT", "Observer", "Outcome", "Reclaimer"]
+__all__ = ["Observer", "Outcome", "Reclaimer"]
 
 _log = logging.getLogger(__name__)
 
@@ -44,10 +41,6 @@ HAND_OUT_GRACE_S: Final = 1.0
 """A segment just handed out is not evicted for this long, so that its reader can open it."""
 PROBES_AT_ONCE: Final = 64
 """Looks per turn of the serving loop (about 15 us each)."""
-HOLDERS_S: Final = 0.03
-"""Time of the processor that finding out who holds what may take for one reply."""
-UNKNOWN_SLOT: Final = 0
-"""Stands for whoever uses a segment without being a session."""
 PIN_MEMO_S: Final = 0.2
 """How long a segment found pinned is not considered again for eviction."""
 
@@ -101,7 +94,7 @@ class Reclaimer:
         self.pins = pins or PinWatch(directory)
         self.ledger = ledger
         self._directory = directory
-        self._sessions = sessions
+        self.sessions = sessions
         self._policy = policy
         self._pinned_until_s: dict[str, float] = {}
         self._by_key: dict[Key, Retired] = {}
@@ -111,14 +104,15 @@ class Reclaimer:
 
     # --- retiring -----------------------------------------------------------------------------
 
-    def _on_disk(self, resident: Resident) -> str:
+    def name_on_disk(self, resident: Resident) -> str:
+        """The name of a segment's file: a retired one has another."""
         return zombie_name(resident.name) if resident.name in self.ledger.retired else resident.name
 
     def is_pinned(self, resident: Resident) -> bool | None:
         """The kernel's word on a segment; None if its name is gone."""
         if self.pins.rung is Rung.SESSIONS:
             return bool(resident.sessions)
-        return self.pins.is_used(self._on_disk(resident))
+        return self.pins.is_used(self.name_on_disk(resident))
 
     def retire(self, resident: Resident, now_s: float, why: str = "request") -> bool:
         """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
@@ -196,7 +190,7 @@ class Reclaimer:
         if self._by_key.get(resident.key) is retired:
             del self._by_key[resident.key]
         for slot in list(resident.sessions):
-            session = self._sessions.by_slot(slot)
+            session = self.sessions.by_slot(slot)
             if session is not None:
                 session.drop_segment(resident)
         self.observer.freed(resident)
@@ -270,7 +264,7 @@ class Reclaimer:
         candidates, graced = self.ledger.candidates(now_s, HAND_OUT_GRACE_S)
         self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
         unknown = [r for r in candidates if r.name not in self._pinned_until_s]
-        ordered = self._policy(unknown, self._sessions.poses())
+        ordered = self._policy(unknown, self.sessions.poses())
         # what a session says it holds is most likely pinned: look at the others first
         ordered.sort(key=lambda resident: bool(resident.sessions))
         for resident in ordered[:PROBES_AT_ONCE]:
@@ -298,56 +292,13 @@ class Reclaimer:
             return Outcome.PENDING
         return Outcome.PENDING if self.ledger.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
 
-    # --- who ----------------------------------------------------------------------------------
-
-    def slots_of(self, resident: Resident) -> list[int] | None:
-        """Slots that have a segment locked; None if its name is gone."""
-        try:
-            with self.pins.opened(self._on_disk(resident)) as fd:
-                return holders(fd)
-        except OSError:
-            return None
-
-    def users_among(self, resident: Resident, slots: Sequence[int]) -> list[int]:
-        """Slots of sessions, of those that have a segment locked, and 0 if somebody unknown uses it, too.
-
-        Unknown is whose lock no session of ours has (a client of an earlier life that we have not heard
-        of), and a pin without any lock.  Our own loaders look at segments, too, and do not count.
-        """
-        known = [slot for slot in slots if self._sessions.by_slot(slot) is not None]
-        ours = slots.count(LOADER_SLOT)
-        if len(slots) > len(known) + ours or (not known and not ours and self.is_pinned(resident)):
-            known.append(UNKNOWN_SLOT)
-        return known
-
-    def holders_of(self, residents: Iterable[Resident], *, limit: int = 512) -> tuple[Holder, ...]:
-        """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock.
-
-        A bounded look: at so many segments, and for so long.
-        """
-        end_s = time.thread_time() + HOLDERS_S
-        bytes_of: dict[int, int] = {}
-        cells_of: dict[int, int] = {}
-        for count, resident in enumerate(residents):
-            if count >= limit or time.thread_time() > end_s:
-                break
-            for slot in self.users_among(resident, self.slots_of(resident) or ()):
-                bytes_of[slot] = bytes_of.get(slot, 0) + resident.nbytes
-                cells_of[slot] = cells_of.get(slot, 0) + 1
-        found = []
-        for slot, nbytes in sorted(bytes_of.items(), key=lambda item: -item[1]):
-            session = self._sessions.by_slot(slot)
-            if session is None:
-                found.append(Holder(0, 0, -1, "unknown", nbytes, cells_of[slot]))
-            else:
-                found.append(session.as_holder(nbytes, cells_of[slot]))
-        return tuple(found)
+    # --- the end --------------------------------------------------------------------------------
 
     def remove_all(self) -> None:
         """Take every name away; memory goes back as soon as its last reader ends."""
         for resident in self.ledger.everything():
             with contextlib.suppress(OSError):
-                self._directory.unlink(self._on_disk(resident))
+                self._directory.unlink(self.name_on_disk(resident))
 
     def close(self) -> None:
         """Hear of nothing any more."""

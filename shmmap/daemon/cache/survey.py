@@ -14,7 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.cache.reclaimer import UNKNOWN_SLOT, Reclaimer
+from shmmap.daemon.cache.holders import UNKNOWN_SLOT, Holders
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import Busy
@@ -72,8 +73,9 @@ class Survey:
         What the last whole walk found.
     """
 
-    def __init__(self, reclaimer: Reclaimer, *, in_service: Callable[[Resident], bool]) -> None:
-        self._reclaimer = reclaimer
+    def __init__(self, ledger: Ledger, holders: Holders, *, in_service: Callable[[Resident], bool]) -> None:
+        self._ledger = ledger
+        self._holders = holders
         self._in_service = in_service
         self._asked: list[tuple[Session, Answer]] = []
         self._running: list[tuple[Session, Answer]] = []
@@ -134,12 +136,12 @@ class Survey:
         for resident in sorted(session.residents(), key=lambda resident: -resident.nbytes):
             if time.thread_time() > end_s:
                 break
-            slots = self._reclaimer.slots_of(resident) if resident.last_use_s < before_s else None
+            slots = self._holders.slots_of(resident) if resident.last_use_s < before_s else None
             if slots is not None and session.slot not in slots:
                 session.drop_segment(resident)
 
     def _begin(self, most: int | None) -> None:
-        self._left = self._reclaimer.ledger.everything()[:most]
+        self._left = self._ledger.everything()[:most]
         self._found = Usage()
         self._asking_s = 0.0
 
@@ -148,7 +150,7 @@ class Survey:
         if self._asking_s > ASKING_S:
             return []
         begin_s = time.thread_time()
-        slots = self._reclaimer.slots_of(resident) or []
+        slots = self._holders.slots_of(resident) or []
         self._asking_s += time.thread_time() - begin_s
         return slots
 
@@ -158,7 +160,7 @@ class Survey:
             if time.thread_time() > end_s:
                 break  # somebody holds very many locks
             resident = self._left.pop()
-            users = self._reclaimer.users_among(resident, self._slots_of(resident))
+            users = self._holders.users_among(resident, self._slots_of(resident))
             if users:
                 found.count += 1
                 found.nbytes += resident.nbytes

@@ -232,5 +232,5 @@ class MapQueries:
             state,
             resident.nbytes,
             resident.points,
-            self._cache.reclaimer.holders_of([resident]),
+            self._cache.holders.of([resident]),
         )

@@ -13,6 +13,7 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import client_row
 from shmmap.daemon.transport.sessions import Sessions
@@ -48,6 +49,7 @@ class Sampler:
         cache: CellCache,
         scheduler: Scheduler,
         statistics: StatisticsWriter,
+        rows: CellRows,
         event_log: EventLog,
         *,
         sessions: Sessions,
@@ -56,6 +58,7 @@ class Sampler:
     ) -> None:
         self._cache = cache
         self._scheduler = scheduler
+        self._rows = rows
         self._statistics = statistics
         self._sessions = sessions
         self._waiting = waiting
@@ -113,11 +116,19 @@ class Sampler:
             self._told_s = now_s
             self._event_log.beat()
 
+    def _show_used(self) -> None:
+        """Bring hits and last use of segments that were handed out up to date."""
+        cache = self._cache
+        for _ in range(min(USED_ROWS_A_BEAT, len(cache.used))):
+            resident = cache.used.pop()
+            if cache.ledger.resident_named(resident.name) is resident:
+                self._rows.show(resident, "resident" if cache.is_current(resident) else "stale")
+
     def _beat(self, now_s: float) -> None:
         self.measure()
         if now_s - self._looked_s >= BEAT_S:
             self._look_around(now_s)
         self._cache.ledger.overhead_bytes = self._statistics.size_bytes
-        self._cache.show_used(USED_ROWS_A_BEAT)
+        self._show_used()
         self._statistics.beat()
         self._on_beat()

@@ -7,7 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from shmmap.daemon.cache.reclaimer import UNKNOWN_SLOT, Reclaimer
+from shmmap.daemon.cache.holders import UNKNOWN_SLOT, Holders
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.survey import LOOKS_AT_ONCE, MOST_ASKED, Survey, Usage
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Peer, Session, Sessions
@@ -23,13 +24,12 @@ def resident(number: int) -> Resident:
 
 
 class Memory:
-    """Segments and who maps them; stands for the reclaimer and its ledger."""
+    """Segments and who maps them; stands for the ledger and the holders."""
 
     def __init__(self, count: int = SEGMENTS) -> None:
         self.segments = [resident(number) for number in range(count)]
         self.users: dict[str, list[int]] = {}
         self.looked = 0
-        self.ledger = self
 
     def everything(self) -> list[Resident]:
         return sorted(self.segments, key=lambda one: -one.nbytes)
@@ -46,7 +46,9 @@ class Memory:
 
 
 def survey_of(memory: Memory, *, superseded: frozenset[str] = frozenset()) -> Survey:
-    return Survey(cast("Reclaimer", memory), in_service=lambda one: one.name not in superseded)
+    return Survey(
+        cast("Ledger", memory), cast("Holders", memory), in_service=lambda one: one.name not in superseded
+    )
 
 
 def session() -> Session:

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Segments as rows of the statistics."""
+
+from __future__ import annotations
+
+from shmmap.daemon.records import Resident
+from shmmap.statistics.cell_rows import CellRow
+from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = ["CellRows"]
+
+
+class CellRows:
+    """Shows segments.
+
+    Parameters
+    ----------
+    id_prefix, segment_prefix
+        What cell ids and segment names are shown without.
+    """
+
+    def __init__(self, statistics: StatisticsWriter, id_prefix: str, segment_prefix: str) -> None:
+        self._statistics = statistics
+        self._id_prefix = id_prefix
+        self._segment_prefix = segment_prefix
+
+    def show(self, resident: Resident, state: str) -> None:
+        """Show a segment as it is now; ``state`` is ``resident``, ``stale`` or ``zombie`` (retired)."""
+        row = CellRow(
+            id=resident.key.cell_id.removeprefix(self._id_prefix),
+            layer=resident.key.layer,
+            version=resident.version,
+            segment=resident.name.removeprefix(self._segment_prefix),
+            state=state,
+            bytes=resident.nbytes,
+            points=resident.points,
+            box=resident.box,
+            hits=resident.hits,
+            last_use_monotonic_ns=int(resident.last_use_s * 1e9),
+            load_ns=resident.load_ns,
+        )
+        self._statistics.cell_changed(resident.name, row)
+
+    def hide(self, name: str) -> None:
+        """There is no segment of this name any more."""
+        self._statistics.cell_removed(name)
