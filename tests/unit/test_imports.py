@@ -52,8 +52,8 @@ PARTS = {
         "formats", "origin", "layers", "segment", "protocol", "client", "statistics", "simulation", "testing",
     },
     "cli": BASE | {
-        "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol", "segment",
-        "service", "statistics", "daemon.config", "daemon.config_file", "daemon.main",
+        "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
+        "segment", "service", "statistics", "daemon.config", "daemon.config_file", "daemon.main",
         "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip

@@ -17,6 +17,7 @@ import errno
 import logging
 import os
 import stat
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -52,6 +53,7 @@ class _Found(NamedTuple):
     why_not: str
 
 
+@dataclass(eq=False, slots=True)
 class Adoption:
     """Takes over what is in the directory under an instance's name.
 
@@ -61,33 +63,23 @@ class Adoption:
         Access that published segments are to have from now on; ``gid`` -1 leaves the group alone.
     """
 
-    def __init__(
-        self,
-        directory: ShmDirectory,
-        instance: str,
-        cache: CellCache,
-        loads: Loads,
-        *,
-        mode: int,
-        gid: int,
-    ) -> None:
-        self._directory = directory
-        self._prefix = segment_prefix(instance)
-        self._not_segments = (statistics_name(instance), self._prefix + "lock")
-        self._cache = cache
-        self._reclaimer = cache.reclaimer
-        self._loads = loads
-        self._mode = mode
-        self._gid = gid
+    directory: ShmDirectory
+    instance: str
+    cache: CellCache
+    loads: Loads
+    mode: int
+    gid: int
 
     def take_over(self, now_s: float) -> TakenOver:
         """Look at every name once."""
         adopted = retired = dropped = 0
-        for name in self._directory.names(self._prefix):
-            if name.startswith(self._not_segments):
+        prefix = segment_prefix(self.instance)
+        not_segments = (statistics_name(self.instance), prefix + "lock")
+        for name in self.directory.names(prefix):
+            if name.startswith(not_segments):
                 continue
             try:
-                fd = self._directory.open(name)
+                fd = self.directory.open(name)
             except OSError as error:
                 self._remove(name, str(error.strerror))
                 dropped += 1
@@ -127,7 +119,7 @@ class Adoption:
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, block: PublishBlock) -> str:
         """Why a whole segment cannot serve; empty if it can."""
-        cache, catalogue = self._cache, self._cache.catalogue
+        cache, catalogue = self.cache, self.cache.catalogue
         if is_zombie(name):
             return "it was retired"
         if status.st_mode & 0o222 or status.st_nlink != 1:
@@ -159,19 +151,19 @@ class Adoption:
     def _adopt(self, fd: int, name: str, found: _Found, now_s: float) -> None:
         step("daemon.adopt")
         assert found.header is not None  # noqa: S101  _look gives a reason where there is none
-        if self._gid >= 0:
-            os.fchown(fd, -1, self._gid)
-        os.fchmod(fd, self._mode)
-        index = self._cache.catalogue.find(found.header.cell_id)
+        if self.gid >= 0:
+            os.fchown(fd, -1, self.gid)
+        os.fchmod(fd, self.mode)
+        index = self.cache.catalogue.find(found.header.cell_id)
         assert index is not None  # noqa: S101
         resident = self._resident(fd, name, found, now_s)
-        self._cache.adopt(resident, index)
-        self._loads.check(resident)
+        self.cache.adopt(resident, index)
+        self.loads.check(resident)
 
     def _keep_for_readers(self, fd: int, name: str, found: _Found, now_s: float) -> bool:
         """Watch it as a retired one if somebody uses it, else remove it; True if it is used."""
         try:
-            used = os.fstat(fd).st_uid == os.geteuid() and self._reclaimer.pins.told(fd)
+            used = os.fstat(fd).st_uid == os.geteuid() and self.cache.reclaimer.pins.told(fd)
         except OSError:  # nothing that has leases
             used = False
         if not used:
@@ -180,12 +172,12 @@ class Adoption:
         if not is_zombie(name):
             hidden = zombie_name(name)
             try:
-                self._directory.rename(name, hidden)
+                self.directory.rename(name, hidden)
             except OSError:  # somebody else has taken that name
                 hidden = zombie_name(another_name(name))
-                self._directory.rename(name, hidden)
+                self.directory.rename(name, hidden)
             name = hidden
-        self._reclaimer.adopt(self._resident(fd, name, found, now_s), now_s)
+        self.cache.reclaimer.adopt(self._resident(fd, name, found, now_s), now_s)
         return True
 
     def _resident(self, fd: int, name: str, found: _Found, now_s: float) -> Resident:
@@ -211,7 +203,7 @@ class Adoption:
 
     def _remove(self, name: str, why: str) -> None:
         try:
-            self._directory.unlink(name)
+            self.directory.unlink(name)
         except OSError as error:
             # sticky directories let only a file's owner remove it; a directory is nobody's segment
             level = logging.INFO if error.errno == errno.EISDIR else logging.WARNING

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.loading.loads import Loads
@@ -23,6 +24,7 @@ START_ATTEMPTS: Final = 3
 """After this many loaders in a row that could not start, loads fail instead of waiting."""
 
 
+@dataclass(eq=False, slots=True)
 class LostWorkers:
     """Replaces workers, and queues again what they had not begun.
 
@@ -34,61 +36,52 @@ class LostWorkers:
         Called with a load, a code, a message, the state of the file it failed for, and the time.
     """
 
-    def __init__(
-        self,
-        pool: WorkerPool,
-        jobs: dict[int, Load],
-        loads: Loads,
-        room: Room,
-        statistics: StatisticsWriter,
-        fail: Callable[[Load, str, str, SourceStamp | None, float], None],
-    ) -> None:
-        self._pool = pool
-        self._jobs = jobs
-        self._loads = loads
-        self._room = room
-        self._statistics = statistics
-        self._fail = fail
+    pool: WorkerPool
+    jobs: dict[int, Load]
+    loads: Loads
+    room: Room
+    statistics: StatisticsWriter
+    fail: Callable[[Load, str, str, SourceStamp | None, float], None]
 
     def ended(self, worker: Worker, now_s: float) -> None:
         """A worker's process ended."""
-        self._statistics.add("worker_crashes")
+        self.statistics.add("worker_crashes")
         if worker.ready:
             self._replace(worker, "load_failed", now_s)
             return
-        self._pool.failed_starts += 1
-        unfinished, how = self._pool.remove(worker)
+        self.pool.failed_starts += 1
+        unfinished, how = self.pool.remove(worker)
         _log.error(logfmt("loader could not start", reason=how))
-        give_up = how == RESTART or self._pool.failed_starts >= START_ATTEMPTS
+        give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
         for job in unfinished:
-            load = self._jobs.pop(job.number, None)
+            load = self.jobs.pop(job.number, None)
             if load is not None and give_up:
-                self._fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
+                self.fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
             elif load is not None:
-                self._loads.requeue(load)
+                self.loads.requeue(load)
 
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load, or whose start, took too long."""
-        for worker in self._pool.overdue(now_s):
+        for worker in self.pool.overdue(now_s):
             if worker.ready:
-                self._statistics.add("loads_timed_out")
+                self.statistics.add("loads_timed_out")
                 self._replace(worker, "load_timeout", now_s)
             else:
                 self.ended(worker, now_s)
 
     def _replace(self, worker: Worker, code: str, now_s: float) -> None:
         """Forget a worker that had begun: the job it worked on fails."""
-        unfinished, how = self._pool.remove(worker)
+        unfinished, how = self.pool.remove(worker)
         died = code == "load_failed"
         why = f"the loader died of it ({how})" if died else "loading took longer than allowed"
         for position, job in enumerate(unfinished):
-            self._room.hungry.pop(job.number, None)
-            load = self._jobs.pop(job.number, None)
+            self.room.hungry.pop(job.number, None)
+            load = self.jobs.pop(job.number, None)
             if position == 0:
                 _log.error(logfmt("loader replaced", path=job.path, reason=why))
                 if load is not None:
                     # where it took too long nobody looks again: the file system may be what hangs
                     known = load.sources[0] if died and load.sources else None
-                    self._fail(load, code, f"{job.path}: {why}", known, now_s)
+                    self.fail(load, code, f"{job.path}: {why}", known, now_s)
             elif load is not None:
-                self._loads.requeue(load)
+                self.loads.requeue(load)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import Outcome
@@ -15,6 +16,7 @@ from shmmap.daemon.records import Load
 __all__ = ["Room"]
 
 
+@dataclass(eq=False, slots=True)
 class Room:
     """Asks the cache for room on behalf of loads.
 
@@ -24,18 +26,17 @@ class Room:
         Per job number, the worker that waits for more room, and how many bytes it needs in all.
     """
 
-    def __init__(self, cache: CellCache, loads: Loads, pool: WorkerPool) -> None:
-        self._cache = cache
-        self._loads = loads
-        self._pool = pool
-        self.hungry: dict[int, tuple[Worker, int]] = {}
+    cache: CellCache
+    loads: Loads
+    pool: WorkerPool
+    hungry: dict[int, tuple[Worker, int]] = field(default_factory=dict)
 
     def refusal(self, load: Load, shortage: int, now_s: float) -> str:
         """Make room for a load; why there is none, or nothing where it is on its way."""
-        ledger = self._cache.ledger
+        ledger = self.cache.ledger
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             return f"the cell needs {load.estimate} bytes, the whole budget is {ledger.budget_bytes}"
-        if self._cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back():
+        if self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back():
             return ""
         return f"{load.estimate} bytes do not fit: the budget of {ledger.budget_bytes} bytes is in use"
 
@@ -45,24 +46,23 @@ class Room:
 
     def feed(self, jobs: Mapping[int, Load], now_s: float) -> None:
         """Grant, hold or refuse the extra bytes that workers asked for; ``jobs`` are loads by job number."""
-        ledger = self._cache.ledger
+        ledger = self.cache.ledger
         for number, (worker, nbytes) in list(self.hungry.items()):
             load = jobs.get(number)
             answer: Grant | Refuse | None = None
-            if load is not None and self._loads.grow(load, nbytes):
+            if load is not None and self.loads.grow(load, nbytes):
                 answer = Grant(number)
             elif load is not None:
                 hopeless = nbytes + ledger.overhead_bytes > ledger.budget_bytes
                 shortage = ledger.shortage(nbytes - load.reserved)
                 if not hopeless and (
-                    self._cache.reclaimer.free(shortage, now_s) is Outcome.PENDING
-                    or self._may_be_given_back()
+                    self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back()
                 ):
                     continue
                 answer = Refuse(number)
             del self.hungry[number]
             if answer is not None:
-                self._pool.answer(worker, answer)
+                self.pool.answer(worker, answer)
 
     def _may_be_given_back(self) -> bool:
         """Whether a load runs that will end by itself: it may need less than is reserved for it.
@@ -70,4 +70,4 @@ class Room:
         Loads that wait for room do not end by themselves, nor do those that come after them in the
         same loader's queue.
         """
-        return any(worker.queue and next(iter(worker.queue)) not in self.hungry for worker in self._pool)
+        return any(worker.queue and next(iter(worker.queue)) not in self.hungry for worker in self.pool)

@@ -33,6 +33,7 @@ class Answer:
     blockers: tuple[Holder, ...] | None = None
 
 
+@dataclass(eq=False, slots=True)
 class CellReplies:
     """Answers with what the cache has and what is being loaded.
 
@@ -42,34 +43,25 @@ class CellReplies:
         Called with a session and an encoded reply.
     """
 
-    def __init__(
-        self,
-        cache: CellCache,
-        scheduler: Scheduler,
-        statistics: StatisticsWriter,
-        *,
-        epoch: int,
-        send: Callable[[Session, bytes], None],
-    ) -> None:
-        self._cache = cache
-        self._scheduler = scheduler
-        self._statistics = statistics
-        self._epoch = epoch
-        self._send = send
+    cache: CellCache
+    scheduler: Scheduler
+    statistics: StatisticsWriter
+    epoch: int
+    send: Callable[[Session, bytes], None]
 
     def answer(self, wanted: PendingRequest, now_s: float) -> None:
         """Send what there is by now of everything that is wanted."""
-        warm = self._cache.warm.layers
+        warm = self.cache.warm.layers
         answer = Answer()
         if wanted.area is not None and wanted.area.z is not None:
-            inside = set(self._cache.at_height([index for index, _ in wanted.cells], wanted.area.z))
+            inside = set(self.cache.at_height([index for index, _ in wanted.cells], wanted.area.z))
             wanted.cells = [cell for cell in wanted.cells if cell[0] in inside]
         for cell_id, layer in wanted.unknown:
             answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
         for index, layer in wanted.cells:
             resident = warm[layer].get(index) if layer in warm else None
             if resident is None:  # evicted since the request came, perhaps, and still whole
-                resident = self._cache.find_warm(index, layer, now_s)
+                resident = self.cache.find_warm(index, layer, now_s)
             if resident is not None and not wanted.refused:
                 answer.handles.append(resident.handle)
                 answer.residents.append(resident)
@@ -78,7 +70,7 @@ class CellReplies:
         self.reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
         self.hand_out(wanted.session, answer, now_s)
         if wanted.deadline_s:
-            self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
+            self.statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
 
     def reply(
         self,
@@ -91,15 +83,15 @@ class CellReplies:
         """Send a reply; the ledger follow in `hand_out`, when it is on its way."""
         reply = encode_cells(
             request,
-            self._epoch,
-            self._cache.catalogue.map_version,
+            self.epoch,
+            self.cache.catalogue.map_version,
             answer.handles,
             removed,
             removed_packed,
             answer.pending,
             answer.failed,
         )
-        self._send(session, reply)
+        self.send(session, reply)
 
     def hand_out(self, session: Session, answer: Answer, now_s: float) -> None:
         """Note who has been given what."""
@@ -107,14 +99,14 @@ class CellReplies:
             resident.last_use_s = now_s
             resident.hits += 1
         session.hold(answer.residents)
-        self._cache.used.update(answer.residents)
-        self._statistics.add("handles_sent", len(answer.handles))
+        self.cache.used.update(answer.residents)
+        self.statistics.add("handles_sent", len(answer.handles))
 
     def _answer_cold(
         self, wanted: PendingRequest, index: int, layer: str, answer: Answer, now_s: float
     ) -> None:
         """Answer for one cell that is not simply warm."""
-        cache, loads = self._cache, self._scheduler.loads
+        cache, loads = self.cache, self.scheduler.loads
         key = Key(cache.catalogue.id(index), layer)
         wire_id = cache.wire_id(key.cell_id)
         failure, promised = loads.failures.get(key), loads.is_promised(key)
@@ -137,5 +129,5 @@ class CellReplies:
             answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders))
         elif not current:
             if not promised:  # evicted, or no longer out of room: "pending" promises a load
-                self._scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
+                self.scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
             answer.pending.append(PendingCell(wire_id, layer))

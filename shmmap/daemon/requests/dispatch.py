@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import dataclass
 from typing import Final
 
 import zmq
@@ -32,30 +33,19 @@ WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 """A longer request that is refused unread is dropped: finding its number takes too long."""
 
 
+@dataclass(eq=False, slots=True)
 class Dispatch:
     """Hands each request to what answers it; a defect met by one request does not end the others'."""
 
-    def __init__(
-        self,
-        sessions: Sessions,
-        handshake: Handshake,
-        cells: CellRequests,
-        queries: MapQueries,
-        operators: OperatorRequests,
-        authorization: Authorization,
-        survey: Survey,
-        sampler: Sampler,
-        outbox: Outbox,
-    ) -> None:
-        self._sessions = sessions
-        self._handshake = handshake
-        self._cells = cells
-        self._queries = queries
-        self._operators = operators
-        self._authorization = authorization
-        self._survey = survey
-        self._sampler = sampler
-        self._outbox = outbox
+    sessions: Sessions
+    handshake: Handshake
+    cells: CellRequests
+    queries: MapQueries
+    operators: OperatorRequests
+    authorization: Authorization
+    survey: Survey
+    sampler: Sampler
+    outbox: Outbox
 
     def handle(self, heard: Heard) -> None:
         """Answer one request, or say why not."""
@@ -68,25 +58,25 @@ class Dispatch:
             request = message.request
             self._route(heard.identity, heard.frame, message)
         except ShmmapError as error:
-            self._outbox.refuse(heard.identity, request or request_number(data), error)
+            self.outbox.refuse(heard.identity, request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
             _log.exception("a request could not be handled; this is a defect in shmmap")
-            self._outbox.refuse(heard.identity, request, InternalError("the daemon failed on this request"))
+            self.outbox.refuse(heard.identity, request, InternalError("the daemon failed on this request"))
 
     def refuse_unread(self, heard: Heard) -> None:
         """A process has too many requests waiting to have this one served, ever."""
         data = heard.frame.buffer
         if len(data) <= WORTH_AN_ANSWER_BYTES:
             error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
-            self._outbox.refuse(heard.identity, request_number(data), error)
+            self.outbox.refuse(heard.identity, request_number(data), error)
 
     def _route(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
-            entered = self._handshake.enter(identity, frame, message, now_s)
-            self._outbox.send(entered, encode(self._queries.welcome(entered, message)))
+            entered = self.handshake.enter(identity, frame, message, now_s)
+            self.outbox.send(entered, encode(self.queries.welcome(entered, message)))
             return
-        session = self._sessions.by_identity.get(identity)
+        session = self.sessions.by_identity.get(identity)
         if session is None:
             raise NoSession("this daemon does not know the session", hint="send hello first")
         session.requests += 1
@@ -95,25 +85,25 @@ class Dispatch:
             if message.intent is not None:
                 session.intent, session.says_where = bounded_intent(message.intent), True
             if isinstance(message, messages.Differential):
-                self._cells.differential(session, message, now_s)
+                self.cells.differential(session, message, now_s)
             elif isinstance(message, messages.Area):
-                self._cells.area(session, message, now_s)
+                self.cells.area(session, message, now_s)
             else:
-                self._cells.selected(session, message, now_s)
+                self.cells.selected(session, message, now_s)
         elif isinstance(message, messages.Release):
             versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
-            self._cells.let_go(session.drop(versions))
-            self._outbox.send(session, encode(messages.Released(message.request)))
+            self.cells.let_go(session.drop(versions))
+            self.outbox.send(session, encode(messages.Released(message.request)))
         elif isinstance(message, messages.Bye):
-            self._handshake.leave(session)
+            self.handshake.leave(session)
         elif isinstance(message, OPERATOR_REQUESTS):
-            self._authorization.require(peer_of(frame), now_s)
-            self._operators.handle(session, message, now_s)
+            self.authorization.require(peer_of(frame), now_s)
+            self.operators.handle(session, message, now_s)
         elif isinstance(message, messages.Stats):
-            self._survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
+            self.survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
         else:
-            self._outbox.send(session, encode(self._queries.answer(message)))
+            self.outbox.send(session, encode(self.queries.answer(message)))
 
     def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
-        self._sampler.measure()
-        self._outbox.send(session, encode(self._queries.stats(message, usage, time.monotonic())))
+        self.sampler.measure()
+        self.outbox.send(session, encode(self.queries.stats(message, usage, time.monotonic())))

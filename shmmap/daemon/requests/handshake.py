@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import zmq
@@ -23,6 +24,7 @@ __all__ = ["Handshake"]
 _SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 
 
+@dataclass(eq=False, slots=True)
 class Handshake:
     """Opens and ends sessions.
 
@@ -32,21 +34,12 @@ class Handshake:
         Told of a session that has ended.
     """
 
-    def __init__(
-        self,
-        sessions: Sessions,
-        cells: CellRequests,
-        statistics: StatisticsWriter,
-        event_log: EventLog,
-        operators: OperatorRequests,
-        watched: WatchedDescriptors,
-    ) -> None:
-        self._sessions = sessions
-        self._cells = cells
-        self._statistics = statistics
-        self._event_log = event_log
-        self._operators = operators
-        self._watched = watched
+    sessions: Sessions
+    cells: CellRequests
+    statistics: StatisticsWriter
+    event_log: EventLog
+    operators: OperatorRequests
+    watched: WatchedDescriptors
 
     def enter(self, identity: bytes, frame: zmq.Frame, message: Hello, now_s: float) -> Session:
         """Return the session of who says hello.
@@ -65,36 +58,36 @@ class Handshake:
                 hint="update the older of the two",
             )
         peer = peer_of(frame)
-        old = self._sessions.by_identity.get(identity)
+        old = self.sessions.by_identity.get(identity)
         if old is not None:
             if old.peer == peer:
                 return old  # a repeated hello: its answer was late or lost
             self.leave(old)
-        spare = self._sessions.spare() if self._sessions.full else None
+        spare = self.sessions.spare() if self.sessions.full else None
         if spare is not None:
             self.leave(spare)
-        if self._sessions.full:
+        if self.sessions.full:
             raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
-        session = self._sessions.open(identity, peer, message.client, now_s, slot=message.session)
+        session = self.sessions.open(identity, peer, message.client, now_s, slot=message.session)
         session.fd = _descriptor(frame)
-        self._statistics.add("sessions_opened")
-        self._event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
+        self.statistics.add("sessions_opened")
+        self.event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
         if session.pidfd >= 0:
-            self._watched.watch(session.pidfd, lambda: self.leave(session))
+            self.watched.watch(session.pidfd, lambda: self.leave(session))
         return session
 
     def leave(self, session: Session) -> None:
         """A client's process ended, or it said goodbye: what it held may be free now."""
         held = session.residents()
-        self._event_log.publish(
+        self.event_log.publish(
             events.Left, session.slot, session.peer.pid, session.client, session.held_bytes
         )
-        self._cells.forget(session)
+        self.cells.forget(session)
         if session.pidfd >= 0:
-            self._watched.unwatch(session.pidfd)
-        self._sessions.close(session)
-        self._cells.let_go(held)
-        self._operators.left(session)
+            self.watched.unwatch(session.pidfd)
+        self.sessions.close(session)
+        self.cells.let_go(held)
+        self.operators.left(session)
 
 
 def _descriptor(frame: zmq.Frame) -> int:

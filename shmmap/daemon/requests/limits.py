@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from typing import Final
 
@@ -135,6 +136,7 @@ def bounded_intent(intent: messages.Intent) -> messages.Intent:
     return intent
 
 
+@dataclass(eq=False, slots=True)
 class SessionQuota:
     """Refuses what would exceed it, cell by cell.
 
@@ -146,21 +148,18 @@ class SessionQuota:
         The serving loop's clock, seconds.
     """
 
-    def __init__(
-        self, nbytes: int, cache: CellCache, statistics: StatisticsWriter, clock: Callable[[], float]
-    ) -> None:
-        self._nbytes = nbytes
-        self._cache = cache
-        self._statistics = statistics
-        self._now_s = clock
+    nbytes: int
+    cache: CellCache
+    statistics: StatisticsWriter
+    clock: Callable[[], float]
 
     def is_out_of_reach(self, session: Session) -> bool:
         """Whether the session could have everything that is in memory."""
-        return session.held_bytes + self._cache.ledger.resident_bytes <= self._nbytes
+        return session.held_bytes + self.cache.ledger.resident_bytes <= self.nbytes
 
     def check(self, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> None:
         """Note in ``wanted.refused`` what is too much, farthest cells first; ``cold`` is not in memory."""
-        session, cache, warm = wanted.session, self._cache, self._cache.warm.layers
+        session, cache, warm = wanted.session, self.cache, self.cache.warm.layers
         if self.is_out_of_reach(session) and not cold:
             return
         chilled = set(cold)
@@ -168,10 +167,10 @@ class SessionQuota:
             cache.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes
             for index, layer in wanted.cells
         ]
-        if session.held_bytes + sum(sizes) <= self._nbytes:
+        if session.held_bytes + sum(sizes) <= self.nbytes:
             return
-        cache.survey.drop_unused(session, self._now_s() - HAND_OUT_GRACE_S)
-        left = self._nbytes - session.exclusive_bytes()
+        cache.survey.drop_unused(session, self.clock() - HAND_OUT_GRACE_S)
+        left = self.nbytes - session.exclusive_bytes()
         # a new version takes the place of the old one that its holder is about to drop
         replaced = {r.key: r.nbytes for r in session.residents() if not cache.is_current(r)}
         boxes = cache.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
@@ -187,9 +186,7 @@ class SessionQuota:
                 continue  # somebody keeps it anyway, perhaps this session itself
             left -= sizes[position] - replaced.get(key, 0)
             if left < 0:
-                message = (
-                    f"this client would keep more than {self._nbytes} bytes (its quota) for itself alone"
-                )
+                message = f"this client would keep more than {self.nbytes} bytes (its quota) for itself alone"
                 wanted.refused[key] = ("over_budget", message)
-                self._statistics.add("refused_quota")
-                cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self._now_s())
+                self.statistics.add("refused_quota")
+                cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self.clock())

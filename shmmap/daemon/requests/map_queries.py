@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from shmmap import __version__
@@ -30,6 +31,7 @@ PAGE_ROWS: Final = 500
 """Longest metadata page: making one takes the serving loop about a millisecond."""
 
 
+@dataclass(eq=False, slots=True)
 class MapQueries:
     """Answers from the catalogue and from what is in memory.
 
@@ -41,35 +43,20 @@ class MapQueries:
         Where events are published; empty: nowhere.
     """
 
-    def __init__(
-        self,
-        config: DaemonConfig,
-        cache: CellCache,
-        sessions: Sessions,
-        statistics: StatisticsWriter,
-        pins: OperatorPins,
-        map_switch: MapSwitch,
-        loads: Loads,
-        *,
-        epoch: int,
-        event_log: EventLog,
-        events_path: str = "",
-    ) -> None:
-        self._config = config
-        self._cache = cache
-        self._sessions = sessions
-        self._statistics = statistics
-        self._pins = pins
-        self._map_switch = map_switch
-        self._loads = loads
-        self._epoch = epoch
-        self._event_log = event_log
-        self._events_path = events_path
-        self._kinds = tuple(kind.describe() for kind in kinds())
+    config: DaemonConfig
+    cache: CellCache
+    sessions: Sessions
+    statistics: StatisticsWriter
+    pins: OperatorPins
+    map_switch: MapSwitch
+    loads: Loads
+    epoch: int
+    event_log: EventLog
+    events_path: str = ""
 
     @property
     def _catalogue(self) -> CatalogueView:
-        return self._cache.catalogue
+        return self.cache.catalogue
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
         """Tell a new client where everything is."""
@@ -79,21 +66,21 @@ class MapQueries:
             major=messages.PROTOCOL_VERSION[0],
             minor=messages.PROTOCOL_VERSION[1],
             daemon=__version__,
-            instance=self._config.instance,
-            epoch=self._epoch,
+            instance=self.config.instance,
+            epoch=self.epoch,
             session=session.slot,
             map_version=catalogue.map_version,
-            map_path=self._config.map_path,
+            map_path=self.config.map_path,
             frame_id=catalogue.frame_id,
-            shm_dir=self._config.shm_dir,
-            id_prefix=self._cache.id_prefix,
-            segment_prefix=self._cache.segment_prefix,
+            shm_dir=self.config.shm_dir,
+            id_prefix=self.cache.id_prefix,
+            segment_prefix=self.cache.segment_prefix,
             cells=len(catalogue),
             bounds=catalogue.bounds,
-            layers=self._kinds,
-            budget_bytes=self._cache.ledger.budget_bytes,
+            layers=tuple(kind.describe() for kind in kinds()),
+            budget_bytes=self.cache.ledger.budget_bytes,
             pid=os.getpid(),
-            events=self._events_path,
+            events=self.events_path,
         )
 
     def answer(self, message: messages.Request) -> messages.Reply:
@@ -101,13 +88,13 @@ class MapQueries:
         if isinstance(message, messages.Metadata):
             return self._metadata(message)
         if isinstance(message, Recent):
-            return self._event_log.page(message)
+            return self.event_log.page(message)
         if isinstance(message, messages.Show):
             return self._show(message)
         raise BadRequest(f"a {type(message).__name__} cannot be answered here")
 
     def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
-        cache, catalogue = self._cache, self._catalogue
+        cache, catalogue = self.cache, self._catalogue
         indices: Sequence[int]
         indices = (
             range(len(catalogue))
@@ -117,7 +104,7 @@ class MapQueries:
         removed: tuple[str, ...] = ()
         known = True
         if message.since is not None:
-            change = self._map_switch.changes_since(message.since)
+            change = self.map_switch.changes_since(message.since)
             known = change is not None
             if change is not None:
                 touched = {i for cell in change[0] if (i := cache.index_of(cell)) is not None}
@@ -127,7 +114,7 @@ class MapQueries:
         end = start + max(1, min(message.limit, PAGE_ROWS))
         return messages.MetadataPage(
             request=message.request,
-            epoch=self._epoch,
+            epoch=self.epoch,
             map_version=catalogue.map_version,
             rows=tuple(self._row(index) for index in indices[start:end]),
             next=end if end < len(indices) else None,
@@ -137,9 +124,9 @@ class MapQueries:
 
     def _row(self, index: int) -> messages.MetadataRow:
         catalogue = self._catalogue
-        heights = self._cache.heights.get(index, (None, None))
+        heights = self.cache.heights.get(index, (None, None))
         return messages.MetadataRow(
-            self._cache.wire_id(catalogue.id(index)),
+            self.cache.wire_id(catalogue.id(index)),
             catalogue.version(index),
             *catalogue.box(index),
             catalogue.stamp(index).size,
@@ -150,12 +137,12 @@ class MapQueries:
         """Answer a request for statistics with what a survey found."""
         return messages.StatsReply(
             request=message.request,
-            epoch=self._epoch,
+            epoch=self.epoch,
             map_version=self._catalogue.map_version,
-            counters=dict(self._statistics.values),
+            counters=dict(self.statistics.values),
             sessions=tuple(
                 self._session_row(session, usage.shares.get(session.slot, Share()), now_s)
-                for session in self._sessions
+                for session in self.sessions
             ),
             unknown_holders=usage.unknown,
             unknown_bytes=usage.unknown_bytes,
@@ -181,13 +168,13 @@ class MapQueries:
         )
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
-        cache = self._cache
+        cache = self.cache
         index = cache.index_of(message.id)
         if index is None:
             return self._show_gone(message)
         cell_id = cache.catalogue.id(index)
         version = cache.catalogue.version(index)
-        failures = [failure for key, failure in self._loads.failures.items() if key.cell_id == cell_id]
+        failures = [failure for key, failure in self.loads.failures.items() if key.cell_id == cell_id]
         shown = []
         for resident in cache.ledger.everything():
             if resident.key.cell_id == cell_id:
@@ -205,17 +192,17 @@ class MapQueries:
             *cache.catalogue.box(index),
             cache.catalogue.stamp(index).size,
             tuple(shown),
-            tuple(key.layer for key in self._loads.by_key if key.cell_id == cell_id),
+            tuple(key.layer for key in self.loads.by_key if key.cell_id == cell_id),
             "; ".join(f"{failure.code}: {failure.message}" for failure in failures),
             z_min=z_min,
             z_max=z_max,
-            pinned=self._pins.layers_of(cell_id),
+            pinned=self.pins.layers_of(cell_id),
         )
 
     def _show_gone(self, message: messages.Show) -> messages.ShownCell:
         """A cell that left the map while somebody maps it: version 0."""
-        everything = self._cache.ledger.everything()
-        names = (message.id, self._cache.id_prefix + message.id)
+        everything = self.cache.ledger.everything()
+        names = (message.id, self.cache.id_prefix + message.id)
         left = [resident for resident in everything if resident.key.cell_id in names and message.id]
         if not left:
             raise UnknownCell(
@@ -232,5 +219,5 @@ class MapQueries:
             state,
             resident.nbytes,
             resident.points,
-            self._cache.holders.of([resident]),
+            self.cache.holders.of([resident]),
         )

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from shmmap.daemon.records import Resident
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.writer import StatisticsWriter
@@ -10,6 +12,7 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["CellRows"]
 
 
+@dataclass(eq=False, slots=True)
 class CellRows:
     """Shows segments.
 
@@ -19,18 +22,17 @@ class CellRows:
         What cell ids and segment names are shown without.
     """
 
-    def __init__(self, statistics: StatisticsWriter, id_prefix: str, segment_prefix: str) -> None:
-        self._statistics = statistics
-        self._id_prefix = id_prefix
-        self._segment_prefix = segment_prefix
+    statistics: StatisticsWriter
+    id_prefix: str
+    segment_prefix: str
 
     def show(self, resident: Resident, state: str) -> None:
         """Show a segment as it is now; ``state`` is ``resident``, ``stale`` or ``zombie`` (retired)."""
         row = CellRow(
-            id=resident.key.cell_id.removeprefix(self._id_prefix),
+            id=resident.key.cell_id.removeprefix(self.id_prefix),
             layer=resident.key.layer,
             version=resident.version,
-            segment=resident.name.removeprefix(self._segment_prefix),
+            segment=resident.name.removeprefix(self.segment_prefix),
             state=state,
             bytes=resident.nbytes,
             points=resident.points,
@@ -39,8 +41,8 @@ class CellRows:
             last_use_monotonic_ns=int(resident.last_use_s * 1e9),
             load_ns=resident.load_ns,
         )
-        self._statistics.cell_changed(resident.name, row)
+        self.statistics.cell_changed(resident.name, row)
 
     def hide(self, name: str) -> None:
         """There is no segment of this name any more."""
-        self._statistics.cell_removed(name)
+        self.statistics.cell_removed(name)

@@ -7,6 +7,7 @@ It beats from the serving loop itself, so that whoever is hung does not beat.
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
 
@@ -31,6 +32,7 @@ USED_ROWS_A_BEAT: Final = 64
 """Rows of the statistics whose hits are brought up to date at a beat: about half a millisecond."""
 
 
+@dataclass(eq=False, slots=True)
 class Sampler:
     """Measures and beats.
 
@@ -44,34 +46,25 @@ class Sampler:
         Called after each beat.
     """
 
-    def __init__(
-        self,
-        cache: CellCache,
-        scheduler: Scheduler,
-        statistics: StatisticsWriter,
-        rows: CellRows,
-        event_log: EventLog,
-        *,
-        sessions: Sessions,
-        waiting: Sized,
-        on_beat: Callable[[], None],
-    ) -> None:
-        self._cache = cache
-        self._scheduler = scheduler
-        self._rows = rows
-        self._statistics = statistics
-        self._sessions = sessions
-        self._waiting = waiting
-        self._on_beat = on_beat
-        self._event_log = event_log
-        self._recent = RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
-        self._looked_s = self._told_s = float("-inf")
-        self._last_s = 0.0
-        self.next_s = 0.0
+    cache: CellCache
+    scheduler: Scheduler
+    statistics: StatisticsWriter
+    rows: CellRows
+    event_log: EventLog
+    sessions: Sessions
+    waiting: Sized
+    on_beat: Callable[[], None]
+    next_s: float = 0.0
+    _recent: RecentCounts = field(
+        init=False, default_factory=lambda: RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
+    )
+    _looked_s: float = float("-inf")
+    _told_s: float = float("-inf")
+    _last_s: float = 0.0
 
     def turn(self, now_s: float) -> None:
         """Beat if it is time to, soon after cells came, went or changed."""
-        if self._statistics.outdated:
+        if self.statistics.outdated:
             # whoever asks right after a change sees it, yet a stream of changes costs little
             self.next_s = min(self.next_s, self._last_s + CHANGE_BEAT_S)
         if now_s >= self.next_s:
@@ -80,55 +73,55 @@ class Sampler:
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
-        ledger, set_value = self._cache.ledger, self._statistics.set
-        set_value("sessions", len(self._sessions))
-        set_value("waiting_requests", len(self._waiting))
-        set_value("workers", len(self._scheduler.pool))
-        set_value("load_queue", len(self._scheduler.loads))
+        ledger, set_value = self.cache.ledger, self.statistics.set
+        set_value("sessions", len(self.sessions))
+        set_value("waiting_requests", len(self.waiting))
+        set_value("workers", len(self.scheduler.pool))
+        set_value("load_queue", len(self.scheduler.loads))
         set_value("cells_resident", ledger.resident_count)
-        set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(self._cache.warm))
+        set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(self.cache.warm))
         set_value("bytes_resident", ledger.resident_bytes)
         set_value("zombies", len(ledger.retired))
         set_value("bytes_zombie", ledger.retired_bytes)
-        set_value("bytes_pinned", self._cache.survey.usage.nbytes)
-        set_value("segments_pinned", self._cache.survey.usage.count)
+        set_value("bytes_pinned", self.cache.survey.usage.nbytes)
+        set_value("segments_pinned", self.cache.survey.usage.count)
         set_value("bytes_reserved", ledger.reserved_bytes)
-        set_value("bytes_statistics", self._statistics.size_bytes)
+        set_value("bytes_statistics", self.statistics.size_bytes)
         set_value("budget_bytes", ledger.budget_bytes)
-        set_value("evictions", self._cache.reclaimer.evicted_count)
-        set_value("map_cells", len(self._cache.catalogue))
-        set_value("events_published", self._event_log.last)
+        set_value("evictions", self.cache.reclaimer.evicted_count)
+        set_value("map_cells", len(self.cache.catalogue))
+        set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
         """What takes longer, and need not be done at each of many beats while cells load."""
         self._looked_s = now_s
-        if self._cache.survey.idle:  # else the serving loop is at it
-            self._cache.survey.step()
-        values = self._statistics.values
+        if self.cache.survey.idle:  # else the serving loop is at it
+            self.cache.survey.step()
+        values = self.statistics.values
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
-        clients = islice(self._sessions, MAX_CLIENTS)
-        self._statistics.show_clients([client_row(session) for session in clients])
-        self._cache.events.pressure.turn(now_s)
+        clients = islice(self.sessions, MAX_CLIENTS)
+        self.statistics.show_clients([client_row(session) for session in clients])
+        self.cache.events.pressure.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
-            self._event_log.beat()
+            self.event_log.beat()
 
     def _show_used(self) -> None:
         """Bring hits and last use of segments that were handed out up to date."""
-        cache = self._cache
+        cache = self.cache
         for _ in range(min(USED_ROWS_A_BEAT, len(cache.used))):
             resident = cache.used.pop()
             if cache.ledger.resident_named(resident.name) is resident:
-                self._rows.show(resident, "resident" if cache.is_current(resident) else "stale")
+                self.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
 
     def _beat(self, now_s: float) -> None:
         self.measure()
         if now_s - self._looked_s >= BEAT_S:
             self._look_around(now_s)
-        self._cache.ledger.overhead_bytes = self._statistics.size_bytes
+        self.cache.ledger.overhead_bytes = self.statistics.size_bytes
         self._show_used()
-        self._statistics.beat()
-        self._on_beat()
+        self.statistics.beat()
+        self.on_beat()

@@ -187,7 +187,7 @@ def test_eviction(whole: Callable[..., WholeDaemon], tmp_path: Path) -> None:
             one.turn_until(lambda: one.answered() or one.memory.cache.ledger.retired)
         with sweeping.walking():
             one.turn_until(one.answered)
-        reply = decode_reply(one._client.recv())
+        reply: Any = decode_reply(one._client.recv())
         held += [row.id for row in reply.cells]
         one.ask(m.Release(100 + number))
     assert one.memory.cache.reclaimer.evicted_count > 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -36,6 +37,7 @@ FAREWELL_S: Final = 1.0
 connection ends (ZMQ_IMMEDIATE)."""
 
 
+@dataclass(eq=False, slots=True)
 class OperatorRequests:
     """Does what an operator asks; whether one may ask was found out before.
 
@@ -45,33 +47,26 @@ class OperatorRequests:
         When the daemon stops; infinity if nobody asked for that.
     """
 
-    def __init__(
-        self,
-        cache: CellCache,
-        pins: OperatorPins,
-        reloader: Reloader,
-        outbox: Outbox,
-    ) -> None:
-        self._cache = cache
-        self._pins = pins
-        self._reloader = reloader
-        self._outbox = outbox
-        self._asked_to_stop: Session | None = None
-        self.stop_by_s = math.inf
+    cache: CellCache
+    pins: OperatorPins
+    reloader: Reloader
+    outbox: Outbox
+    stop_by_s: float = math.inf
+    _asked_to_stop: Session | None = None
 
     def handle(self, session: Session, message: messages.Request, now_s: float) -> None:
         """Carry out one request and answer it, a reload when it is over."""
         if isinstance(message, messages.Reload):
             self._reload(session, message)
         elif isinstance(message, messages.Evict):
-            self._outbox.send(session, encode(self._evict(message, now_s)))
+            self.outbox.send(session, encode(self._evict(message, now_s)))
         elif isinstance(message, messages.Pin):
-            self._outbox.send(session, encode(self._pins.pin(message, now_s)))
+            self.outbox.send(session, encode(self.pins.pin(message, now_s)))
         elif isinstance(message, messages.Unpin):
-            self._outbox.send(session, encode(self._pins.unpin(message)))
+            self.outbox.send(session, encode(self.pins.unpin(message)))
         elif isinstance(message, messages.Shutdown):
             _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
-            self._outbox.send(session, encode(messages.Stopping(message.request)))
+            self.outbox.send(session, encode(messages.Stopping(message.request)))
             self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
     def left(self, session: Session) -> None:
@@ -80,11 +75,11 @@ class OperatorRequests:
             self.stop_by_s = -math.inf
 
     def _reload(self, session: Session, message: messages.Reload) -> None:
-        before = self._cache.catalogue
+        before = self.cache.catalogue
 
         def answer(result: Catalogue | ShmmapError) -> None:
             if isinstance(result, ShmmapError):
-                self._outbox.refuse(session.identity, message.request, result)
+                self.outbox.refuse(session.identity, message.request, result)
                 return
             change = compare(before, result)
             reloaded = messages.Reloaded(
@@ -95,12 +90,12 @@ class OperatorRequests:
                 len(change.removed),
                 result.problems,
             )
-            self._outbox.send(session, encode(reloaded))
+            self.outbox.send(session, encode(reloaded))
 
-        self._reloader.ask(answer)
+        self.reloader.ask(answer)
 
     def _evict(self, message: messages.Evict, now_s: float) -> messages.Evicted:
-        cache = self._cache
+        cache = self.cache
         unknown: list[str] = []
         chosen: list[Resident] = []
         if message.ids is None:
@@ -114,7 +109,7 @@ class OperatorRequests:
                 else:
                     asked.add(cache.catalogue.id(index))
             chosen = [r for r in cache.ledger.residents() if r.key.cell_id in asked]
-        loose = [resident for resident in chosen if resident.key not in self._pins]
+        loose = [resident for resident in chosen if resident.key not in self.pins]
         freed = sum(cache.evict(resident, now_s) for resident in loose)
         kept = len(chosen) - len(loose)
         return messages.Evicted(message.request, freed, len(loose) - freed, tuple(unknown), kept)

@@ -36,6 +36,7 @@ def taken(one: InnerDaemon, name: str) -> Iterator[None]:
 
 def shown(one: InnerDaemon) -> dict[str, str]:
     """Segments and their states as the statistics tell."""
+    one.cache.tell_all()
     one.statistics.beat()
     return {cell.segment: cell.state for cell in read_statistics("inner", one.shm_dir).cells}
 
