@@ -43,6 +43,7 @@ from shmmap.daemon.transport.outbox import SEND_QUEUE, Outbox
 from shmmap.daemon.transport.socket_file import bind_socket, remove_socket
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
@@ -159,9 +160,11 @@ class Service:
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
                 _log.info(
-                    "ready endpoint=%s instance=%s map=%s cells=%d budget_bytes=%d after_s=%.2f",
-                    self._socket_path, self._config.instance, self._config.map_path, cells,
-                    memory.cache.ledger.budget_bytes, time.monotonic() - started_s,
+                    logfmt(
+                        "ready", endpoint=self._socket_path, instance=self._config.instance,
+                        map=self._config.map_path, cells=cells, budget_bytes=memory.cache.ledger.budget_bytes,
+                        after_s=time.monotonic() - started_s,
+                    )
                 )  # fmt: skip
                 self._manager.ready(f"serving {cells} cells")
                 _settle_memory()
@@ -250,9 +253,7 @@ class Service:
                 self._reload()
             elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._loop.stopping:
                 keep = self._signals.keep = number == KEEP_SIGNAL
-                _log.info(
-                    "stopping on %s%s", number.name, ", the segments stay for the next start" if keep else ""
-                )
+                _log.info(logfmt("stopping", signal=number.name, segments="kept" if keep else "removed"))
                 if not keep:
                     for again in STOP_SIGNALS:
                         signal.signal(again, self._quick_exit)

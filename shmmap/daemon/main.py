@@ -24,10 +24,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import os
 import time
 from functools import partial
 from pathlib import Path
 
+from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.instance_lock import InstanceLock
@@ -47,6 +49,7 @@ from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import ConfigError
 from shmmap.failpoints import step
+from shmmap.logfmt import logfmt
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
@@ -72,6 +75,11 @@ def run(config: DaemonConfig) -> int:
     set_up_logging()
     if not config.map_path:
         raise ConfigError("no map is named", key="map_path", hint="give `shmmap serve MAP`, or set map_path")
+    _log.info(
+        logfmt(
+            "starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid()
+        )
+    )
     prepare_process()
     raise_descriptor_limit()
     activated = take_activated_socket()
@@ -109,7 +117,7 @@ def run(config: DaemonConfig) -> int:
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
-            _log.warning("%s", problem)
+            _log.warning(logfmt("map problem", text=problem))
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
             stack.callback(lambda: memory.close(keep=signals.keep))

@@ -13,6 +13,7 @@ from shmmap.daemon.host.groups import group_id
 from shmmap.daemon.pins.probe import Rung, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.errors import ConfigError
+from shmmap.logfmt import logfmt
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["access_of_segments", "choose_pins", "make_runtime_dir", "raise_descriptor_limit"]
@@ -51,15 +52,9 @@ def choose_pins(directory: ShmDirectory) -> PinWatch:
     """Find out how well this machine tells who uses a segment, and say so."""
     support = probe_pins(directory)
     if support.rung is not Rung.LEASES:
-        _log.warning(
-            "%s grants no leases: who uses a segment is known from %s only",
-            directory.path,
-            support.rung.value,
-        )
-    _log.info(
-        "pins: leases=%d locks=%d close_events=%d process_ends=%d, taken: %s",
-        support.leases, support.locks, support.close_events, support.process_ends, support.rung.value,
-    )  # fmt: skip
+        _log.warning(logfmt("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor"))
+    source = support.rung.value
+    _log.info(logfmt("segments in use are known from", source=source, **support._asdict()))
     return PinWatch(
         directory, support.rung, events=support.close_events and support.rung is not Rung.SESSIONS
     )

@@ -27,6 +27,7 @@ from shmmap.geometry import ZRange
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import PublishBlock
@@ -222,7 +223,7 @@ class CellCache:
         """Take an adopted segment that is not what it should be out of service, if it still is in it."""
         if self.ledger.resident_named(resident.name) is resident:
             self._statistics.add("adoptions_failed")
-            _log.warning("%s of an earlier daemon is not used: %s", resident.name, why)
+            _log.warning(logfmt("segment of an earlier daemon not used", segment=resident.name, reason=why))
             self.reclaimer.retire(resident, now_s, "damaged")
 
     def enter(self, resident: Resident, index: int) -> None:
@@ -304,7 +305,8 @@ class CellCache:
         names = self.names.gone()
         residents = self.ledger.residents() if names is None else map(self.ledger.resident_named, names)
         for resident in [r for r in residents if r is not None and not self._directory.exists(r.name)]:
-            _log.warning("%s of %s was removed by somebody else", resident.name, resident.key.cell_id)
+            cell = resident.key.cell_id
+            _log.warning(logfmt("segment removed by somebody else", segment=resident.name, cell=cell))
             self.reclaimer.retire(resident, now_s, "damaged")
 
     def close(self, *, keep: bool = False) -> None:

@@ -21,6 +21,7 @@ from shmmap.daemon.pins.probe import Rung
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
+from shmmap.logfmt import logfmt
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, zombie_name
 
@@ -133,7 +134,7 @@ class Reclaimer:
             return self._directory.rename(resident.name, zombie_name(resident.name))
         except OSError as error:
             old, new = resident.name, another_name(resident.name)
-            _log.warning("cannot rename %s to %s: %s", old, zombie_name(old), error.strerror)
+            _log.warning(logfmt("segment not renamed", old=old, new=zombie_name(old), error=error.strerror))
             found = self._directory.rename(old, zombie_name(new))
             self.ledger.rename(resident, new)
             self.observer.renamed(old)
@@ -167,7 +168,7 @@ class Reclaimer:
         try:
             found = self._directory.rename(zombie_name(name), name)
         except OSError as error:  # somebody else has taken its name: the cell is loaded anew
-            _log.warning("cannot rename %s to %s: %s", zombie_name(name), name, error.strerror)
+            _log.warning(logfmt("segment not renamed", old=zombie_name(name), new=name, error=error.strerror))
             self.never_revive(key)
             return None
         if not found:

@@ -27,6 +27,7 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.errors import BadRequest, SegmentCorrupt
 from shmmap.failpoints import step
 from shmmap.layers.spec import layer_spec
+from shmmap.logfmt import logfmt
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import PublishBlock, SegmentHeader
 from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
@@ -97,10 +98,8 @@ class Adoption:
                 os.close(fd)
         step("daemon.adopted")
         if adopted or retired or dropped:
-            _log.info(
-                "of an earlier daemon: %d segments taken over, %d still in use, %d dropped",
-                adopted, retired, dropped,
-            )  # fmt: skip
+            counts = {"taken_over": adopted, "still_in_use": retired, "dropped": dropped}
+            _log.info(logfmt("segments of an earlier daemon", **counts))
         return TakenOver(adopted, retired, dropped)
 
     # --- judging ------------------------------------------------------------------------------
@@ -207,8 +206,4 @@ class Adoption:
         except OSError as error:
             # sticky directories let only a file's owner remove it; a directory is nobody's segment
             level = logging.INFO if error.errno == errno.EISDIR else logging.WARNING
-            _log.log(
-                level, "leftover %s is refused (%s) and cannot be removed: %s", name, why, error.strerror
-            )
-            return
-        _log.debug("leftover %s is removed: %s", name, why)
+            _log.log(level, logfmt("leftover not removed", name=name, unusable=why, error=error.strerror))

@@ -36,6 +36,7 @@ from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
 from shmmap.layers.points import LAYER
 from shmmap.layers.versions import MAX_NEIGHBOURS
+from shmmap.logfmt import logfmt
 from shmmap.segment.directory import is_full
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
@@ -270,9 +271,9 @@ class Scheduler:
         self._statistics.add("loads_from_cache", done.cached)
         self._statistics.add("layers_computed", not done.cached and key.layer != LAYER)
         for warning in done.warnings:
-            _log.info("%s: %s", key.cell_id, warning)
+            _log.info(logfmt("loaded with a warning", cell=key.cell_id, layer=key.layer, warning=warning))
         if done.dropped:
-            _log.info("%s: %d points left out, not finite", key.cell_id, done.dropped)
+            _log.info(logfmt("points dropped", cell=key.cell_id, count=done.dropped, reason="not finite"))
         self._end(load)
 
     def _on_checked(self, load: Load, message: Checked, now_s: float) -> None:
@@ -318,7 +319,8 @@ class Scheduler:
             self._statistics.add("refused_over_budget")
         else:
             self._statistics.add("loads_failed")
-            _log.warning("cannot load %s: %s: %s", load.key.cell_id, code, message)
+            cell, layer = load.key
+            _log.warning(logfmt("load failed", cell=cell, layer=layer, code=code, message=message))
         if self._cache.index_of(load.key.cell_id) is None:  # it left the map: nothing is remembered of it
             self._end(load)
             return

@@ -19,6 +19,7 @@ import msgspec
 from shmmap import __version__
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.logfmt import logfmt
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["Worker", "WorkerPool"]
@@ -155,7 +156,7 @@ class WorkerPool:
             try:
                 worker = self.start_one()
             except OSError as error:  # no more processes, memory or descriptors just now
-                _log.error("cannot start a loader: %s", error)
+                _log.error(logfmt("loader could not start", reason=error))
                 if worker is None or len(worker.queue) > JOBS_AHEAD:
                     return False
         try:
@@ -200,7 +201,7 @@ class WorkerPool:
                 os.set_inheritable(fd, False)
             message = worker_messages.decode_from_worker(data)
         except msgspec.MsgspecError as error:
-            _log.error("a loader sends nonsense and is ended: %s", error)
+            _log.error(logfmt("loader ended", reason="its message cannot be read", error=error))
             if fd >= 0:
                 os.close(fd)
             raise EOFError from error

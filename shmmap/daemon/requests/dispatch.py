@@ -22,6 +22,7 @@ from shmmap.daemon.transport.inbox import Heard, peer_of
 from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
+from shmmap.logfmt import logfmt
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 
@@ -60,7 +61,7 @@ class Dispatch:
         except ShmmapError as error:
             self.outbox.refuse(heard.identity, request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
-            _log.exception("a request could not be handled; this is a defect in shmmap")
+            _log.exception(logfmt("request failed", cause="a defect in shmmap"))
             self.outbox.refuse(heard.identity, request, InternalError("the daemon failed on this request"))
 
     def refuse_unread(self, heard: Heard) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
 from typing import Final
 
 import zmq
@@ -15,11 +15,14 @@ from shmmap.daemon.transport.inbox import peer_of
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch
+from shmmap.logfmt import logfmt
 from shmmap.protocol import events
 from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Handshake"]
+
+_log = logging.getLogger(__name__)
 
 _SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 
@@ -78,10 +81,10 @@ class Handshake:
 
     def leave(self, session: Session) -> None:
         """A client's process ended, or it said goodbye: what it held may be free now."""
-        held = session.residents()
-        self.event_log.publish(
-            events.Left, session.slot, session.peer.pid, session.client, session.held_bytes
-        )
+        held, pid = session.residents(), session.peer.pid
+        if held:
+            _log.info(logfmt("client gone", pid=pid, name=session.client, held_bytes=session.held_bytes))
+        self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
         self.cells.forget(session)
         if session.pidfd >= 0:
             self.watched.unwatch(session.pidfd)

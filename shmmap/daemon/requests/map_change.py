@@ -15,6 +15,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.errors import ShmmapError
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -47,12 +48,10 @@ class MapChange:
         self.scheduler.drop(change.removed)
         cache.tell_all()
         tell_reload(self.event_log, self.statistics, catalogue, change, cache.wire_id)
-        _log.info(
-            "map read again: %d cells changed, %d added, %d removed",
-            len(change.changed), len(change.added), len(change.removed),
-        )  # fmt: skip
+        counts = {name: len(getattr(change, name)) for name in ("changed", "moved", "added", "removed")}
+        _log.info(logfmt("reload done", cells=len(catalogue), **counts))
         for problem in catalogue.problems:
-            _log.warning("%s", problem)
+            _log.warning(logfmt("map problem", text=problem))
 
     def _keep(self, error: ShmmapError) -> None:
         tell_reload_failed(self.event_log, self.statistics, self.cache.catalogue.map_version, error)

@@ -22,6 +22,7 @@ from typing import Final
 
 from shmmap.daemon.transport.connections import Census, end_connection
 from shmmap.daemon.transport.listen_gate import ListenGate
+from shmmap.logfmt import logfmt
 
 __all__ = ["MEMORY_ALLOWANCE_BYTES", "CrowdControl"]
 
@@ -159,7 +160,7 @@ class CrowdControl:
     def _end(self, pid: int, descriptors: Collection[int], why: str) -> None:
         ended = sum(end_connection(fd, pid, self._gate.paths) for fd in descriptors)
         self.ended += ended
-        _log.warning("ended %d connections of process %d: %s", ended, pid, why)
+        _log.warning(logfmt("connections ended", pid=pid, count=ended, reason=why))
 
 
 def memory_bytes() -> int:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.transport.own_sockets import listens, looked_at, open_descriptors, target
+from shmmap.logfmt import logfmt
 
 __all__ = ["ListenGate"]
 
@@ -83,7 +84,7 @@ class ListenGate:
         while not self._find(listening) and time.monotonic() < deadline_s:
             time.sleep(0.001)
         if not listening <= self._entries.keys():
-            _log.warning("connections cannot be guarded: /proc/self/fdinfo does not tell of them")
+            _log.warning(logfmt("connections not limited", reason="/proc/self/fdinfo does not tell of them"))
         for fd in self._entries:
             self._arm(fd, 0)
             self._watch(fd, lambda fd=fd: self._knock(fd))  # type: ignore[misc]

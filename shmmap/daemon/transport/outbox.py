@@ -18,6 +18,7 @@ from shmmap.daemon.transport.connections import end_connection, unread_bytes
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
+from shmmap.logfmt import logfmt
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 from shmmap.statistics.writer import StatisticsWriter
@@ -66,7 +67,7 @@ class Outbox:
             self._socket.send(reply, zmq.NOBLOCK)
             step("daemon.replied")
         except zmq.ZMQError as error:
-            _log.warning("a reply was dropped: %s", error)
+            _log.warning(logfmt("reply dropped", error=error))
             return
         self._statistics.add("replies")
         self._statistics.add("bytes_sent", len(reply))
@@ -82,10 +83,8 @@ class Outbox:
             session.unread_bytes = 0
         elif session.unread_bytes > MOST_UNREAD_BYTES:
             if end_connection(session.fd, session.peer.pid, self.paths):
-                _log.warning(
-                    "ended a connection of process %d: it left %d bytes of replies unread",
-                    session.peer.pid, session.unread_bytes,
-                )  # fmt: skip
+                why = f"it left {session.unread_bytes} bytes of replies unread"
+                _log.warning(logfmt("connections ended", pid=session.peer.pid, count=1, reason=why))
             session.unread_bytes = 0
             return False
         return True

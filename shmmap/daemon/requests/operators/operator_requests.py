@@ -15,6 +15,7 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
+from shmmap.logfmt import logfmt
 from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
@@ -65,7 +66,7 @@ class OperatorRequests:
         elif isinstance(message, messages.Unpin):
             self.outbox.send(session, encode(self.pins.unpin(message)))
         elif isinstance(message, messages.Shutdown):
-            _log.info("stopping at the request of pid %d, uid %d", session.peer.pid, session.peer.uid)
+            _log.info(logfmt("stopping", requested_by_pid=session.peer.pid, uid=session.peer.uid))
             self.outbox.send(session, encode(messages.Stopping(message.request)))
             self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
