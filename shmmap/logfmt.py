@@ -12,7 +12,10 @@ another line, is written as an escape.
 
 from __future__ import annotations
 
-__all__ = ["escaped", "logfmt"]
+import logging
+from typing import Final
+
+__all__ = ["escaped", "log", "logfmt"]
 
 _ESCAPES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
@@ -56,3 +59,35 @@ def _number(char: str) -> str:
     if code < 0x100:
         return f"\\x{code:02x}"
     return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+class _Log:
+    """The package's log: an event and its details make a line, see `logfmt`."""
+
+    def __init__(self) -> None:
+        self._logger = logging.getLogger("shmmap")
+
+    def debug(self, event: str, **details: object) -> None:
+        """Log what only somebody looking for a defect wants to know."""
+        if self._logger.isEnabledFor(logging.DEBUG):
+            self._logger.debug(logfmt(event, **details))
+
+    def info(self, event: str, **details: object) -> None:
+        """Log what happens."""
+        if self._logger.isEnabledFor(logging.INFO):
+            self._logger.info(logfmt(event, **details))
+
+    def warning(self, event: str, **details: object) -> None:
+        """Log what an operator should know."""
+        self._logger.warning(logfmt(event, **details))
+
+    def error(self, event: str, **details: object) -> None:
+        """Log what failed."""
+        self._logger.error(logfmt(event, **details))
+
+    def exception(self, event: str, **details: object) -> None:
+        """Log what failed, with the traceback of the exception being handled."""
+        self._logger.exception(logfmt(event, **details))
+
+
+log: Final = _Log()

@@ -7,7 +7,6 @@ import contextlib
 import ctypes
 import dataclasses
 import gc
-import logging
 import os
 import signal
 import time
@@ -43,15 +42,13 @@ from shmmap.daemon.transport.outbox import SEND_QUEUE, Outbox
 from shmmap.daemon.transport.socket_file import bind_socket, remove_socket
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["Service"]
-
-_log = logging.getLogger(__name__)
 
 RECEIVE_QUEUE: Final = 32
 """Requests that libzmq reads ahead from one connection, of up to `MAX_REQUEST_BYTES` each."""
@@ -159,13 +156,11 @@ class Service:
                 self._tell_epoch("started")
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
-                _log.info(
-                    logfmt(
+                log.info(
                         "ready", endpoint=self._socket_path, instance=self._config.instance,
                         map=self._config.map_path, cells=cells, budget_bytes=memory.cache.ledger.budget_bytes,
                         after_s=time.monotonic() - started_s,
-                    )
-                )  # fmt: skip
+                    )  # fmt: skip
                 self._manager.ready(f"serving {cells} cells")
                 _settle_memory()
                 if self._signals.reload_wanted:
@@ -253,7 +248,7 @@ class Service:
                 self._reload()
             elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._loop.stopping:
                 keep = self._signals.keep = number == KEEP_SIGNAL
-                _log.info(logfmt("stopping", signal=number.name, segments="kept" if keep else "removed"))
+                log.info("stopping", signal=number.name, segments="kept" if keep else "removed")
                 if not keep:
                     for again in STOP_SIGNALS:
                         signal.signal(again, self._quick_exit)

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import logging
 import os
 import time
 from functools import partial
@@ -49,15 +48,13 @@ from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import ConfigError
 from shmmap.failpoints import step
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 
 __all__ = ["run"]
-
-_log = logging.getLogger(__name__)
 
 
 def run(config: DaemonConfig) -> int:
@@ -75,11 +72,7 @@ def run(config: DaemonConfig) -> int:
     set_up_logging()
     if not config.map_path:
         raise ConfigError("no map is named", key="map_path", hint="give `shmmap serve MAP`, or set map_path")
-    _log.info(
-        logfmt(
-            "starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid()
-        )
-    )
+    log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     prepare_process()
     raise_descriptor_limit()
     activated = take_activated_socket()
@@ -117,7 +110,7 @@ def run(config: DaemonConfig) -> int:
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
-            _log.warning(logfmt("map problem", text=problem))
+            log.warning("map problem", text=problem)
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
             stack.callback(lambda: memory.close(keep=signals.keep))

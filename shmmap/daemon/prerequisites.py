@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import resource
 from pathlib import Path
@@ -13,12 +12,10 @@ from shmmap.daemon.host.groups import group_id
 from shmmap.daemon.pins.probe import Rung, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.errors import ConfigError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["access_of_segments", "choose_pins", "make_runtime_dir", "raise_descriptor_limit"]
-
-_log = logging.getLogger(__name__)
 
 
 def raise_descriptor_limit() -> None:
@@ -52,9 +49,9 @@ def choose_pins(directory: ShmDirectory) -> PinWatch:
     """Find out how well this machine tells who uses a segment, and say so."""
     support = probe_pins(directory)
     if support.rung is not Rung.LEASES:
-        _log.warning(logfmt("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor"))
+        log.warning("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor")
     source = support.rung.value
-    _log.info(logfmt("segments in use are known from", source=source, **support._asdict()))
+    log.info("segments in use are known from", source=source, **support._asdict())
     return PinWatch(
         directory, support.rung, events=support.close_events and support.rung is not Rung.SESSIONS
     )

@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -27,7 +26,7 @@ from xxhash import xxh3_64_hexdigest
 
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.map_layout import absolute_path
@@ -38,8 +37,6 @@ from shmmap.origin.stamp import Stamp
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
-
-_log = logging.getLogger(__name__)
 
 _RECIPE: Final = "cells of 20 m, frame kept, 1"  # changes whenever the same cloud would be divided otherwise
 _KEPT_CLOUDS: Final = 8
@@ -141,7 +138,7 @@ class DividedCloud:
         return MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
 
     def _divide(self, out: str) -> None:
-        _log.info(logfmt("dividing", cloud=self.path, into=out))
+        log.info("dividing", cloud=self.path, into=out)
         process, channel = start_child("shmmap.dividing.child_main", self.path, out, new_session=False)
         failure: dict[str, Any] = {}
         stage = ""
@@ -154,7 +151,7 @@ class DividedCloud:
                         continue
                     if told["stage"] != stage:
                         stage = told["stage"]
-                        _log.info(logfmt("dividing", cloud=self.path, stage=stage))
+                        log.info("dividing", cloud=self.path, stage=stage)
                     part = f" {told['done'] / told['total']:.0%}" if told["total"] else ""
                     self._tell(f"STATUS={stage} {self.path}{part}", f"EXTEND_TIMEOUT_USEC={_MORE_TIME_USEC}")
             except BaseException:
@@ -212,7 +209,7 @@ class DividedCloud:
                 fd = os.open(os.path.join(path, _USE_LOCK), os.O_RDWR | os.O_CLOEXEC)
                 try:
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    _log.info(logfmt("divided cloud removed from the cache", path=path))
+                    log.info("divided cloud removed from the cache", path=path)
                     shutil.rmtree(path)
                 finally:
                     os.close(fd)

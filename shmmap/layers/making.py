@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,12 +13,10 @@ from shmmap.layers.disk_cache import CacheKey, LayerCache, neighbour_states
 from shmmap.layers.points import LAYER, build_points
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 
 __all__ = ["Made", "cache_key", "make_layer"]
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +109,7 @@ def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> N
         cache.store(key, header, fd)
     except OSError as error:  # the cache is a convenience: a full disk costs nobody a layer
         cache.writable = False
-        _log.warning(logfmt("layers not kept on disk", cache_dir=cache.directory, error=error))
+        log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
     if cache.stored_bytes > cache.limit_bytes // 16:
         with contextlib.suppress(OSError):
             cache.trim()

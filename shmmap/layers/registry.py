@@ -10,7 +10,6 @@ Another package offers a kind by an entry point of the group ``shmmap.layers`` w
 
 from __future__ import annotations
 
-import logging
 from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import Final
@@ -28,11 +27,9 @@ from shmmap.layers import (
     voxel,
 )  # fmt: skip
 from shmmap.layers.contract import LayerKind
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 
 __all__ = ["find_kind", "kinds", "register"]
-
-_log = logging.getLogger(__name__)
 
 GROUP: Final = "shmmap.layers"
 
@@ -66,10 +63,10 @@ def _offered() -> dict[str, LayerKind]:
         try:
             kind = entry.load()
         except Exception as error:  # noqa: BLE001  somebody else's module: anything may happen in it
-            _log.error(logfmt("layer kind not loaded", kind=entry.name, module=entry.value, error=error))
+            log.error("layer kind not loaded", kind=entry.name, module=entry.value, error=error)
             continue
         if not isinstance(kind, LayerKind) or kind.name != entry.name or kind.name in _own:
-            _log.error(logfmt("layer kind not offered by its module", kind=entry.name, module=entry.value))
+            log.error("layer kind not offered by its module", kind=entry.name, module=entry.value)
             continue
         found[kind.name] = kind
     return found

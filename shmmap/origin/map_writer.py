@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 import os
 import secrets
@@ -20,14 +19,12 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest
 from shmmap.formats.durable_file import flush_directory
 from shmmap.formats.pcd_writer import write_pcd
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.metadata_text import metadata_text
 
 __all__ = ["MapWriter", "WrittenMap"]
 
 Columns = Mapping[str, NDArray[Any]]
-
-_log = logging.getLogger(__name__)
 
 # Autoware's loader reads corners into an int
 _MAX_CORNER = 2**31
@@ -110,8 +107,8 @@ class MapWriter:
         self._out_dir = os.path.abspath(out_dir)
         self._refuse_existing()
         if not float(cell_size).is_integer():
-            _log.warning(
-                logfmt("cell corners are not whole metres, refused by Autoware's loader", cell_size=cell_size)
+            log.warning(
+                "cell corners are not whole metres, refused by Autoware's loader", cell_size=cell_size
             )
         self._size = float(cell_size)
         self._prefix = prefix

@@ -21,7 +21,6 @@ Layout, little-endian::
 
 from __future__ import annotations
 
-import logging
 import os
 import stat
 import struct
@@ -34,7 +33,7 @@ from numpy.typing import NDArray
 from xxhash import xxh3_64, xxh3_64_hexdigest, xxh3_64_intdigest
 
 from shmmap.errors import MapDataError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 
 __all__ = ["Source", "default_cache_directory", "load_sidecar", "save_sidecar", "sidecar_file"]
@@ -46,8 +45,6 @@ _START = struct.Struct("<8sIIQ")
 # File systems stamp files by the kernel's coarse clock, which ticks every 1 to 10 ms: a change right
 # after a scan can leave a directory's stamp as it was.  Younger sources are not trusted to be done.
 _SETTLED_NS = 20_000_000
-
-_log = logging.getLogger(__name__)
 
 
 class Source(msgspec.Struct, frozen=True, array_like=True):
@@ -105,7 +102,7 @@ def load_sidecar(path: str, key: str) -> Catalogue | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, MapDataError, msgspec.MsgspecError) as error:
-        _log.warning(logfmt("damaged catalogue cache ignored", path=path, error=error))
+        log.warning("damaged catalogue cache ignored", path=path, error=error)
         return None
 
 
@@ -190,7 +187,7 @@ def save_sidecar(
                 os.unlink(file.name)
                 raise
     except OSError as error:
-        _log.warning(logfmt("catalogue not cached", path=path, error=error.strerror))
+        log.warning("catalogue not cached", path=path, error=error.strerror)
         return False
     return True
 

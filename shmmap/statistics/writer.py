@@ -11,7 +11,6 @@ statistics serve the operator, the daemon serves without them.
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import struct
 import time
@@ -19,7 +18,7 @@ from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 
 from shmmap.errors import ConfigError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import statistics_name
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
@@ -37,8 +36,6 @@ from shmmap.statistics.layout import (
 )
 
 __all__ = ["StatisticsWriter"]
-
-_log = logging.getLogger(__name__)
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
 _CLIENTS_A_PAGE = 16
@@ -279,12 +276,10 @@ class StatisticsWriter:
         except OSError as error:
             if not self._told:
                 self._told = True
-                _log.warning(
-                    logfmt(
+                log.warning(
                         "statistics not written", error=error.strerror,
                         effect="cells are served as before, `shmmap top` and `health` show an older state",
-                    )
-                )  # fmt: skip
+                    )  # fmt: skip
             return False
         return True
 

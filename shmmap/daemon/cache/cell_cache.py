@@ -8,7 +8,6 @@ of `shmmap.daemon.loading.scheduler`, which publishes here.
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, Protocol
@@ -27,7 +26,7 @@ from shmmap.geometry import ZRange
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import PublishBlock
@@ -35,8 +34,6 @@ from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellCache", "Rows"]
-
-_log = logging.getLogger(__name__)
 
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
@@ -223,7 +220,7 @@ class CellCache:
         """Take an adopted segment that is not what it should be out of service, if it still is in it."""
         if self.ledger.resident_named(resident.name) is resident:
             self._statistics.add("adoptions_failed")
-            _log.warning(logfmt("segment of an earlier daemon not used", segment=resident.name, reason=why))
+            log.warning("segment of an earlier daemon not used", segment=resident.name, reason=why)
             self.reclaimer.retire(resident, now_s, "damaged")
 
     def enter(self, resident: Resident, index: int) -> None:
@@ -306,7 +303,7 @@ class CellCache:
         residents = self.ledger.residents() if names is None else map(self.ledger.resident_named, names)
         for resident in [r for r in residents if r is not None and not self._directory.exists(r.name)]:
             cell = resident.key.cell_id
-            _log.warning(logfmt("segment removed by somebody else", segment=resident.name, cell=cell))
+            log.warning("segment removed by somebody else", segment=resident.name, cell=cell)
             self.reclaimer.retire(resident, now_s, "damaged")
 
     def close(self, *, keep: bool = False) -> None:

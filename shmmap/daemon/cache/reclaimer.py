@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import logging
 from collections.abc import Iterable
 from typing import Final, Protocol
 
@@ -21,13 +20,11 @@ from shmmap.daemon.pins.probe import Rung
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, zombie_name
 
 __all__ = ["Observer", "Outcome", "Reclaimer"]
-
-_log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
@@ -134,7 +131,7 @@ class Reclaimer:
             return self._directory.rename(resident.name, zombie_name(resident.name))
         except OSError as error:
             old, new = resident.name, another_name(resident.name)
-            _log.warning(logfmt("segment not renamed", old=old, new=zombie_name(old), error=error.strerror))
+            log.warning("segment not renamed", old=old, new=zombie_name(old), error=error.strerror)
             found = self._directory.rename(old, zombie_name(new))
             self.ledger.rename(resident, new)
             self.observer.renamed(old)
@@ -168,7 +165,7 @@ class Reclaimer:
         try:
             found = self._directory.rename(zombie_name(name), name)
         except OSError as error:  # somebody else has taken its name: the cell is loaded anew
-            _log.warning(logfmt("segment not renamed", old=zombie_name(name), new=name, error=error.strerror))
+            log.warning("segment not renamed", old=zombie_name(name), new=name, error=error.strerror)
             self.never_revive(key)
             return None
         if not found:

@@ -3,19 +3,16 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 from shmmap.daemon.events.eviction_history import EvictionHistory
 from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellEvents"]
-
-_log = logging.getLogger(__name__)
 
 
 class CellEvents:
@@ -81,7 +78,7 @@ class CellEvents:
         if why == "room":
             self._history.evicted(resident.key, resident.version)
             cell, layer = resident.key
-            _log.info(logfmt("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason="budget"))
+            log.info("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason="budget")
         if why != "superseded":
             self._log.publish(
                 events.Evicted, self._wire_id(resident.key.cell_id), resident.key.layer,

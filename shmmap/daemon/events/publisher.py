@@ -6,17 +6,14 @@ Whoever does not keep up loses events and notices by their numbers; nobody is wa
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Final
 
 import zmq
 
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 
 __all__ = ["EventPublisher", "events_path"]
-
-_log = logging.getLogger(__name__)
 
 QUEUE: Final = 1024
 """Events kept for a subscriber that does not read; further ones are lost to it."""
@@ -60,7 +57,7 @@ class EventPublisher:
         try:
             self.socket.send(data, zmq.NOBLOCK)
         except zmq.ZMQError as error:
-            _log.warning(logfmt("event not sent", error=error))
+            log.warning("event not sent", error=error)
 
     def drain(self) -> None:
         """Hear who subscribed; they are told where the numbers stand."""

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import signal
 import socket
 from collections.abc import Iterator
 from typing import Final
 
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 
 __all__ = [
     "KEEP_SIGNAL",
@@ -20,8 +19,6 @@ __all__ = [
     "StartSignals",
     "ignore_signals",
 ]
-
-_log = logging.getLogger(__name__)
 
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1
@@ -56,7 +53,7 @@ class StartSignals:
     def _on_stop(self, number: int, frame: object) -> None:
         del frame
         if not self._stop:
-            _log.info(logfmt("stopping", signal=signal.Signals(number).name, during="start"))
+            log.info("stopping", signal=signal.Signals(number).name, during="start")
         self._stop = True
         if not self._held:
             raise SystemExit(0)

@@ -14,7 +14,6 @@ Every name of the instance is looked at once, before anything is served:
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import stat
 from dataclasses import dataclass
@@ -27,15 +26,13 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.errors import BadRequest, SegmentCorrupt
 from shmmap.failpoints import step
 from shmmap.layers.spec import layer_spec
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import PublishBlock, SegmentHeader
 from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
 from shmmap.segment.verify import read_header
 
 __all__ = ["Adoption", "TakenOver"]
-
-_log = logging.getLogger(__name__)
 
 
 class TakenOver(NamedTuple):
@@ -99,7 +96,7 @@ class Adoption:
         step("daemon.adopted")
         if adopted or retired or dropped:
             counts = {"taken_over": adopted, "still_in_use": retired, "dropped": dropped}
-            _log.info(logfmt("segments of an earlier daemon", **counts))
+            log.info("segments of an earlier daemon", **counts)
         return TakenOver(adopted, retired, dropped)
 
     # --- judging ------------------------------------------------------------------------------
@@ -205,5 +202,5 @@ class Adoption:
             self.directory.unlink(name)
         except OSError as error:
             # sticky directories let only a file's owner remove it; a directory is nobody's segment
-            level = logging.INFO if error.errno == errno.EISDIR else logging.WARNING
-            _log.log(level, logfmt("leftover not removed", name=name, unusable=why, error=error.strerror))
+            tell = log.info if error.errno == errno.EISDIR else log.warning
+            tell("leftover not removed", name=name, unusable=why, error=error.strerror)

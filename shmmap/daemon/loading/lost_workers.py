@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -12,13 +11,11 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_pool import RESTART, Worker, WorkerPool
 from shmmap.daemon.records import Load
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["LostWorkers"]
-
-_log = logging.getLogger(__name__)
 
 START_ATTEMPTS: Final = 3
 """After this many loaders in a row that could not start, loads fail instead of waiting."""
@@ -51,7 +48,7 @@ class LostWorkers:
             return
         self.pool.failed_starts += 1
         unfinished, how = self.pool.remove(worker)
-        _log.error(logfmt("loader could not start", reason=how))
+        log.error("loader could not start", reason=how)
         give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
         for job in unfinished:
             load = self.jobs.pop(job.number, None)
@@ -78,7 +75,7 @@ class LostWorkers:
             self.room.hungry.pop(job.number, None)
             load = self.jobs.pop(job.number, None)
             if position == 0:
-                _log.error(logfmt("loader replaced", path=job.path, reason=why))
+                log.error("loader replaced", path=job.path, reason=why)
                 if load is not None:
                     # where it took too long nobody looks again: the file system may be what hangs
                     known = load.sources[0] if died and load.sources else None

@@ -12,7 +12,6 @@ cell that failed: only workers look at files, because a look may take as long as
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Hashable, Iterable
 
@@ -36,14 +35,12 @@ from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
 from shmmap.layers.points import LAYER
 from shmmap.layers.versions import MAX_NEIGHBOURS
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.segment.directory import is_full
 from shmmap.segment.layout import SourceStamp
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Scheduler"]
-
-_log = logging.getLogger(__name__)
 
 
 def _nobody(key: Key) -> None:
@@ -271,9 +268,9 @@ class Scheduler:
         self._statistics.add("loads_from_cache", done.cached)
         self._statistics.add("layers_computed", not done.cached and key.layer != LAYER)
         for warning in done.warnings:
-            _log.info(logfmt("loaded with a warning", cell=key.cell_id, layer=key.layer, warning=warning))
+            log.info("loaded with a warning", cell=key.cell_id, layer=key.layer, warning=warning)
         if done.dropped:
-            _log.info(logfmt("points dropped", cell=key.cell_id, count=done.dropped, reason="not finite"))
+            log.info("points dropped", cell=key.cell_id, count=done.dropped, reason="not finite")
         self._end(load)
 
     def _on_checked(self, load: Load, message: Checked, now_s: float) -> None:
@@ -320,7 +317,7 @@ class Scheduler:
         else:
             self._statistics.add("loads_failed")
             cell, layer = load.key
-            _log.warning(logfmt("load failed", cell=cell, layer=layer, code=code, message=message))
+            log.warning("load failed", cell=cell, layer=layer, code=code, message=message)
         if self._cache.index_of(load.key.cell_id) is None:  # it left the map: nothing is remembered of it
             self._end(load)
             return

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import socket
 import subprocess
@@ -19,12 +18,10 @@ import msgspec
 from shmmap import __version__
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["Worker", "WorkerPool"]
-
-_log = logging.getLogger(__name__)
 
 JOBS_AHEAD = 4
 """Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
@@ -156,7 +153,7 @@ class WorkerPool:
             try:
                 worker = self.start_one()
             except OSError as error:  # no more processes, memory or descriptors just now
-                _log.error(logfmt("loader could not start", reason=error))
+                log.error("loader could not start", reason=error)
                 if worker is None or len(worker.queue) > JOBS_AHEAD:
                     return False
         try:
@@ -201,7 +198,7 @@ class WorkerPool:
                 os.set_inheritable(fd, False)
             message = worker_messages.decode_from_worker(data)
         except msgspec.MsgspecError as error:
-            _log.error(logfmt("loader ended", reason="its message cannot be read", error=error))
+            log.error("loader ended", reason="its message cannot be read", error=error)
             if fd >= 0:
                 os.close(fd)
             raise EOFError from error

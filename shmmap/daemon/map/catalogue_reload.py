@@ -8,19 +8,16 @@ one runs are answered by the next one, which sees everything that they could mea
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 from collections.abc import Callable
 
 from shmmap.errors import InternalError, ShmmapError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_origin import MapOrigin
 
 __all__ = ["Reloader"]
-
-_log = logging.getLogger(__name__)
 
 Answer = Callable[[Catalogue | ShmmapError], None]
 
@@ -68,7 +65,7 @@ class Reloader:
         except OSError as error:
             self._result = ShmmapError(f"{self._origin.path}: {error}")
         except Exception as error:  # noqa: BLE001  else nobody would ever hear of this reload or a later one
-            _log.exception(logfmt("reload failed", map=self._origin.path, cause="a defect in shmmap"))
+            log.exception("reload failed", map=self._origin.path, cause="a defect in shmmap")
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
@@ -83,7 +80,7 @@ class Reloader:
         if isinstance(result, Catalogue):
             apply(result)
         elif result is not None:
-            _log.error(logfmt("reload failed", map=self._origin.path, message=result, served="the old state"))
+            log.error("reload failed", map=self._origin.path, message=result, served="the old state")
             failed(result)
         if result is not None:
             for answer in asked:

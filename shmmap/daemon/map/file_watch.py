@@ -9,7 +9,6 @@ changes made on this machine: on NFS and the like, a reload has to be asked for.
 from __future__ import annotations
 
 import errno
-import logging
 import os
 from collections.abc import Iterable
 from typing import Final
@@ -17,11 +16,9 @@ from typing import Final
 from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
 from shmmap.daemon.host.mounts import file_system_of
 from shmmap.errors import ConfigError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 
 __all__ = ["FileWatch", "directories_of"]
-
-_log = logging.getLogger(__name__)
 
 SETTLE_S: Final = 0.5
 MOST_S: Final = 5.0
@@ -91,12 +88,10 @@ class FileWatch:
                 self.close()
                 raise _refusal(refused)
             if (kind := file_system_of(directory)) in _REMOTE:
-                _log.warning(
-                    logfmt(
+                log.warning(
                         "changes made on other machines are not noticed", directory=directory,
                         file_system=kind, hint="shmmap reload",
-                    )
-                )  # fmt: skip
+                    )  # fmt: skip
 
     def follow(self, directories: Iterable[str]) -> None:
         """Watch these too, from when on that can be; watching one twice is the same as once."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from typing import Final
@@ -22,13 +21,11 @@ from shmmap.daemon.transport.inbox import Heard, peer_of
 from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 
 __all__ = ["Dispatch"]
-
-_log = logging.getLogger(__name__)
 
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 """A longer request that is refused unread is dropped: finding its number takes too long."""
@@ -61,7 +58,7 @@ class Dispatch:
         except ShmmapError as error:
             self.outbox.refuse(heard.identity, request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
-            _log.exception(logfmt("request failed", cause="a defect in shmmap"))
+            log.exception("request failed", cause="a defect in shmmap")
             self.outbox.refuse(heard.identity, request, InternalError("the daemon failed on this request"))
 
     def refuse_unread(self, heard: Heard) -> None:

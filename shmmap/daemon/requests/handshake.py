@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import logging
+from dataclasses import dataclass
 from typing import Final
 
 import zmq
@@ -15,14 +15,12 @@ from shmmap.daemon.transport.inbox import peer_of
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Handshake"]
-
-_log = logging.getLogger(__name__)
 
 _SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 
@@ -83,7 +81,7 @@ class Handshake:
         """A client's process ended, or it said goodbye: what it held may be free now."""
         held, pid = session.residents(), session.peer.pid
         if held:
-            _log.info(logfmt("client gone", pid=pid, name=session.client, held_bytes=session.held_bytes))
+            log.info("client gone", pid=pid, name=session.client, held_bytes=session.held_bytes)
         self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
         self.cells.forget(session)
         if session.pidfd >= 0:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 
@@ -15,13 +14,11 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.errors import ShmmapError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["MapChange"]
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False, slots=True)
@@ -49,9 +46,9 @@ class MapChange:
         cache.tell_all()
         tell_reload(self.event_log, self.statistics, catalogue, change, cache.wire_id)
         counts = {name: len(getattr(change, name)) for name in ("changed", "moved", "added", "removed")}
-        _log.info(logfmt("reload done", cells=len(catalogue), **counts))
+        log.info("reload done", cells=len(catalogue), **counts)
         for problem in catalogue.problems:
-            _log.warning(logfmt("map problem", text=problem))
+            log.warning("map problem", text=problem)
 
     def _keep(self, error: ShmmapError) -> None:
         tell_reload_failed(self.event_log, self.statistics, self.cache.catalogue.map_version, error)

@@ -13,7 +13,6 @@ A process that lost a connection wrongly connects again; what it maps is not tou
 from __future__ import annotations
 
 import ctypes
-import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Mapping
@@ -22,11 +21,9 @@ from typing import Final
 
 from shmmap.daemon.transport.connections import Census, end_connection
 from shmmap.daemon.transport.listen_gate import ListenGate
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 
 __all__ = ["MEMORY_ALLOWANCE_BYTES", "CrowdControl"]
-
-_log = logging.getLogger(__name__)
 
 LEAST_SHARE: Final = 8
 """A process with no more connections than this is never the culprit."""
@@ -160,7 +157,7 @@ class CrowdControl:
     def _end(self, pid: int, descriptors: Collection[int], why: str) -> None:
         ended = sum(end_connection(fd, pid, self._gate.paths) for fd in descriptors)
         self.ended += ended
-        _log.warning(logfmt("connections ended", pid=pid, count=ended, reason=why))
+        log.warning("connections ended", pid=pid, count=ended, reason=why)
 
 
 def memory_bytes() -> int:

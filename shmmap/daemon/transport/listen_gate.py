@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import logging
 import os
 import platform
 import re
@@ -27,11 +26,9 @@ from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.transport.own_sockets import listens, looked_at, open_descriptors, target
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 
 __all__ = ["ListenGate"]
-
-_log = logging.getLogger(__name__)
 
 _WATCHED: Final = re.compile(r"^tfd:\s*(\d+) events:\s*[0-9a-f]+ data:\s*([0-9a-f]+)", re.MULTILINE)
 LEAST_RESERVE: Final = 48
@@ -84,7 +81,7 @@ class ListenGate:
         while not self._find(listening) and time.monotonic() < deadline_s:
             time.sleep(0.001)
         if not listening <= self._entries.keys():
-            _log.warning(logfmt("connections not limited", reason="/proc/self/fdinfo does not tell of them"))
+            log.warning("connections not limited", reason="/proc/self/fdinfo does not tell of them")
         for fd in self._entries:
             self._arm(fd, 0)
             self._watch(fd, lambda fd=fd: self._knock(fd))  # type: ignore[misc]

@@ -8,7 +8,6 @@ unread loses its connection, and its replies with it.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Collection
 from typing import Final
 
@@ -18,14 +17,12 @@ from shmmap.daemon.transport.connections import end_connection, unread_bytes
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["SEND_QUEUE", "Outbox"]
-
-_log = logging.getLogger(__name__)
 
 SEND_QUEUE: Final = 256
 """Outbox kept for a client that does not read them; further ones are dropped."""
@@ -67,7 +64,7 @@ class Outbox:
             self._socket.send(reply, zmq.NOBLOCK)
             step("daemon.replied")
         except zmq.ZMQError as error:
-            _log.warning(logfmt("reply dropped", error=error))
+            log.warning("reply dropped", error=error)
             return
         self._statistics.add("replies")
         self._statistics.add("bytes_sent", len(reply))
@@ -84,7 +81,7 @@ class Outbox:
         elif session.unread_bytes > MOST_UNREAD_BYTES:
             if end_connection(session.fd, session.peer.pid, self.paths):
                 why = f"it left {session.unread_bytes} bytes of replies unread"
-                _log.warning(logfmt("connections ended", pid=session.peer.pid, count=1, reason=why))
+                log.warning("connections ended", pid=session.peer.pid, count=1, reason=why)
             session.unread_bytes = 0
             return False
         return True

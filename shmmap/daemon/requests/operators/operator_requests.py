@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -15,14 +14,12 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
-from shmmap.logfmt import logfmt
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 
 __all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
-
-_log = logging.getLogger(__name__)
 
 OPERATOR_REQUESTS: Final = (
     messages.Reload,
@@ -66,7 +63,7 @@ class OperatorRequests:
         elif isinstance(message, messages.Unpin):
             self.outbox.send(session, encode(self.pins.unpin(message)))
         elif isinstance(message, messages.Shutdown):
-            _log.info(logfmt("stopping", requested_by_pid=session.peer.pid, uid=session.peer.uid))
+            log.info("stopping", requested_by_pid=session.peer.pid, uid=session.peer.uid)
             self.outbox.send(session, encode(messages.Stopping(message.request)))
             self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
