@@ -8,18 +8,20 @@ belongs to it.  A *box* is ``(min_x, min_y, max_x, max_y)``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_boxes"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
+    Floats: TypeAlias = NDArray[np.float64]
+    Mask: TypeAlias = NDArray[np.bool_]
+
+__all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_boxes"]
 
 
 def _finite(kind: str, **values: float) -> None:
@@ -28,8 +30,7 @@ def _finite(kind: str, **values: float) -> None:
             raise BadRequest(f"{kind}: {name} must be a finite number of metres, not {value!r}")
 
 
-@dataclass(frozen=True, slots=True)
-class ZRange:
+class ZRange(msgspec.Struct, frozen=True):
     """Closed interval of heights, metres, map frame."""
 
     min: float
@@ -50,8 +51,7 @@ def _check_radius(kind: str, x: float, y: float, radius: float) -> None:
         raise BadRequest(f"{kind}: radius must not be negative, it is {radius!r}")
 
 
-@dataclass(frozen=True, slots=True)
-class Circle:
+class Circle(msgspec.Struct, frozen=True):
     """True circle: a box belongs to it when its nearest point is within ``radius``."""
 
     x: float
@@ -80,8 +80,7 @@ class Circle:
         return inside
 
 
-@dataclass(frozen=True, slots=True)
-class AutowareSquare:
+class AutowareSquare(msgspec.Struct, frozen=True):
     """Autoware's area test, to the letter: a square of half-side ``radius``.
 
     Autoware calls it a cylinder, but its first clause (box grown by the radius, closed borders)
@@ -124,8 +123,7 @@ class AutowareSquare:
         return inside
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class Box(msgspec.Struct, frozen=True):
     """Axis-aligned rectangle."""
 
     min_x: float

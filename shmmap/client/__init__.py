@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, PendingLayer
 from shmmap.client.client import Client, connect
-from shmmap.client.map_listing import CellInfo, MapListing
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Missed
+    from shmmap.client.map_listing import CellInfo, MapListing
     from shmmap.client.points_around import PointsAround
     from shmmap.client.retention import Departed, Retention, RetentionPolicy
     from shmmap.client.window import MapWindow
@@ -40,8 +40,10 @@ __all__ = [
 ]
 
 _LATER: Final = {
+    "CellInfo": "map_listing",
     "Departed": "retention",
     "EventStream": "event_stream",
+    "MapListing": "map_listing",
     "MapWindow": "window",
     "Missed": "event_stream",
     "PointsAround": "points_around",

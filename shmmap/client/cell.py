@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import NDArray
-
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
@@ -16,6 +14,7 @@ from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
 if TYPE_CHECKING:
     import open3d
     import torch
+    from numpy.typing import NDArray
 
 __all__ = ["Cell"]
 

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.client.cell import Cell
 from shmmap.errors import BadRequest
 from shmmap.geometry import Circle, distance_to_boxes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["PointsAround", "points_around"]
 

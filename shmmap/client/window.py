@@ -10,9 +10,7 @@ import weakref
 from collections.abc import Sequence
 from itertools import chain
 from types import TracebackType
-from typing import Any, Final
-
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
@@ -24,6 +22,9 @@ from shmmap.client.window_state import EMPTY, LayerKey, WindowState, WindowUpdat
 from shmmap.errors import BadRequest, ShmmapError
 from shmmap.geometry import Circle, ZRange
 from shmmap.protocol.messages import Intent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["MapWindow"]
 

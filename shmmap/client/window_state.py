@@ -4,16 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
 from shmmap.errors import CellError, OverBudget
 from shmmap.protocol.messages import Intent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["EMPTY", "LayerKey", "WindowState", "WindowUpdate", "update_between"]
 

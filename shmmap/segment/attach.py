@@ -13,25 +13,21 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import posix_ipc
-from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.layout import (
-    PAGE_BYTES,
-    ColumnRow,
-    PublishBlock,
-    SegmentHeader,
-    read_columns,
-    unpack_header,
-    unpack_publish_block,
-)
+from shmmap.segment.header import read_columns, unpack_header
+from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
 from shmmap.segment.pins import lock_slot
+from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["AttachedSegment", "Unmap", "attach", "unmap"]
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import signal
 import struct
 import time
 from typing import Final
@@ -36,6 +35,8 @@ _OFD_SETLK: Final = 37
 
 def prepare_process() -> None:
     """Ignore SIGIO; without this an opener that meets our lease would kill this process."""
+    import signal  # for daemons: clients take no lease
+
     signal.signal(signal.SIGIO, signal.SIG_IGN)
 
 

@@ -32,8 +32,8 @@ from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
 from shmmap.origin.stamp import Stamp
 from shmmap.segment.directory import ShmDirectory, is_full
-from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
+from shmmap.segment.publish_block import PublishBlock
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Store"]
