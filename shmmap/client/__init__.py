@@ -2,12 +2,21 @@
 """The client library: connect, ask for cells, follow a pose.
 
 What windows need is loaded when it is first used; a program that only asks does without.
+
+The packages come first, before modules of ours nest: Python keeps its frames in chunks of 16 KiB, and
+where imports nest so deeply that a loop in them (numpy's has thousands of rounds) comes to lie on the
+border of two, it maps and unmaps memory in every round (30 ms).
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec  # noqa: F401
+import numpy as np  # noqa: F401
+import posix_ipc  # noqa: F401
+import zmq  # noqa: F401
 
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, PendingLayer

@@ -20,8 +20,10 @@ __all__ = ["main"]
 _NOTHING = "pass"
 _PACKAGES = "import numpy, zmq, posix_ipc, msgspec"
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
-# an installed package is compiled
-_ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+_ENVIRONMENT = {
+    **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},  # as installed
+    "OPENBLAS_NUM_THREADS": "1",  # numpy's threads, just started, spin as long as the process lives
+}
 
 
 def cpu_ms(code: str) -> float:
