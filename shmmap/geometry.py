@@ -51,6 +51,11 @@ def _check_radius(kind: str, x: float, y: float, radius: float) -> None:
         raise BadRequest(f"{kind}: radius must not be negative, it is {radius!r}")
 
 
+def _inside(bounds: tuple[float, float, float, float], x: float, y: float, radius: float) -> bool:
+    min_x, min_y, max_x, max_y = bounds
+    return min_x <= x - radius and x + radius <= max_x and min_y <= y - radius and y + radius <= max_y
+
+
 class Circle(msgspec.Struct, frozen=True):
     """True circle: a box belongs to it when its nearest point is within ``radius``."""
 
@@ -71,6 +76,10 @@ class Circle(msgspec.Struct, frozen=True):
     def center(self) -> tuple[float, float]:
         """Where distance is measured from."""
         return self.x, self.y
+
+    def contains_circle(self, x: float, y: float, radius: float) -> bool:
+        """Whether a circle lies wholly in this one, border included."""
+        return math.hypot(x - self.x, y - self.y) + radius <= self.radius
 
     def overlaps(self, boxes: Floats) -> Mask:
         """Which of ``boxes`` ((N, 4) float64) the circle touches, as (N,) bool."""
@@ -109,6 +118,12 @@ class AutowareSquare(msgspec.Struct, frozen=True):
     def center(self) -> tuple[float, float]:
         """Where distance is measured from."""
         return self.x, self.y
+
+    def contains_circle(self, x: float, y: float, radius: float) -> bool:
+        """Whether a circle lies wholly in the square, as far as float32 lets one be sure."""
+        bounds = self.bounds
+        margin = float(np.spacing(np.float32(max(map(abs, bounds)))))  # by which a box may be rounded away
+        return _inside(bounds, x, y, radius + margin)
 
     def overlaps(self, boxes: Floats) -> Mask:
         """Which of ``boxes`` ((N, 4) float64) the square touches, as (N,) bool."""
@@ -150,6 +165,10 @@ class Box(msgspec.Struct, frozen=True):
     def center(self) -> tuple[float, float]:
         """Where distance is measured from."""
         return (self.min_x + self.max_x) / 2, (self.min_y + self.max_y) / 2
+
+    def contains_circle(self, x: float, y: float, radius: float) -> bool:
+        """Whether a circle lies wholly in the rectangle, border included."""
+        return _inside(self.bounds, x, y, radius)
 
     def overlaps(self, boxes: Floats) -> Mask:
         """Which of ``boxes`` ((N, 4) float64) the rectangle touches, as (N,) bool."""

@@ -90,6 +90,14 @@ class Client(OperatorRequests):
         return self._session.path
 
     @property
+    def disconnected_since(self) -> float | None:
+        """`time.monotonic` of when the connection to the daemon broke; None while it stands.
+
+        Known at once when the daemon ends.  The next request connects again by itself.
+        """
+        return self._session.lost_since
+
+    @property
     def epoch(self) -> int:
         """Which life of the daemon the session is with."""
         return self._session.welcome.epoch
@@ -98,6 +106,11 @@ class Client(OperatorRequests):
     def map_version(self) -> int:
         """Which state of the map the last answer was about."""
         return self._session.map_version
+
+    @property
+    def session(self) -> Session:
+        """What its requests share; for windows."""
+        return self._session
 
     @property
     def unmapper(self) -> Unmapper:
@@ -165,6 +178,7 @@ class Client(OperatorRequests):
         intent: Intent | None = None,
         by_name: bool = False,
         populate: bool = False,
+        timeout: float | None = None,
     ) -> CellSet:
         """Cells that touch an area, minus those that are held at their current version.
 
@@ -180,6 +194,8 @@ class Client(OperatorRequests):
             restarted daemon, which cannot know what the versions of an earlier life belonged to.
         populate
             Let the kernel map every page while attaching instead of at first touch.
+        timeout
+            Seconds the reply may take beyond ``wait``; None: those of the client.
 
         Other parameters and errors are those of `area`.
         """
@@ -191,6 +207,7 @@ class Client(OperatorRequests):
             wait,
             removed=mine.removed,
             populate=populate,
+            timeout_s=timeout,
         )
 
     def selected(
@@ -257,7 +274,8 @@ def connect(
         Seconds until the daemon must have said welcome.  Short, since a daemon always answers at once:
         whoever does not is stopped, hung or overloaded.
     name
-        How this program appears in ``shmmap clients``; at most 64 characters.
+        How this program appears in ``shmmap clients``, at most 64 characters; empty: by the name of its
+        script, or of the module it was started as (``python -m``).
     shm_dir
         Directory of the segments as this process sees it (default: ``SHMMAP_SHM_DIR``, else as the daemon
         says); for containers that have it mounted elsewhere.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import posix_ipc
 
-from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle, needed_packages
 from shmmap.failpoints import step
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import read_columns, unpack_header
@@ -133,7 +133,8 @@ class AttachedSegment:
         SegmentCorrupt
             Naming the first column whose bytes changed.
         """
-        import xxhash
+        with needed_packages("verify()"):
+            import xxhash
 
         for column in self.header.columns:
             if (

@@ -21,7 +21,9 @@ _NOTHING = "pass"
 _PACKAGES = "import numpy, zmq, posix_ipc, msgspec"
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 _ENVIRONMENT = {
-    **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},  # as installed
+    **{
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    },  # as installed
     "OPENBLAS_NUM_THREADS": "1",  # numpy's threads, just started, spin as long as the process lives
 }
 

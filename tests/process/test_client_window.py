@@ -19,6 +19,7 @@ import pytest
 
 import shmmap
 from shmmap.client.retention import Departed
+from shmmap.client.window_follower import WindowFollower
 from shmmap.errors import BadRequest, DaemonUnreachable, NoAnswer
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -105,7 +106,7 @@ def test_a_window_that_stands_still_learns_of_a_reload(daemon: Factory, divided_
 
 def wait_for(window: shmmap.MapWindow, reached: Callable[[], bool]) -> None:
     """Wait until the window's thread has published a state that fits."""
-    assert window._follower is not None
+    assert isinstance(window._follower, WindowFollower)
     with window._follower._changed:
         assert window._follower._changed.wait_for(reached, LONG_S)
 
@@ -270,7 +271,7 @@ def test_a_window_nobody_closes_ends_with_the_program(daemon: Factory, divided_m
     window = shmmap.MapWindow(one.endpoint, 30)
     window.move_to(0, 0, wait=LONG_S)
     view = window.cells[0].xyz
-    assert threading.active_count() == before + 1
+    assert threading.active_count() == before + 2, "the window's, and its connection's"
     del window
     assert threading.active_count() == before
     assert np.isfinite(view).all()

@@ -57,7 +57,7 @@ def test_header_fields(segments: Segments) -> None:
 
 def test_an_unknown_column_is_named_with_those_there_are(segments: Segments) -> None:
     cell = segments.cell("/map/a.pcd", COLUMNS)
-    with pytest.raises(KeyError, match="no column 'colour'; it has xyz, intensity, ring, rgb"):
+    with pytest.raises(KeyError, match=r"no column 'colour' \(it has xyz, intensity, ring, rgb\)"):
         cell["colour"]
     with pytest.raises(KeyError, match="no column 'colour'"):
         cell.unit("colour")

@@ -29,7 +29,7 @@ def grid(make_cell: Callable[..., Cell]) -> list[Cell]:
 
 
 def around(cells: list[Cell], x: float, y: float, radius: float) -> PointsAround:
-    return points_around(cells, np.array([cell.box for cell in cells]), x, y, radius)
+    return points_around(cells, np.array([cell.box for cell in cells]), x, y, radius, covered=True)
 
 
 @pytest.mark.parametrize(
