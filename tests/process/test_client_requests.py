@@ -69,6 +69,23 @@ def test_everything_says_what_it_is(daemon: Factory, divided_map: DividedMap) ->
             client.area((1.0, 2.0, 3.0))  # type: ignore[arg-type]
 
 
+def test_a_client_goes_by_its_script(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:
+    one = daemon(divided_map.root)
+    script = tmp_path / "localize.py"
+    script.write_text(
+        "import sys, shmmap\n"
+        "for options in ({}, {'name': 'own'}):\n"
+        "    with shmmap.connect(sys.argv[1], **options) as client:\n"
+        "        print(*sorted(session.client for session in client.stats().sessions))\n"
+        "with shmmap.MapWindow(sys.argv[1]) as window:\n"
+        "    print(*sorted(session.client for session in window.client.stats().sessions))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script), one.endpoint], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["localize.py", "own", "localize.py"]
+
+
 def test_areas(daemon: Factory, divided_map: DividedMap) -> None:
     with shmmap.connect(daemon(divided_map.root).endpoint, name="areas") as client:
         circle = client.area(shmmap.Circle(5.0, -7.0, 33.0))
