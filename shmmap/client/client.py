@@ -34,7 +34,7 @@ class Client(OperatorRequests):
     May be used from several threads: one request is on its way at a time, others wait for it.
 
     After a fork the child gets a session of its own with its first request.  Cells attached before
-    stay readable in it, and until the child drops them or ends the daemon takes them for pinned by the
+    stay readable in it; until the child drops them or ends, the daemon counts them as in use by the
     parent.  The parent notices nothing.
 
     Every request has a deadline, ``timeout`` beyond what it lets the daemon wait, and is repeated on

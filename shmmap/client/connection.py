@@ -143,7 +143,7 @@ class Connection:
                 raise NoAnswer(f"{self.path}: no answer within {timeout_s:.3g} s", hint=_SILENT_HINT)
             if not isinstance(reply, ErrorReply):
                 raise ProtocolMismatch(
-                    f"the daemon answered {type(message).__name__} with {type(reply).__name__}",
+                    f"the daemon answered a request {type(message).__name__} with {type(reply).__name__}",
                     hint=_UPDATE_HINT,
                 )
             if reply.code != "no_session":
@@ -162,7 +162,9 @@ class Connection:
         if isinstance(reply, ErrorReply):
             raise error_from_wire(reply.code, reply.message, reply.hint)
         if not isinstance(reply, Welcome):
-            raise ProtocolMismatch(f"{self.path}: the answer to Hello was {type(reply).__name__}")
+            raise ProtocolMismatch(
+                f"{self.path}: the answer to Hello was {type(reply).__name__}", hint=_UPDATE_HINT
+            )
         if reply.major != PROTOCOL_VERSION[0]:
             raise ProtocolMismatch(
                 f"{self.path}: the daemon speaks protocol {reply.major}.{reply.minor}, "
@@ -226,7 +228,10 @@ class Connection:
             raise self._no_daemon()
 
     def _no_daemon(self) -> ProtocolMismatch:
-        return ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")
+        return ProtocolMismatch(
+            f"{self.path}: what listens there is no shmmap daemon",
+            hint="is this the socket of another program?",
+        )
 
 
 def _slice_ms(deadline_s: float) -> int:

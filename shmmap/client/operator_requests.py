@@ -18,11 +18,11 @@ class OperatorRequests:
         self._session = session
 
     def stats(self) -> messages.StatsReply:
-        """Return the daemon's counters, its sessions, and memory that nobody known holds."""
+        """Return the daemon's counters, its sessions, and memory that processes without a session use."""
         return self._session.ask(messages.Stats, messages.StatsReply)
 
     def show(self, cell: str) -> messages.ShownCell:
-        """Return everything about one cell: versions, segments and their holders, last failure.
+        """Return everything about one cell: versions, segments and who uses them, last failure.
 
         Raises
         ------
@@ -42,7 +42,7 @@ class OperatorRequests:
         return self._session.ask(messages.Reload, messages.Reloaded)
 
     def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
-        """Have the daemon drop cells, all by default; mapped ones are freed when they are let go.
+        """Have the daemon drop cells, all by default; those in use are freed when they are let go.
 
         Raises
         ------
@@ -55,7 +55,7 @@ class OperatorRequests:
     def pin(
         self, ids: str | Iterable[str] = (), layers: str | Sequence[str] = ("points",)
     ) -> messages.Pinned:
-        """Have the daemon keep cells resident, until `unpin` or its end; without ids, list its pins.
+        """Have the daemon keep cells in memory, until `unpin` or its end; without ids, list its pins.
 
         Raises
         ------

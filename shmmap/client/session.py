@@ -129,7 +129,7 @@ class Session:
             )
         try:
             if self._closed:
-                raise BadRequest("this client is closed")
+                raise BadRequest("this client is closed", hint="connect again")
             connection = self._connection or self._connect()
             self._tell_unmapped(connection)
             yield connection

@@ -204,7 +204,7 @@ class MapWindow:
         if wait is not None and not wait >= 0:
             raise BadRequest(f"wait must not be negative, it is {wait!r}")
         if self._closed:
-            raise BadRequest("this window is closed")
+            raise BadRequest("this window is closed", hint="make another one")
         state = self._follower.move(pose, wait)
         update = update_between(self._seen, state, current=self._follower.answers(state))
         self._seen = state.versions

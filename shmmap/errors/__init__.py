@@ -18,7 +18,7 @@
     │   └── NoAnswer           no reply before the deadline; also a `TimeoutError`
     ├── ProtocolMismatch       client and daemon speak different versions         exit 76
     ├── InstanceBusy           another daemon owns this instance                  exit 75
-    ├── NoSession              the daemon does not know this session: say hello       exit 1
+    ├── NoSession              the daemon does not know this session: say hello   exit 1
     ├── NotPermitted           the daemon refuses this to this user               exit 1
     ├── Busy                   too many requests of this process wait already     exit 75
     ├── SegmentError           a segment cannot be used

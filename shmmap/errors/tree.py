@@ -203,7 +203,7 @@ class NotPermitted(ShmmapError):
 
 
 class Busy(ShmmapError):
-    """The daemon holds so many unanswered requests of this process that it takes no more: wait."""
+    """The daemon has so many unanswered requests of this process that it takes no more: wait for some."""
 
     code = "busy"
     exit_code = 75
@@ -217,7 +217,7 @@ class SegmentError(ShmmapError):
 
 
 class StaleHandle(SegmentError):
-    """The segment a handle names is gone (evicted or superseded): ask the daemon again."""
+    """The segment that a handle names is gone (evicted, or replaced by a newer version): ask again."""
 
     code = "stale_handle"
     exit_code = 1

@@ -214,7 +214,7 @@ class SessionRow(msgspec.Struct, array_like=True, frozen=True):
 
 
 class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
-    """Answer to `Stats`: counters by name, sessions, and pins nobody known holds."""
+    """Answer to `Stats`: counters by name, sessions, and segments in use by processes without a session."""
 
     request: int
     epoch: int
@@ -226,7 +226,7 @@ class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
 
 
 class ShownSegment(msgspec.Struct, array_like=True, frozen=True):
-    """One segment of a shown cell; ``state`` is resident, stale or zombie."""
+    """One segment of a shown cell; ``state`` is resident, stale or zombie (retired, but still in use)."""
 
     layer: str
     version: int

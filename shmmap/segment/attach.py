@@ -70,7 +70,7 @@ class _Mapping:
             number = ctypes.get_errno()
             raise SegmentError(
                 f"cannot map {nbytes} bytes: {os.strerror(number)}",
-                hint="vm.max_map_count or RLIMIT_AS may be too low",
+                hint="vm.max_map_count, or the limit of address space (ulimit -v), may be too low",
             )
         self._address = address
         self._nbytes = nbytes
@@ -221,7 +221,7 @@ def attach(
         available = status.st_size
         end = offset + nbytes if nbytes else available
         if end > available or end == 0:
-            raise SegmentCorrupt(f"segment {name} has {available} bytes, the handle needs {end}")
+            raise SegmentCorrupt(f"segment {name} has {available} bytes, the daemon's handle says {end}")
         size = end - offset
         # Reading the header is cheaper than the page fault that looking at it would cost
         page = os.pread(fd, min(size, PAGE_BYTES), offset)
