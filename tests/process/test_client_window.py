@@ -237,7 +237,7 @@ def test_a_daemon_that_ends_is_noticed_at_once(daemon: Factory, divided_map: Div
     one = daemon(divided_map.root)
     with (
         shmmap.connect(one.endpoint) as client,
-        shmmap.MapWindow(client, 30, refresh_interval=1e6, timeout=threading.TIMEOUT_MAX / 2) as window,
+        shmmap.MapWindow(client, 30, refresh_interval=1e6, timeout=3 * LONG_S) as window,
     ):
         window.move_to(0, 0, wait=LONG_S)
         assert [client.disconnected_since] == [None]
@@ -257,7 +257,7 @@ def test_a_daemon_that_ends_is_noticed_at_once(daemon: Factory, divided_map: Div
 def test_a_window_s_timeout_is_its_own(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     with (
-        shmmap.connect(one.endpoint, timeout=threading.TIMEOUT_MAX / 2) as client,
+        shmmap.connect(one.endpoint, timeout=3 * LONG_S) as client,
         shmmap.MapWindow(client, 30, update_distance=0, timeout=0.2) as window,
     ):
         window.move_to(0, 0, wait=LONG_S)
