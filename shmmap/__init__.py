@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         CannotWrite,
         CellError,
         ConfigError,
+        ConnectionLost,
         DaemonUnreachable,
         InstanceBusy,
         InternalError,
@@ -48,11 +49,13 @@ if TYPE_CHECKING:
         MapDataError,
         MapMissing,
         NoAnswer,
+        NoColumn,
         NoSession,
         NoSocket,
         NoSpace,
         NotPermitted,
         OverBudget,
+        PackageMissing,
         ProtocolMismatch,
         SegmentCorrupt,
         SegmentError,
@@ -61,6 +64,7 @@ if TYPE_CHECKING:
         StaleHandle,
         StaleSocket,
         UnknownCell,
+        needed_packages,
     )
     from shmmap.formats.cloud import read_cloud
     from shmmap.formats.pcd_writer import write_pcd
@@ -70,7 +74,7 @@ if TYPE_CHECKING:
     from shmmap.layers.covariance import voxel_covariances
     from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
-    from shmmap.protocol.messages import HeldCell, Intent
+    from shmmap.protocol.messages import HeldCell, Holder, Intent
 
 __version__ = "0.1.0"
 
@@ -88,10 +92,12 @@ __all__ = [
     "Circle",
     "Client",
     "ConfigError",
+    "ConnectionLost",
     "DaemonUnreachable",
     "Departed",
     "EventStream",
     "HeldCell",
+    "Holder",
     "InstanceBusy",
     "Intent",
     "InternalError",
@@ -105,11 +111,13 @@ __all__ = [
     "MapWindow",
     "Missed",
     "NoAnswer",
+    "NoColumn",
     "NoSession",
     "NoSocket",
     "NoSpace",
     "NotPermitted",
     "OverBudget",
+    "PackageMissing",
     "PendingLayer",
     "PointsAround",
     "ProtocolMismatch",
@@ -129,13 +137,14 @@ __all__ = [
     "canonical_layer",
     "connect",
     "ground_height",
+    "needed_packages",
     "read_cloud",
     "voxel_covariances",
     "write_pcd",
 ]
 
 _GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
-_MESSAGES: Final = frozenset({"HeldCell", "Intent"})
+_MESSAGES: Final = frozenset({"HeldCell", "Holder", "Intent"})
 _LAYERS: Final = {
     "LayerKind": "contract",
     "LayerTable": "contract",
@@ -182,7 +191,10 @@ def __getattr__(name: str) -> Any:
         module = "shmmap.errors"
     else:
         raise AttributeError(f"module 'shmmap' has no attribute {name!r}")
-    value = getattr(importlib.import_module(module), name)
+    from shmmap.errors import needed_packages
+
+    with needed_packages(f"shmmap.{name}"):
+        value = getattr(importlib.import_module(module), name)
     globals()[name] = value
     return value
 

@@ -8,18 +8,20 @@ belongs to it.  A *box* is ``(min_x, min_y, max_x, max_y)``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_boxes"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
+    Floats: TypeAlias = NDArray[np.float64]
+    Mask: TypeAlias = NDArray[np.bool_]
+
+__all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_boxes"]
 
 
 def _finite(kind: str, **values: float) -> None:
@@ -28,8 +30,7 @@ def _finite(kind: str, **values: float) -> None:
             raise BadRequest(f"{kind}: {name} must be a finite number of metres, not {value!r}")
 
 
-@dataclass(frozen=True, slots=True)
-class ZRange:
+class ZRange(msgspec.Struct, frozen=True):
     """Closed interval of heights, metres, map frame."""
 
     min: float
@@ -50,8 +51,12 @@ def _check_radius(kind: str, x: float, y: float, radius: float) -> None:
         raise BadRequest(f"{kind}: radius must not be negative, it is {radius!r}")
 
 
-@dataclass(frozen=True, slots=True)
-class Circle:
+def _inside(bounds: tuple[float, float, float, float], x: float, y: float, radius: float) -> bool:
+    min_x, min_y, max_x, max_y = bounds
+    return min_x <= x - radius and x + radius <= max_x and min_y <= y - radius and y + radius <= max_y
+
+
+class Circle(msgspec.Struct, frozen=True):
     """True circle: a box belongs to it when its nearest point is within ``radius``."""
 
     x: float
@@ -72,6 +77,10 @@ class Circle:
         """Where distance is measured from."""
         return self.x, self.y
 
+    def contains_circle(self, x: float, y: float, radius: float) -> bool:
+        """Whether a circle lies wholly in this one, border included."""
+        return math.hypot(x - self.x, y - self.y) + radius <= self.radius
+
     def overlaps(self, boxes: Floats) -> Mask:
         """Which of ``boxes`` ((N, 4) float64) the circle touches, as (N,) bool."""
         dx = np.maximum(np.maximum(boxes[:, 0] - self.x, self.x - boxes[:, 2]), 0.0)
@@ -80,8 +89,7 @@ class Circle:
         return inside
 
 
-@dataclass(frozen=True, slots=True)
-class AutowareSquare:
+class AutowareSquare(msgspec.Struct, frozen=True):
     """Autoware's area test, to the letter: a square of half-side ``radius``.
 
     Autoware calls it a cylinder, but its first clause (box grown by the radius, closed borders)
@@ -111,6 +119,12 @@ class AutowareSquare:
         """Where distance is measured from."""
         return self.x, self.y
 
+    def contains_circle(self, x: float, y: float, radius: float) -> bool:
+        """Whether a circle lies wholly in the square, as far as float32 lets one be sure."""
+        bounds = self.bounds
+        margin = float(np.spacing(np.float32(max(map(abs, bounds)))))  # by which a box may be rounded away
+        return _inside(bounds, x, y, radius + margin)
+
     def overlaps(self, boxes: Floats) -> Mask:
         """Which of ``boxes`` ((N, 4) float64) the square touches, as (N,) bool."""
         x, y, radius = (float(np.float32(v)) for v in (self.x, self.y, self.radius))
@@ -124,8 +138,7 @@ class AutowareSquare:
         return inside
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class Box(msgspec.Struct, frozen=True):
     """Axis-aligned rectangle."""
 
     min_x: float
@@ -152,6 +165,10 @@ class Box:
     def center(self) -> tuple[float, float]:
         """Where distance is measured from."""
         return (self.min_x + self.max_x) / 2, (self.min_y + self.max_y) / 2
+
+    def contains_circle(self, x: float, y: float, radius: float) -> bool:
+        """Whether a circle lies wholly in the rectangle, border included."""
+        return _inside(self.bounds, x, y, radius)
 
     def overlaps(self, boxes: Floats) -> Mask:
         """Which of ``boxes`` ((N, 4) float64) the rectangle touches, as (N,) bool."""

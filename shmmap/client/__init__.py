@@ -2,6 +2,10 @@
 """The client library: connect, ask for cells, follow a pose.
 
 What windows need is loaded when it is first used; a program that only asks does without.
+
+The packages come first, before modules of ours nest: Python keeps its frames in chunks of 16 KiB, and
+where imports nest so deeply that a loop in them (numpy's has thousands of rounds) comes to lie on the
+border of two, it maps and unmaps memory in every round (30 ms).
 """
 
 from __future__ import annotations
@@ -9,13 +13,18 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec  # noqa: F401
+import numpy as np  # noqa: F401
+import posix_ipc  # noqa: F401
+import zmq  # noqa: F401
+
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, PendingLayer
 from shmmap.client.client import Client, connect
-from shmmap.client.map_listing import CellInfo, MapListing
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Missed
+    from shmmap.client.map_listing import CellInfo, MapListing
     from shmmap.client.points_around import PointsAround
     from shmmap.client.retention import Departed, Retention, RetentionPolicy
     from shmmap.client.window import MapWindow
@@ -40,8 +49,10 @@ __all__ = [
 ]
 
 _LATER: Final = {
+    "CellInfo": "map_listing",
     "Departed": "retention",
     "EventStream": "event_stream",
+    "MapListing": "map_listing",
     "MapWindow": "window",
     "Missed": "event_stream",
     "PointsAround": "points_around",

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import NDArray
-
+from shmmap.errors import NoColumn
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
@@ -16,6 +15,7 @@ from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
 if TYPE_CHECKING:
     import open3d
     import torch
+    from numpy.typing import NDArray
 
 __all__ = ["Cell"]
 
@@ -31,6 +31,9 @@ class Cell:
     ----------
     id : str
         Absolute path of the source file, as in Autoware.
+    name : str
+        The id without what the ids of all cells of the map begin with, as a rule the file's name
+        (``"120_40.pcd"``): for people to read, and good wherever an id is asked for.
     version : int
         64-bit hash of the id and the source's stamp; another one after any rewrite of the file.
     layer : str
@@ -55,6 +58,7 @@ class Cell:
         "box",
         "id",
         "layer",
+        "name",
         "nbytes",
         "offset",
         "points",
@@ -65,6 +69,7 @@ class Cell:
 
     def __init__(self, cell_id: str, segment: str, handle: Handle, attached: AttachedSegment) -> None:
         self.id = cell_id
+        self.name = handle.id
         self.version = handle.version
         self.layer = handle.layer
         self.box = (handle.min_x, handle.min_y, handle.max_x, handle.max_y)
@@ -91,8 +96,8 @@ class Cell:
 
         Raises
         ------
-        KeyError
-            The cell has no such column; the message lists those it has.
+        NoColumn
+            The cell has no such column; the hint lists those it has.  Also a `KeyError`.
         """
         view = self._views.get(column)
         if view is None:
@@ -101,7 +106,10 @@ class Cell:
                     view = self._views[column] = self._attached.column(index)
                     break
             else:
-                raise KeyError(f"{self.id} has no column {column!r}; it has {', '.join(self.column_names)}")
+                raise NoColumn(
+                    f"{self.name}: layer {self.layer} has no column {column!r}",
+                    hint=f"it has {', '.join(self.column_names)}",
+                )
         return view
 
     @property
@@ -194,7 +202,7 @@ class Cell:
         """
         from shmmap.client.wrapping import open3d_cloud
 
-        return open3d_cloud(self)
+        return open3d_cloud(self.columns)
 
     def to_torch(self) -> dict[str, torch.Tensor]:
         """Return torch tensors by column name over the same memory.
@@ -204,4 +212,4 @@ class Cell:
         """
         from shmmap.client.wrapping import torch_tensors
 
-        return torch_tensors(self)
+        return torch_tensors(self.columns)

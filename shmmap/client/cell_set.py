@@ -8,7 +8,7 @@ from typing import NamedTuple, overload
 
 from shmmap.client.cell import Cell
 from shmmap.errors import CellError
-from shmmap.protocol.messages import FailedCell, Holder
+from shmmap.protocol.messages import FailedCell
 
 __all__ = ["CellSet", "PendingLayer", "cell_error"]
 
@@ -99,14 +99,6 @@ def _kinds(root: type[CellError]) -> dict[str, type[CellError]]:
 _KINDS = _kinds(CellError)
 
 
-def _line(holder: Holder) -> str:
-    what = f"{holder.bytes} bytes" + (f" in {holder.cells} cells" if holder.cells else "")
-    if holder.session == 0:
-        return f"unknown (not through the client library) holds {what}"
-    name = f" ({holder.client})" if holder.client else ""
-    return f"session {holder.session:016x}, pid {holder.pid}{name} holds {what}"
-
-
 def cell_error(failure: FailedCell, cell_id: str) -> CellError:
     """Return the error that a reply describes for one cell."""
     kind = _KINDS.get(failure.code, CellError)
@@ -114,5 +106,5 @@ def cell_error(failure: FailedCell, cell_id: str) -> CellError:
         f"{cell_id} ({failure.layer}): {failure.message}",
         cell_id=cell_id,
         layer=failure.layer,
-        holders=[_line(holder) for holder in failure.holders],
+        holders=failure.holders,
     )

@@ -7,33 +7,34 @@ import os
 from collections.abc import Iterable, Sequence
 from threading import TIMEOUT_MAX
 from types import TracebackType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from shmmap import geometry
 from shmmap.client.attaching import Unmapper
 from shmmap.client.cell_set import CellSet
 from shmmap.client.discovery import candidates
 from shmmap.client.held import Held, HeldCells
-from shmmap.client.map_listing import MapListing
+from shmmap.client.operator_requests import OperatorRequests, several
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest, NoAnswer
+from shmmap.errors import BadRequest
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Intent, Welcome
+
+if TYPE_CHECKING:
+    from shmmap.client.map_listing import MapListing
 
 __all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
 
 DEFAULT_WAIT_S: Final = 5.0
-_LISTING_ROUNDS: Final = 5  # how often a listing is begun again because the map changed meanwhile
-_PAGE_ROWS: Final = 10_000
 
 
-class Client:
+class Client(OperatorRequests):
     """A session with the daemon; get one from `connect`.
 
     May be used from several threads: one request is on its way at a time, others wait for it.
 
     After a fork the child gets a session of its own with its first request.  Cells attached before
-    stay readable in it, and until the child drops them or ends the daemon takes them for pinned by the
+    stay readable in it; until the child drops them or ends, the daemon counts them as in use by the
     parent.  The parent notices nothing.
 
     Every request has a deadline, ``timeout`` beyond what it lets the daemon wait, and is repeated on
@@ -49,8 +50,8 @@ class Client:
         name: str,
         shm_dir: str,
     ) -> None:
-        self._session = Session(
-            paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir
+        super().__init__(
+            Session(paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir)
         )
 
     def __enter__(self) -> Client:
@@ -89,6 +90,14 @@ class Client:
         return self._session.path
 
     @property
+    def disconnected_since(self) -> float | None:
+        """`time.monotonic` of when the connection to the daemon broke; None while it stands.
+
+        Known at once when the daemon ends.  The next request connects again by itself.
+        """
+        return self._session.lost_since
+
+    @property
     def epoch(self) -> int:
         """Which life of the daemon the session is with."""
         return self._session.welcome.epoch
@@ -97,6 +106,11 @@ class Client:
     def map_version(self) -> int:
         """Which state of the map the last answer was about."""
         return self._session.map_version
+
+    @property
+    def session(self) -> Session:
+        """What its requests share; for windows."""
+        return self._session
 
     @property
     def unmapper(self) -> Unmapper:
@@ -150,7 +164,7 @@ class Client:
         SegmentError
             This user may not read the segments, or the process has no room for more mappings.
         """
-        specs = _layers(layers)
+        specs = several(layers)
         message = messages.area_to_message(area)
         return self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, intent), wait)
 
@@ -164,6 +178,7 @@ class Client:
         intent: Intent | None = None,
         by_name: bool = False,
         populate: bool = False,
+        timeout: float | None = None,
     ) -> CellSet:
         """Cells that touch an area, minus those that are held at their current version.
 
@@ -179,10 +194,12 @@ class Client:
             restarted daemon, which cannot know what the versions of an earlier life belonged to.
         populate
             Let the kernel map every page while attaching instead of at first touch.
+        timeout
+            Seconds the reply may take beyond ``wait``; None: those of the client.
 
         Other parameters and errors are those of `area`.
         """
-        specs = _layers(layers)
+        specs = several(layers)
         message = messages.area_to_message(area)
         mine = HeldCells(held, specs, by_name=by_name)
         return self._session.ask_cells(
@@ -190,6 +207,7 @@ class Client:
             wait,
             removed=mine.removed,
             populate=populate,
+            timeout_s=timeout,
         )
 
     def selected(
@@ -205,8 +223,8 @@ class Client:
         An id is the absolute path of the cell's file, or its base name where that is unique.  Other
         parameters and errors are those of `area`.
         """
-        specs = _layers(layers)
-        wanted = _ids(ids)
+        specs = several(layers)
+        wanted = several(ids)
         return self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, intent), wait)
 
     def release(self) -> int:
@@ -216,7 +234,7 @@ class Client:
         """
         return self._session.tell_unmapped()
 
-    # --- the map and the daemon -------------------------------------------------------------------
+    # --- the map ------------------------------------------------------------------------------------
 
     def metadata(self, area: geometry.Area | None = None, *, since: int | None = None) -> MapListing:
         """List the map's cells, loaded or not.
@@ -229,109 +247,9 @@ class Client:
             Only what changed after this map version, if the daemon still knows it
             (`MapListing.since_known`).
         """
-        message = messages.area_to_message(area) if area is not None else None
-        for _ in range(_LISTING_ROUNDS):
-            listing: MapListing | None = None
-            start: int | None = 0
-            while start is not None:
-                page = self._session.ask(
-                    lambda n, at=start: messages.Metadata(n, message, since, at, _PAGE_ROWS),  # type: ignore[misc]
-                    messages.MetadataPage,
-                )
-                if listing is None:
-                    listing = MapListing(
-                        self._session.welcome.id_prefix,
-                        map_version=page.map_version,
-                        since_known=page.since_known,
-                        removed=tuple(self._session.whole_id(cell) for cell in page.removed),
-                    )
-                elif page.map_version != listing.map_version:
-                    break  # a reload came in between: pages of two states do not fit together
-                listing.add(page.rows)
-                start = page.next
-            else:
-                assert listing is not None  # noqa: S101  the loop ran at least once
-                return listing
-        raise NoAnswer("the map changed again and again while it was being listed")
+        from shmmap.client.map_listing import list_cells  # most clients never ask
 
-    def stats(self) -> messages.StatsReply:
-        """Return the daemon's counters, its sessions, and memory that nobody known holds."""
-        return self._session.ask(messages.Stats, messages.StatsReply)
-
-    def show(self, cell: str) -> messages.ShownCell:
-        """Return everything about one cell: versions, segments and their holders, last failure.
-
-        Raises
-        ------
-        UnknownCell
-            The map has no such cell.
-        """
-        return self._session.ask(lambda n: messages.Show(n, cell), messages.ShownCell)
-
-    def reload(self) -> messages.Reloaded:
-        """Have the daemon read the map's directory again.
-
-        Raises
-        ------
-        NotPermitted
-            The daemon lets only administrators do this.
-        """
-        return self._session.ask(messages.Reload, messages.Reloaded)
-
-    def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
-        """Have the daemon drop cells, all by default; mapped ones are freed when they are let go.
-
-        Raises
-        ------
-        NotPermitted
-            The daemon lets only administrators do this.
-        """
-        wanted = _ids(ids) if ids is not None else None
-        return self._session.ask(lambda n: messages.Evict(n, wanted), messages.Evicted)
-
-    def pin(
-        self, ids: str | Iterable[str] = (), layers: str | Sequence[str] = ("points",)
-    ) -> messages.Pinned:
-        """Have the daemon keep cells resident, until `unpin` or its end; without ids, list its pins.
-
-        Raises
-        ------
-        NotPermitted
-            The daemon lets only administrators do this.
-        OverBudget
-            All pins together would exceed the budget.
-        """
-        wanted, specs = _ids(ids), _layers(layers)
-        return self._session.ask(lambda n: messages.Pin(n, wanted, specs), messages.Pinned)
-
-    def unpin(self, ids: str | Iterable[str] | None = None) -> messages.Pinned:
-        """Have the daemon keep cells, all by default, no longer; returns what stays pinned.
-
-        Raises
-        ------
-        NotPermitted
-            The daemon lets only administrators do this.
-        """
-        wanted = _ids(ids) if ids is not None else None
-        return self._session.ask(lambda n: messages.Unpin(n, wanted), messages.Pinned)
-
-    def shutdown(self) -> None:
-        """End the daemon, as SIGTERM would; what is mapped stays readable.
-
-        Raises
-        ------
-        NotPermitted
-            The daemon lets only administrators do this.
-        """
-        self._session.ask(messages.Shutdown, messages.Stopping)
-
-
-def _ids(ids: str | Iterable[str]) -> tuple[str, ...]:
-    return (ids,) if isinstance(ids, str) else tuple(ids)
-
-
-def _layers(layers: str | Sequence[str]) -> tuple[str, ...]:
-    return (layers,) if isinstance(layers, str) else tuple(layers)
+        return list_cells(self._session, area, since)
 
 
 def connect(
@@ -356,7 +274,8 @@ def connect(
         Seconds until the daemon must have said welcome.  Short, since a daemon always answers at once:
         whoever does not is stopped, hung or overloaded.
     name
-        How this program appears in ``shmmap clients``; at most 64 characters.
+        How this program appears in ``shmmap clients``, at most 64 characters; empty: by the name of its
+        script, or of the module it was started as (``python -m``).
     shm_dir
         Directory of the segments as this process sees it (default: ``SHMMAP_SHM_DIR``, else as the daemon
         says); for containers that have it mounted elsewhere.

@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import math
 import os
-import struct
 import time
 import weakref
 from collections.abc import Sequence
-from typing import Final, TypeVar
+from queue import SimpleQueue
+from typing import Any, Final, TypeVar
 
 import zmq
 
+from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import find_socket
+from shmmap.client.program_name import program_name
 from shmmap.errors import NoAnswer, ProtocolMismatch, error_from_wire
 from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.messages import PROTOCOL_VERSION, ErrorReply, Hello, Reply, Request, Welcome
@@ -28,7 +30,6 @@ __all__ = ["Connection"]
 
 R = TypeVar("R")
 
-_EVENT: Final = struct.Struct("=HI")  # first frame of a message of zmq_socket_monitor(3): event, value
 _SLICE_MS: Final = 100  # how often silence is looked at: did the connection break?
 _RESEND_S: Final = 1.0  # first repetition on silence; the interval then doubles
 _RECONNECT_MS: Final = 20
@@ -47,9 +48,11 @@ class Connection:
     paths
         Socket paths to try, in order.
     name
-        How this client appears in the daemon's lists.
+        How this client appears in the daemon's lists; empty: by the name of its program.
     timeout_s
         Until `Welcome` must be here.
+    waiting
+        Queues that get a None when the connection breaks; may change at any time.
 
     Attributes
     ----------
@@ -64,12 +67,18 @@ class Connection:
         As `shmmap.client.discovery.find_socket`, and when no `Welcome` comes in time.
     """
 
-    def __init__(self, paths: Sequence[str], *, name: str = "", timeout_s: float = 0.9) -> None:
+    def __init__(
+        self,
+        paths: Sequence[str],
+        *,
+        name: str = "",
+        timeout_s: float = 0.9,
+        waiting: Sequence[SimpleQueue[Any]] = (),
+    ) -> None:
         deadline_s = time.monotonic() + timeout_s
         self.path = find_socket(paths, deadline_s)
-        self._name = name
+        self._name = name or program_name()
         self._next_request = int.from_bytes(os.urandom(6), "little")
-        self._handshakes = 0
         self._hung_up = False
         self._slot = 0  # kept over restarts of the daemon: what is mapped is locked under it
         # a context of our own: no other library's sockets can hold up its end
@@ -81,21 +90,20 @@ class Connection:
         self._socket.setsockopt(zmq.RCVTIMEO, _SLICE_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
-        self._monitor = self._socket.get_monitor_socket(
-            zmq.EVENT_HANDSHAKE_SUCCEEDED
-            | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-            | zmq.EVENT_DISCONNECTED
-            | zmq.EVENT_CONNECT_RETRIED
-        )
+        self._watch = ConnectionWatch(self._socket, waiting)
         # also when nobody calls close(), and at the end of the program
-        sockets = (self._monitor, self._socket)
-        self._finalizer = weakref.finalize(self, _shut, sockets, context, os.getpid())
+        self._finalizer = weakref.finalize(self, _shut, self._watch, self._socket, context, os.getpid())
         self._socket.connect(f"ipc://{self.path}")
         self.welcome = self._greet(deadline_s)
 
     def close(self) -> None:
         """End the connection; messages just sent get a short moment to leave."""
         self._finalizer()
+
+    @property
+    def lost_since(self) -> float | None:
+        """`time.monotonic` of when the connection broke; None while it stands."""
+        return self._watch.lost_since
 
     def new_request(self) -> int:
         """Return a request id not used before."""
@@ -135,7 +143,7 @@ class Connection:
                 raise NoAnswer(f"{self.path}: no answer within {timeout_s:.3g} s", hint=_SILENT_HINT)
             if not isinstance(reply, ErrorReply):
                 raise ProtocolMismatch(
-                    f"the daemon answered {type(message).__name__} with {type(reply).__name__}",
+                    f"the daemon answered a request {type(message).__name__} with {type(reply).__name__}",
                     hint=_UPDATE_HINT,
                 )
             if reply.code != "no_session":
@@ -146,7 +154,6 @@ class Connection:
         started_s = time.monotonic()
         hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name, self._slot)
         reply = self._exchange(hello.request, encode(hello), deadline_s, 0.0)
-        self._watch_connection()
         if reply is None:
             raise NoAnswer(
                 f"{self.path}: connected, but no welcome within {time.monotonic() - started_s:.2g} s",
@@ -155,7 +162,9 @@ class Connection:
         if isinstance(reply, ErrorReply):
             raise error_from_wire(reply.code, reply.message, reply.hint)
         if not isinstance(reply, Welcome):
-            raise ProtocolMismatch(f"{self.path}: the answer to Hello was {type(reply).__name__}")
+            raise ProtocolMismatch(
+                f"{self.path}: the answer to Hello was {type(reply).__name__}", hint=_UPDATE_HINT
+            )
         if reply.major != PROTOCOL_VERSION[0]:
             raise ProtocolMismatch(
                 f"{self.path}: the daemon speaks protocol {reply.major}.{reply.minor}, "
@@ -163,18 +172,20 @@ class Connection:
                 hint=_UPDATE_HINT,
             )
         self._slot = reply.session
+        self._watch.wait_until_connected(deadline_s - time.monotonic())  # else it looks like a second time
         return reply
 
     def _exchange(self, request: int, data: bytes, deadline_s: float, quiet_s: float) -> Reply | None:
         """Send until something comes back under this request id; None at the deadline."""
         sent = False
-        handshakes = self._handshakes
+        watch = self._watch
+        handshakes = watch.handshakes
         interval_s = _RESEND_S
         resend_s = 0.0
         while True:
             now_s = time.monotonic()
-            if not sent or handshakes != self._handshakes or now_s >= resend_s:
-                handshakes = self._handshakes
+            if not sent or handshakes != watch.handshakes or now_s >= resend_s:
+                handshakes = watch.handshakes
                 sent = self._send(data)
                 resend_s = now_s + quiet_s + interval_s
                 interval_s = interval_s * 2 if sent else interval_s
@@ -184,7 +195,7 @@ class Connection:
                     return reply
             else:
                 self._socket.poll(_slice_ms(deadline_s), zmq.POLLOUT)
-            self._watch_connection()
+            self._check_peer()
             if time.monotonic() >= deadline_s:
                 return None
 
@@ -209,25 +220,18 @@ class Connection:
             if reply.request == request:
                 return reply
 
-    def _watch_connection(self) -> None:
+    def _check_peer(self) -> None:
         hung_up = self._hung_up
-        while self._monitor.poll(0):
-            # zmq.utils.monitor would do this, but loads asyncio (20 ms)
-            event, _value = _EVENT.unpack(self._monitor.recv_multipart()[0])
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                self._handshakes += 1
-            elif event == zmq.EVENT_CONNECT_RETRIED:
-                self._hung_up = False
-            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
-                raise self._no_daemon()
-            else:
-                self._hung_up = not self._handshakes
+        self._hung_up = self._watch.hung_up
         # libzmq tries again where a connection broke, but not where sockets' patterns do not fit (SUB, say)
-        if hung_up and self._hung_up:
+        if self._watch.foreign or (hung_up and self._hung_up):
             raise self._no_daemon()
 
     def _no_daemon(self) -> ProtocolMismatch:
-        return ProtocolMismatch(f"{self.path}: who listens there is no shmmap daemon")
+        return ProtocolMismatch(
+            f"{self.path}: what listens there is no shmmap daemon",
+            hint="is this the socket of another program?",
+        )
 
 
 def _slice_ms(deadline_s: float) -> int:
@@ -235,14 +239,13 @@ def _slice_ms(deadline_s: float) -> int:
 
 
 def _shut(
-    sockets: tuple[zmq.Socket[bytes], zmq.Socket[bytes]],
+    watch: ConnectionWatch,
+    socket: zmq.Socket[bytes],
     context: zmq.Context[zmq.Socket[bytes]],
     pid: int,
 ) -> None:
     if os.getpid() != pid:
         return  # in a forked child the sockets are the parent's
-    monitor, socket = sockets
-    socket.disable_monitor()
-    monitor.close(linger=0)
+    watch.stop(socket)
     socket.close(linger=_LAST_WORDS_MS)
     context.term()

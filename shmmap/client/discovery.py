@@ -131,12 +131,12 @@ def check_socket(path: str, deadline_s: float) -> None:
             heard += part
             if not heard:  # a connection that had waited, for a daemon that ended or never started
                 raise StaleSocket(
-                    f"{path}: the connection was closed without a word, by a daemon that ended",
-                    hint="see `systemctl status shmmapd` or its log: did it fail to start?",
+                    f"{path}: a daemon that ended closed the connection without an answer",
+                    hint="see its log, or `systemctl status shmmapd`: did it fail to start?",
                 )
             if not part or heard[0] != 0xFF or (len(heard) == _SIGNATURE_BYTES and heard[9] != 0x7F):
                 raise ProtocolMismatch(
-                    f"{path}: who listens there does not speak ZeroMQ",
+                    f"{path}: what listens there does not speak ZeroMQ",
                     hint="is this the socket of another program?",
                 )
 

@@ -6,14 +6,23 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple, overload
+from typing import TYPE_CHECKING, Final, NamedTuple, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shmmap import geometry
+from shmmap.client.session import Session
+from shmmap.errors import NoAnswer
+from shmmap.protocol import messages
 from shmmap.protocol.messages import MetadataRow
 
-__all__ = ["CellInfo", "MapListing"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["CellInfo", "MapListing", "list_cells"]
+
+_ROUNDS: Final = 5  # how often a listing is begun again because the map changed meanwhile
+_PAGE_ROWS: Final = 10_000
 
 
 class CellInfo(NamedTuple):
@@ -102,3 +111,37 @@ class MapListing(Sequence[CellInfo]):
     def __getitem__(self, index: int | slice) -> CellInfo | list[CellInfo]:
         chosen = range(len(self))[index]
         return [self._info(n) for n in chosen] if isinstance(chosen, range) else self._info(chosen)
+
+
+def list_cells(session: Session, area: geometry.Area | None, since: int | None) -> MapListing:
+    """Ask for all pages of the daemon's list; see `shmmap.Client.metadata`.
+
+    Raises
+    ------
+    NoAnswer
+        No reply before the deadline, or the map changed each time before the last page.
+    """
+    message = messages.area_to_message(area) if area is not None else None
+    for _ in range(_ROUNDS):
+        listing: MapListing | None = None
+        start: int | None = 0
+        while start is not None:
+            page = session.ask(
+                lambda n, at=start: messages.Metadata(n, message, since, at, _PAGE_ROWS),  # type: ignore[misc]
+                messages.MetadataPage,
+            )
+            if listing is None:
+                listing = MapListing(
+                    session.welcome.id_prefix,
+                    map_version=page.map_version,
+                    since_known=page.since_known,
+                    removed=tuple(session.whole_id(cell) for cell in page.removed),
+                )
+            elif page.map_version != listing.map_version:
+                break  # a reload came in between: pages of two states do not fit together
+            listing.add(page.rows)
+            start = page.next
+        else:
+            assert listing is not None  # noqa: S101  the loop ran at least once
+            return listing
+    raise NoAnswer("the map changed again and again while it was being listed", hint="ask again later")

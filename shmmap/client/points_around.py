@@ -4,20 +4,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.client.cell import Cell
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, NoColumn
 from shmmap.geometry import Circle, distance_to_boxes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["PointsAround", "points_around"]
 
 
 class PointsAround:
-    """Cells that touch a circle, and which of their points lie in it.
+    """Cells of a window that touch a circle, and which of their points lie in it.
 
     Nothing is copied, and no point is looked at, before `gather`, `mask` or `count` is called.
     Iterating gives the ``xyz`` of each cell as a whole: the points within the radius and those of
@@ -33,17 +35,27 @@ class PointsAround:
         Cells whose box touches the circle.
     whole : tuple of bool
         For each of them, whether its box lies wholly in the circle.
+    covered : bool
+        Whether these are all the cells that the map has there.  False where the circle reaches beyond what
+        the window's last answer was about, or a cell is missing.
     """
 
-    __slots__ = ("cells", "radius", "whole", "x", "y")
+    __slots__ = ("cells", "covered", "radius", "whole", "x", "y")
 
     def __init__(
-        self, x: float, y: float, radius: float, cells: tuple[Cell, ...], whole: tuple[bool, ...]
+        self,
+        x: float,
+        y: float,
+        radius: float,
+        cells: tuple[Cell, ...],
+        whole: tuple[bool, ...],
+        covered: bool,
     ) -> None:
         self.x = x
         self.y = y
         self.radius = radius
         self.cells = cells
+        self.covered = covered
         self.whole = whole
 
     def __repr__(self) -> str:
@@ -56,15 +68,37 @@ class PointsAround:
     def __iter__(self) -> Iterator[NDArray[Any]]:
         return (cell.xyz for cell in self.cells)
 
+    def _check_points(self) -> None:
+        """Refuse layers whose rows are no points."""
+        for cell in self.cells[:1]:
+            if "xyz" not in cell.column_names:
+                raise NoColumn(
+                    f"layer {cell.layer} has no column 'xyz': which of its rows lie in a circle is not known",
+                    hint=f"take whole cells, views(column) with {', '.join(cell.column_names)};"
+                    " or ask for another layer, points_around(..., layer='points')",
+                )
+
     def views(self, column: str = "xyz") -> list[NDArray[Any]]:
-        """Whole columns of the cells, one read-only view each; nothing is copied."""
+        """Whole columns of the cells, one read-only view each; nothing is copied.
+
+        Raises
+        ------
+        NoColumn
+            A cell has no such column.
+        """
         return [cell[column] for cell in self.cells]
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """Which points of cell number ``index`` lie in the circle, (N,) bool.
 
         Distances are computed in float64, whatever the dtype of the coordinates.
+
+        Raises
+        ------
+        NoColumn
+            The layer's rows are no points: it has no column ``xyz``.
         """
+        self._check_points()
         cell = self.cells[index]
         if self.whole[index]:
             return np.ones(cell.points, np.bool_)
@@ -78,33 +112,70 @@ class PointsAround:
         return inside
 
     def count(self) -> int:
-        """How many points lie in the circle."""
+        """How many points lie in the circle.
+
+        Raises
+        ------
+        NoColumn
+            The layer's rows are no points: it has no column ``xyz``.
+        """
+        self._check_points()
         return sum(
             cell.points if whole else int(np.count_nonzero(self.mask(index)))
             for index, (cell, whole) in enumerate(zip(self.cells, self.whole, strict=True))
         )
 
-    def gather(self, column: str = "xyz") -> NDArray[Any]:
-        """Copy a column of exactly the points in the circle into one array, cell after cell.
+    @overload
+    def gather(self, column: str = "xyz", /) -> NDArray[Any]: ...
 
-        Several columns gathered one after the other have their rows in the same order.
+    @overload
+    def gather(self, column: str, other: str, /, *others: str) -> dict[str, NDArray[Any]]: ...
+
+    def gather(self, column: str = "xyz", /, *others: str) -> NDArray[Any] | dict[str, NDArray[Any]]:
+        """Copy columns of exactly the points in the circle, cell after cell.
+
+        ::
+
+            points = near.gather()  # (N, 3)
+            columns = near.gather("xyz", "intensity")  # {"xyz": (N, 3), "intensity": (N,)}
+
+        Parameters
+        ----------
+        column, *others
+            Names of columns.
+
+        Returns
+        -------
+        array or dict of array
+            Of one column its values; of several a dict by name, whose rows belong together.
 
         Raises
         ------
-        KeyError
-            A cell has no such column.
+        NoColumn
+            A cell has no such column, or the layer's rows are no points: it has no column ``xyz``.
         BadRequest
             Coordinates of cells with different origins cannot be put into one array.
         """
-        if column == "xyz" and len({cell.origin for cell in self.cells}) > 1:
-            raise BadRequest("the cells' coordinates have different origins: use views() with cell.origin")
-        parts = [
-            cell[column] if whole else cell[column][self.mask(index)]
-            for index, (cell, whole) in enumerate(zip(self.cells, self.whole, strict=True))
-        ]
-        if not parts:
-            return np.empty((0, 3) if column == "xyz" else (0,), np.float32)
-        return np.concatenate(parts)
+        self._check_points()
+        names = (column, *others)
+        if "xyz" in names and len({cell.origin for cell in self.cells}) > 1:
+            raise BadRequest(
+                "the cells' coordinates have different origins, and do not fit into one array",
+                hint="use views() and the origin of each of its cells",
+            )
+        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+        for index, (cell, whole) in enumerate(zip(self.cells, self.whole, strict=True)):
+            inside = None if whole else self.mask(index)
+            for name, found in parts.items():
+                found.append(cell[name] if inside is None else cell[name][inside])
+        gathered = {name: _joined(name, found) for name, found in parts.items()}
+        return gathered if others else gathered[column]
+
+
+def _joined(column: str, parts: list[NDArray[Any]]) -> NDArray[Any]:
+    if not parts:
+        return np.empty((0, 3) if column == "xyz" else (0,), np.float32)
+    return np.concatenate(parts)
 
 
 def _farthest_in_boxes(x: float, y: float, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -116,7 +187,13 @@ def _farthest_in_boxes(x: float, y: float, boxes: NDArray[np.float64]) -> NDArra
 
 
 def points_around(
-    cells: Sequence[Cell], boxes: NDArray[np.float64], x: float, y: float, radius: float
+    cells: Sequence[Cell],
+    boxes: NDArray[np.float64],
+    x: float,
+    y: float,
+    radius: float,
+    *,
+    covered: bool,
 ) -> PointsAround:
     """Choose the cells that touch a circle.
 
@@ -126,6 +203,10 @@ def points_around(
         Cells of one layer.
     boxes
         Their boxes, (N, 4) float64, metres, map frame.
+    x, y, radius
+        The circle, metres, map frame.
+    covered
+        Whether these are all the cells that the map has in the circle.
 
     Raises
     ------
@@ -135,4 +216,6 @@ def points_around(
     Circle(x, y, radius)
     near = np.flatnonzero(distance_to_boxes(x, y, boxes) <= radius)
     whole = _farthest_in_boxes(x, y, boxes[near]) <= radius
-    return PointsAround(x, y, radius, tuple([cells[i] for i in near.tolist()]), tuple(whole.tolist()))
+    return PointsAround(
+        x, y, radius, tuple([cells[i] for i in near.tolist()]), tuple(whole.tolist()), covered
+    )

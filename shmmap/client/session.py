@@ -10,7 +10,8 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Final, TypeVar
+from queue import SimpleQueue
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -46,6 +47,8 @@ class Session:
         How long a reply may take, beyond what a request lets the daemon wait.
     connect_timeout_s
         How long `Welcome` may take.
+    name
+        How the program appears in the daemon's lists; empty: by its own name.
     shm_dir
         Directory of the segments; empty: as the daemon says.
 
@@ -72,6 +75,7 @@ class Session:
         self._closed = False
         self._owner_epoch = 0
         self._owner: int | None = None
+        self._waiting: list[SimpleQueue[Any]] = []
         self._inherited: list[Connection] = []
         self._connection: Connection | None = None
         self.path = ""
@@ -81,10 +85,25 @@ class Session:
         _sessions.add(self)
 
     def _connect(self) -> Connection:
-        connection = Connection(self._paths, name=self._name, timeout_s=self._connect_timeout_s)
+        connection = Connection(
+            self._paths, name=self._name, timeout_s=self._connect_timeout_s, waiting=self._waiting
+        )
         self._connection = connection
         self.path = connection.path
         return connection
+
+    @property
+    def lost_since(self) -> float | None:
+        """`time.monotonic` of when the connection broke; None while it stands, or has yet to be made."""
+        return self._connection.lost_since if self._connection is not None else None
+
+    def tell_when_lost(self, queue: SimpleQueue[Any]) -> None:
+        """From now on put a None into a queue when the connection breaks."""
+        self._waiting.append(queue)
+
+    def stop_telling(self, queue: SimpleQueue[Any]) -> None:
+        """End `tell_when_lost`."""
+        self._waiting.remove(queue)
 
     def close(self) -> None:
         """End the session; attached cells stay readable."""
@@ -110,7 +129,7 @@ class Session:
             )
         try:
             if self._closed:
-                raise BadRequest("this client is closed")
+                raise BadRequest("this client is closed", hint="connect again")
             connection = self._connection or self._connect()
             self._tell_unmapped(connection)
             yield connection
@@ -131,6 +150,7 @@ class Session:
         *,
         removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None = None,
         populate: bool = False,
+        timeout_s: float | None = None,
     ) -> CellSet:
         """Send a request for cells and attach what it brings.
 
@@ -142,11 +162,13 @@ class Session:
             Makes ids of the reply's two lists of removals.
         populate
             Let the kernel map every page now.
+        timeout_s
+            Instead of the session's own.
         """
         if wait_s is not None and not 0 <= wait_s < math.inf:
             raise BadRequest(f"wait must be a number of seconds, not {wait_s!r}")
         quiet_s = wait_s or 0.0
-        timeout_s = self.timeout_s + quiet_s
+        timeout_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
         deadline_s = time.monotonic() + timeout_s
         with self._turn(timeout_s) as connection:
             message = make(connection.new_request())
@@ -208,6 +230,7 @@ class Session:
             self._inherited.append(self._connection)
             self._connection = None
         self._lock = threading.Lock()
+        self._waiting = []
         self.attacher.unmapper.restart_in_child()
 
 

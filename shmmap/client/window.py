@@ -3,33 +3,30 @@
 
 from __future__ import annotations
 
-import math
 import os
-import time
 import weakref
 from collections.abc import Sequence
-from itertools import chain
+from threading import TIMEOUT_MAX
 from types import TracebackType
-from typing import Any, Final
-
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
 from shmmap.client.points_around import PointsAround, points_around
+from shmmap.client.pose import pose_intent
 from shmmap.client.retention import Retention, RetentionPolicy
-from shmmap.client.window_follower import PENDING_WAIT_S, WindowFollower, moved
+from shmmap.client.window_blocking import BlockingFollower
+from shmmap.client.window_follower import WindowFollower
+from shmmap.client.window_layers import layer_name
 from shmmap.client.window_refresh import WindowRefresher
-from shmmap.client.window_state import EMPTY, LayerKey, WindowState, WindowUpdate, update_between
-from shmmap.errors import BadRequest, ShmmapError
+from shmmap.client.window_state import EMPTY, LayerKey, WindowUpdate, update_between
+from shmmap.errors import BadRequest, ConnectionLost, ShmmapError
 from shmmap.geometry import Circle, ZRange
-from shmmap.protocol.messages import Intent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["MapWindow"]
-
-_BLOCKING_WAIT_S: Final = 5.0
-_FIRST_PAUSE_S: Final = 0.005  # between requests for what does not fit; doubles
-_STALLED_S: Final = 0.5  # a blocking call gives up on what does not fit after this long without progress
 
 
 class MapWindow:
@@ -67,7 +64,10 @@ class MapWindow:
     z
         (lowest, highest) heights of interest, metres.
     name
-        How the window's own session appears in ``shmmap clients``.
+        How the window's own session appears in ``shmmap clients``; empty: by the name of the program.
+    timeout
+        Seconds that a reply to the window may take, beyond what it lets the daemon wait for loads; None:
+        those of the client.  A daemon that hangs shows in `error` after this long; one that ended, at once.
 
     Raises
     ------
@@ -90,24 +90,23 @@ class MapWindow:
         background: bool = True,
         z: tuple[float, float] | None = None,
         name: str = "",
+        timeout: float | None = None,
     ) -> None:
         if not update_distance >= 0 or not refresh_interval > 0:
             raise BadRequest(
                 "update_distance must not be negative and refresh_interval must be positive,"
                 f" they are {update_distance!r} m and {refresh_interval!r} s"
             )
+        if timeout is not None and not 0 < timeout <= TIMEOUT_MAX:
+            raise BadRequest(f"timeout must be a positive number of seconds, not {timeout!r}")
         Circle(0.0, 0.0, radius)
         self._radius = radius
         self._owns_client = not isinstance(client, Client)
         self._client = client if isinstance(client, Client) else connect(client, name=name)
         self._layers = (layers,) if isinstance(layers, str) else tuple(layers)
-        self._update_distance = update_distance
-        self._refresh_interval_s = refresh_interval
         self._seen = EMPTY.versions
-        self._state = EMPTY
-        self._asked_s = 0.0
         self._closed = False
-        self._follower: WindowFollower | None = None
+        self._follower: WindowFollower | BlockingFollower
         try:
             self._refresher = WindowRefresher(
                 self._client,
@@ -117,21 +116,25 @@ class MapWindow:
                 z=ZRange(*z) if z is not None else None,
                 retention=retention if retention is not None else Retention(),
                 populate=background,  # page faults, too, are better taken by the thread
+                timeout_s=timeout,
             )
         except ShmmapError:
             if self._owns_client:
                 self._client.close()
             raise
         if background:
-            follower = WindowFollower(
+            self._follower = WindowFollower(
                 self._refresher,
-                self._client.unmapper,
+                self._client.session,
                 update_distance=update_distance,
                 refresh_interval_s=refresh_interval,
             )
-            self._follower = follower
-            # also when nobody calls close(), and at the end of the program before sockets are closed
-            self._finalizer = weakref.finalize(self, follower.stop)
+        else:
+            self._follower = BlockingFollower(
+                self._refresher, update_distance=update_distance, refresh_interval_s=refresh_interval
+            )
+        # also when nobody calls close(), and at the end of the program before sockets are closed
+        self._finalizer = weakref.finalize(self, self._follower.stop)
 
     def __enter__(self) -> MapWindow:
         return self
@@ -153,11 +156,9 @@ class MapWindow:
         if self._closed:
             return
         self._closed = True
-        if self._follower is not None:
-            self._finalizer()
-            self._follower.state = EMPTY
+        self._finalizer()
+        self._follower.state = EMPTY
         self._refresher.forget()
-        self._state = EMPTY
         self._seen = EMPTY.versions
         if self._owns_client:
             self._client.close()
@@ -199,25 +200,13 @@ class MapWindow:
         ShmmapError
             Only in the blocking mode: the daemon cannot be asked; the window keeps what it has.
         """
-        pose = _intent(x, y, vx, vy, heading, route)
+        pose = pose_intent(x, y, vx, vy, heading, route)
         if wait is not None and not wait >= 0:
             raise BadRequest(f"wait must not be negative, it is {wait!r}")
         if self._closed:
-            raise BadRequest("this window is closed")
-        follower = self._follower
-        state = None
-        if follower is None:
-            self._refresh(pose, _BLOCKING_WAIT_S if wait is None else wait)
-        else:
-            if follower.elsewhere:
-                raise BadRequest(
-                    "this window's thread lives in the parent process", hint="make a window after the fork"
-                )
-            follower.follow(pose)
-            if wait:
-                state = follower.wait_until_current(wait)
-        state = state or self._current
-        update = update_between(self._seen, state)
+            raise BadRequest("this window is closed", hint="make another one")
+        state = self._follower.move(pose, wait)
+        update = update_between(self._seen, state, current=self._follower.answers(state))
         self._seen = state.versions
         return update
 
@@ -230,45 +219,12 @@ class MapWindow:
         Returns
         -------
         bool
-            False if it was not so within ``timeout`` seconds.  In the blocking mode, whether it is so.
+            False if it was not so within ``timeout`` seconds, or the daemon cannot be asked.  In the
+            blocking mode, whether it is so.
         """
-        if self._follower is not None:
-            return self._follower.wait_until_current(timeout) is not None
-        return self._state.settled
-
-    def _refresh(self, pose: Intent, wait_s: float) -> None:
-        """Ask in the caller's thread until nothing is missing, nothing more comes, or time is up."""
-        now_s = time.monotonic()
-        state = self._state
-        due = now_s - self._asked_s >= self._refresh_interval_s
-        if state.settled and not due and not moved(state, pose, self._update_distance):
-            return
-        deadline_s = now_s + wait_s
-        progress_s = now_s
-        pause_s = _FIRST_PAUSE_S
-        del state
-        patience_s: float | None = None
-        while True:
-            after, progress = self._refresher.refresh(self._state, pose, patience_s)
-            self._state = after
-            self._asked_s = now_s = time.monotonic()
-            if after.settled or now_s >= deadline_s:
-                return
-            if progress or after.pending:
-                progress_s, pause_s = now_s, _FIRST_PAUSE_S
-            elif now_s - progress_s >= _STALLED_S:
-                return  # what is missing waits for memory that others have
-            else:
-                time.sleep(min(pause_s, deadline_s - now_s))  # what was just dropped has to be freed
-                pause_s *= 2
-            del after
-            patience_s = max(0.0, min(PENDING_WAIT_S, deadline_s - now_s))
+        return self._follower.wait_until_current(timeout) is not None
 
     # --- what the window holds ------------------------------------------------------------------------
-
-    @property
-    def _current(self) -> WindowState:
-        return self._state if self._follower is None else self._follower.state
 
     @property
     def client(self) -> Client:
@@ -278,40 +234,77 @@ class MapWindow:
     @property
     def cells(self) -> tuple[Cell, ...]:
         """Cells in the window, in id order."""
-        return tuple(self._current.cells.values())
+        return tuple(self._follower.state.cells.values())
 
     @property
     def complete(self) -> bool:
-        """Whether nothing in the window is missing: nothing pending, nothing failed."""
-        state = self._current
-        return state.asked is not None and not state.pending and not state.failed
+        """Whether the window answers the last pose, and nothing in it is missing: pending or failed.
 
-    @property
-    def error(self) -> ShmmapError | None:
-        """Why the daemon could not be asked the last time; None if it could."""
-        return None if self._follower is None else self._follower.error
+        A pose is answered by an area that was asked for less than ``update_distance`` away from it, and
+        that it lies in.  So this is false right after a jump, and as soon as a vehicle leaves behind what
+        a daemon that has died answered last.
+        """
+        state = self._follower.state
+        return self._follower.answers(state) and not state.pending and not state.failed
 
-    @property
-    def stale_since(self) -> float | None:
-        """`time.monotonic` since when the daemon cannot be asked; None while it can."""
-        return None if self._follower is None else self._follower.stale_since
+    def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
+        """Whether all that the map has within a circle is in the window, in all its layers.
 
-    @property
-    def map_version(self) -> int:
-        """State of the map the window shows."""
-        return self._current.map_version
-
-    def versions(self) -> dict[LayerKey, int]:
-        """Version of each (cell id, layer) in the window."""
-        return dict(self._current.versions)
-
-    def points_around(self, x: float, y: float, radius: float, *, layer: str | None = None) -> PointsAround:
-        """Views of the window's cells that touch a circle; nothing is copied.
+        False where the circle reaches beyond what was last answered, or while a cell is missing of which
+        no version is attached: nobody says where that one lies.
 
         Parameters
         ----------
         x, y, radius
-            Metres, map frame; what lies beyond the window is not there.
+            Metres, map frame.
+
+        Raises
+        ------
+        BadRequest
+            The circle makes no sense.
+        """
+        Circle(x, y, radius)
+        return self._follower.state.covers(x, y, radius)
+
+    @property
+    def error(self) -> ShmmapError | None:
+        """Why the daemon cannot be asked, or could not the last time; None if it could."""
+        error = self._follower.error
+        if error is None and self._client.disconnected_since is not None:
+            return ConnectionLost(
+                f"{self._client.endpoint}: the daemon closed the connection: it ended, or was restarted",
+                hint="the window serves what it has, and connects again by itself",
+            )
+        return error
+
+    @property
+    def stale_since(self) -> float | None:
+        """`time.monotonic` since when the daemon cannot be asked; None while it can.
+
+        A daemon that ends is noticed at once, one that hangs when a reply is overdue (``timeout``).
+        """
+        known = (self._follower.stale_since, self._client.disconnected_since)
+        return min((since for since in known if since is not None), default=None)
+
+    @property
+    def map_version(self) -> int:
+        """State of the map the window shows."""
+        return self._follower.state.map_version
+
+    def versions(self) -> dict[LayerKey, int]:
+        """Version of each (cell id, layer) in the window."""
+        return dict(self._follower.state.versions)
+
+    def points_around(self, x: float, y: float, radius: float, *, layer: str | None = None) -> PointsAround:
+        """Views of the window's cells that touch a circle; nothing is copied.
+
+        `PointsAround.covered` tells whether they are all that the map has there: a pose that has jumped, or
+        outrun a daemon that died, is not to be mistaken for an empty place.
+
+        Parameters
+        ----------
+        x, y, radius
+            Metres, map frame; what lies beyond the window is not there, and not ``covered``.
         layer
             Which of the window's layers, as it was asked for or as `Cell.layer` names it; by default the
             first.  Of two layers of one kind, the name is that of `Cell.layer` (`shmmap.canonical_layer`).
@@ -321,50 +314,11 @@ class MapWindow:
         BadRequest
             The circle makes no sense, or the window has no such layer.
         """
-        state = self._current
-        name = self._name_of(layer if layer is not None else self._layers[0], state)
+        state = self._follower.state
+        name = layer_name(layer if layer is not None else self._layers[0], self._layers, state.by_layer)
+        Circle(x, y, radius)
+        covered = state.covers(x, y, radius, name)
         cells = state.by_layer.get(name)
         if not cells:
-            Circle(x, y, radius)
-            return PointsAround(x, y, radius, (), ())
-        return points_around(cells, state.boxes[name], x, y, radius)
-
-    def _name_of(self, layer: str, state: WindowState) -> str:
-        """Return the name that the cells of a layer go by, in whatever form it was asked for."""
-        if layer in state.by_layer:
-            return layer
-        kind = _kind(layer)
-        asked = [one for one in self._layers if _kind(one) == kind]
-        if len(asked) > 1:
-            return layer  # parameters tell them apart; only the canonical form does so by itself
-        there = next((name for name in state.by_layer if _kind(name) == kind), None)
-        if layer in asked:
-            return there or layer
-        if there or not asked:
-            names = ", ".join([*state.by_layer] or self._layers)
-            raise BadRequest(f"the window has no layer {layer!r}", hint=f"it has {names}")
-        return layer
-
-
-def _kind(layer: str) -> str:
-    return layer.partition("(")[0].strip()
-
-
-def _intent(
-    x: float,
-    y: float,
-    vx: float,
-    vy: float,
-    heading: float | None,
-    route: Sequence[tuple[float, float]] | NDArray[Any],
-) -> Intent:
-    """Return a pose as it travels, whatever kind of numbers it came in."""
-    try:
-        path = tuple([(float(route_x), float(route_y)) for route_x, route_y in route])
-        angle = None if heading is None else float(heading)
-        pose = Intent(float(x), float(y), float(vx), float(vy), angle, path)
-    except (TypeError, ValueError) as error:
-        raise BadRequest(f"pose: numbers are needed, and two for each point of a route: {error}") from error
-    if not all(map(math.isfinite, (pose.x, pose.y, pose.vx, pose.vy, angle or 0.0, *chain(*path)))):
-        raise BadRequest("pose: every number in it must be finite")
-    return pose
+            return PointsAround(x, y, radius, (), (), covered)
+        return points_around(cells, state.boxes[name], x, y, radius, covered=covered)

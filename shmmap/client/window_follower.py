@@ -10,13 +10,14 @@ import time
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from shmmap.client.attaching import Mapping, Unmapper
+from shmmap.client.attaching import Mapping
+from shmmap.client.session import Session
 from shmmap.client.window_refresh import WindowRefresher
-from shmmap.client.window_state import EMPTY, WindowState
-from shmmap.errors import InternalError, ShmmapError
+from shmmap.client.window_state import EMPTY, WindowState, moved
+from shmmap.errors import BadRequest, InternalError, ShmmapError
 from shmmap.protocol.messages import Intent
 
-__all__ = ["PENDING_WAIT_S", "WindowFollower", "moved"]
+__all__ = ["PENDING_WAIT_S", "WindowFollower"]
 
 PENDING_WAIT_S: Final = 0.25
 """How long one request waits for loads: what is ready then is shown, and a new pose is heard."""
@@ -25,18 +26,11 @@ _RETRY_S: Final = 0.05  # first pause after an answer that brought nothing altho
 _RETRY_MAX_S: Final = 1.0  # pauses double up to this
 
 
-def moved(state: WindowState, pose: Intent, update_distance: float) -> bool:
-    """Whether ``pose`` is far enough from where was last asked to ask again."""
-    if state.asked is None:
-        return True
-    distance = math.hypot(pose.x - state.asked.x, pose.y - state.asked.y)
-    return distance > 0 and distance >= update_distance
-
-
 class WindowFollower:
     """Keeps a window current in a thread of its own.
 
-    Everything reaches the thread through one queue: new poses, mappings to give back, the end.
+    Everything reaches the thread through one queue: new poses, mappings to give back, that the connection
+    broke, the end.
     Everything leaves it by replacing one attribute.
 
     Attributes
@@ -52,13 +46,14 @@ class WindowFollower:
     def __init__(
         self,
         refresher: WindowRefresher,
-        unmapper: Unmapper,
+        session: Session,
         *,
         update_distance: float,
         refresh_interval_s: float,
     ) -> None:
         self._refresher = refresher
-        self._unmapper = unmapper
+        self._session = session
+        self._unmapper = session.attacher.unmapper
         self._update_distance = update_distance
         self._refresh_interval_s = refresh_interval_s
         self._mailbox: SimpleQueue[Mapping | None] = SimpleQueue()
@@ -71,21 +66,38 @@ class WindowFollower:
         self.state = EMPTY
         self.error: ShmmapError | None = None
         self.stale_since: float | None = None
-        unmapper.defer_to(self._mailbox)
+        self._unmapper.defer_to(self._mailbox)
+        session.tell_when_lost(self._mailbox)
         self._thread = threading.Thread(target=self._run, name="shmmap-window", daemon=True)
         self._thread.start()
 
     @property
-    def elsewhere(self) -> bool:
+    def _elsewhere(self) -> bool:
         """Whether this is a forked child, where the thread does not exist."""
         return os.getpid() != self._pid
 
-    def follow(self, pose: Intent) -> None:
-        """Take a new pose; returns at once."""
+    def answers(self, state: WindowState) -> bool:
+        """Whether a state answers the latest pose."""
+        pose = self._pose
+        return pose is not None and not moved(state, pose, self._update_distance)
+
+    def move(self, pose: Intent, wait_s: float | None) -> WindowState:
+        """Take a new pose and return a state: at once, or when it is current, at the latest after ``wait_s``.
+
+        Raises
+        ------
+        BadRequest
+            This is a forked child.
+        """
+        if self._elsewhere:
+            raise BadRequest(
+                "this window's thread lives in the parent process", hint="make a window after the fork"
+            )
         self._pose = pose
         if not self._called and moved(self.state, pose, self._update_distance):
             self._called = True  # once is enough, however often poses come
             self._mailbox.put(None)
+        return (self.wait_until_current(wait_s) if wait_s else None) or self.state
 
     def wait_until_current(self, timeout_s: float) -> WindowState | None:
         """Wait until the state answers the latest pose and nothing is missing; None at the deadline.
@@ -97,17 +109,16 @@ class WindowFollower:
             return self.state if current else None
 
     def _is_current(self) -> bool:
-        pose = self._pose
         return (
-            pose is not None
+            self.answers(self.state)
             and self.error is None
             and self.state.settled
-            and not moved(self.state, pose, self._update_distance)
+            and not self._refresher.lost
         )
 
     def stop(self) -> None:
         """End the thread; what is attached stays so."""
-        if self.elsewhere or self._stopping:
+        if self._elsewhere or self._stopping:
             return
         self._stopping = True
         self._mailbox.put(None)
@@ -123,7 +134,7 @@ class WindowFollower:
                 pose = self._pose
                 if pose is None:
                     continue
-                if self.error is None and moved(self.state, pose, self._update_distance):
+                if self.error is None and (not self.answers(self.state) or self._refresher.lost):
                     due_s = 0.0
                 if time.monotonic() >= due_s:
                     due_s = time.monotonic() + self._refresh(pose)
@@ -131,6 +142,7 @@ class WindowFollower:
             self._publish(self.state, InternalError(f"the window's thread ended: {error!r}"))
             raise
         finally:
+            self._session.stop_telling(self._mailbox)
             self._unmapper.stop_deferring(self._mailbox)
 
     def _wait(self, until_s: float) -> bool:

@@ -46,6 +46,8 @@ class WindowRefresher:
         What to keep of what leaves the window.
     populate
         Let the kernel map every page while attaching.
+    timeout_s
+        How long a reply may take beyond what the request waits; None: as long as the client lets it.
     clock
         Seconds.
 
@@ -70,6 +72,7 @@ class WindowRefresher:
         z: geometry.ZRange | None,
         retention: RetentionPolicy,
         populate: bool,
+        timeout_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if shape not in _SHAPES:
@@ -82,8 +85,14 @@ class WindowRefresher:
         self._z = z
         self._retention = retention
         self._populate = populate
+        self._timeout_s = timeout_s
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
+
+    @property
+    def lost(self) -> bool:
+        """Whether the connection to the daemon is broken at present."""
+        return self._client.disconnected_since is not None
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
         """Ask the daemon once.
@@ -100,12 +109,13 @@ class WindowRefresher:
         ShmmapError
             As `Client.differential`; the old state stays true.
         """
-        answer = self._ask(state, pose, wait_s, by_name=False)
+        area = self._make_area(pose.x, pose.y, self._radius, self._z)
+        answer = self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
             # Another life of the daemon cannot know what versions of an earlier one belonged to, and takes
             # those that are not current for strangers.  What was attached stays so while asking again.
             first = answer
-            answer = self._ask(state, pose, wait_s, by_name=True)
+            answer = self._ask(state, area, pose, wait_s, by_name=True)
             del first
         now_s = self._clock()
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
@@ -118,26 +128,32 @@ class WindowRefresher:
                 pending=answer.pending,
                 failed=answer.failed,
                 asked=pose,
+                area=area,
                 epoch=answer.epoch,
                 map_version=answer.map_version,
             )
         else:
-            after = self._apply(state, answer, pose, now_s)
+            after = self._apply(state, answer, area, pose, now_s)
         self._retain(pose, now_s)
         return after, progress
 
-    def _ask(self, state: WindowState, pose: Intent, wait_s: float | None, *, by_name: bool) -> CellSet:
+    def _ask(
+        self, state: WindowState, area: geometry.Area, pose: Intent, wait_s: float | None, *, by_name: bool
+    ) -> CellSet:
         return self._client.differential(
-            self._make_area(pose.x, pose.y, self._radius, self._z),
+            area,
             state.cells.values(),
             self._layers,
             wait=wait_s,
             intent=pose,
             by_name=by_name,
             populate=self._populate,
+            timeout=self._timeout_s,
         )
 
-    def _apply(self, state: WindowState, answer: CellSet, pose: Intent, now_s: float) -> WindowState:
+    def _apply(
+        self, state: WindowState, answer: CellSet, area: geometry.Area, pose: Intent, now_s: float
+    ) -> WindowState:
         removed = set(answer.removed)
         cells = {key: cell for key, cell in state.cells.items() if key[0] not in removed}
         if removed:
@@ -152,6 +168,7 @@ class WindowRefresher:
             pending=answer.pending,
             failed=answer.failed,
             asked=pose,
+            area=area,
             epoch=answer.epoch,
             map_version=answer.map_version,
         )

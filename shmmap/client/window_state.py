@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from shmmap import geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
 from shmmap.errors import CellError, OverBudget
 from shmmap.protocol.messages import Intent
 
-__all__ = ["EMPTY", "LayerKey", "WindowState", "WindowUpdate", "update_between"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["EMPTY", "LayerKey", "WindowState", "WindowUpdate", "moved", "update_between"]
 
 LayerKey: TypeAlias = tuple[str, str]
 """Cell id and layer."""
@@ -35,6 +39,9 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
         Cells still being loaded.
     failed : tuple of CellError
         Cells that cannot be had at present.
+    current : bool
+        Whether the window answers the pose just given.  In the background mode it may still answer an
+        earlier one.
     """
 
     added: tuple[Cell, ...] = ()
@@ -43,6 +50,7 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     removed: tuple[str, ...] = ()
     pending: tuple[PendingLayer, ...] = ()
     failed: tuple[CellError, ...] = ()
+    current: bool = False
 
     @property
     def any(self) -> bool:
@@ -51,8 +59,8 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
 
     @property
     def complete(self) -> bool:
-        """Whether nothing in the window is missing."""
-        return not self.pending and not self.failed
+        """Whether the window answers the pose just given, and nothing in it is missing."""
+        return self.current and not self.pending and not self.failed
 
 
 class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
@@ -68,6 +76,9 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         By layer, boxes of its cells in the order of ``by_layer``, (N, 4) float64.
     asked
         The pose that was asked about; None before the first answer.
+    area
+        What was asked about: all that the map has there is in ``cells``, or named in ``pending`` or
+        ``failed``.
     """
 
     cells: Mapping[LayerKey, Cell] = {}
@@ -77,6 +88,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     pending: tuple[PendingLayer, ...] = ()
     failed: tuple[CellError, ...] = ()
     asked: Intent | None = None
+    area: geometry.Area | None = None
     epoch: int = 0
     map_version: int = 0
 
@@ -89,6 +101,18 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
             and not any(isinstance(failure, OverBudget) for failure in self.failed)
         )
 
+    def covers(self, x: float, y: float, radius: float, layer: str | None = None) -> bool:
+        """Whether all that the map has within a circle is in ``cells``, of one layer or of all.
+
+        Of a cell that is missing nobody says where it lies: it counts as if it lay in the circle.  One of
+        which an older version is here is not missing.
+        """
+        if self.area is None or not self.area.contains_circle(x, y, radius):
+            return False
+        missing = [(cell.id, cell.layer) for cell in self.pending]
+        missing += [(failure.cell_id, failure.layer) for failure in self.failed]
+        return not any(key not in self.cells and layer in (None, key[1]) for key in missing)
+
     @classmethod
     def build(
         cls,
@@ -97,6 +121,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         pending: tuple[PendingLayer, ...],
         failed: tuple[CellError, ...],
         asked: Intent,
+        area: geometry.Area,
         epoch: int,
         map_version: int,
     ) -> WindowState:
@@ -113,6 +138,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
             pending,
             failed,
             asked,
+            area,
             epoch,
             map_version,
         )
@@ -121,10 +147,24 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
 EMPTY: Final = WindowState()
 
 
-def update_between(before: Mapping[LayerKey, int], state: WindowState) -> WindowUpdate:
+def moved(state: WindowState, pose: Intent, update_distance: float) -> bool:
+    """Whether ``pose`` is so far from where was last asked that the daemon must be asked again.
+
+    That is ``update_distance`` metres, or outside the area that was answered.
+    """
+    if state.asked is None or state.area is None:
+        return True
+    distance = math.hypot(pose.x - state.asked.x, pose.y - state.asked.y)
+    return distance > 0 and (
+        distance >= update_distance or not state.area.contains_circle(pose.x, pose.y, 0.0)
+    )
+
+
+def update_between(before: Mapping[LayerKey, int], state: WindowState, *, current: bool) -> WindowUpdate:
     """Compare a state with the versions of an earlier one."""
     if before is state.versions:
-        return WindowUpdate(kept=tuple(state.cells.values()), pending=state.pending, failed=state.failed)
+        kept_all = tuple(state.cells.values())
+        return WindowUpdate(kept=kept_all, pending=state.pending, failed=state.failed, current=current)
     added: list[Cell] = []
     kept: list[Cell] = []
     changed: list[Cell] = []
@@ -138,4 +178,5 @@ def update_between(before: Mapping[LayerKey, int], state: WindowState) -> Window
         tuple(dict.fromkeys(cell_id for cell_id, layer in before if (cell_id, layer) not in state.cells)),
         state.pending,
         state.failed,
+        current,
     )

@@ -11,34 +11,38 @@ DLPack: ``cell.xyz`` is exported read-only by numpy 2.1 and later to consumers t
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from shmmap.errors import needed_packages
 
 if TYPE_CHECKING:
     import open3d
     import torch
-
-    from shmmap.client.cell import Cell
+    from numpy.typing import NDArray
 
 __all__ = ["open3d_cloud", "torch_tensors"]
 
 
-def open3d_cloud(cell: Cell) -> open3d.t.geometry.PointCloud:
-    """Return ``open3d.t.geometry.PointCloud`` over a cell's memory; see `Cell.to_open3d`."""
-    import open3d
+def open3d_cloud(columns: Mapping[str, NDArray[Any]]) -> open3d.t.geometry.PointCloud:
+    """Return ``open3d.t.geometry.PointCloud`` over the memory of a cell's columns; see `Cell.to_open3d`."""
+    with needed_packages("to_open3d()"):
+        import open3d
 
     cloud = open3d.t.geometry.PointCloud()
-    for name, view in cell.columns.items():
+    for name, view in columns.items():
         # Open3D wants a row per point, also where a point has one value
         rows = view if view.ndim > 1 else view.reshape(-1, 1)
         cloud.point["positions" if name == "xyz" else name] = open3d.core.Tensor.from_numpy(rows)
     return cloud
 
 
-def torch_tensors(cell: Cell) -> dict[str, torch.Tensor]:
-    """Return a tensor for each column over a cell's memory; see `Cell.to_torch`."""
-    import torch
+def torch_tensors(columns: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+    """Return a tensor for each column over that memory; see `Cell.to_torch`."""
+    with needed_packages("to_torch()"):
+        import torch
 
     with warnings.catch_warnings():
         # that the array is not writeable: said in the documentation instead of once in a process
         warnings.filterwarnings("ignore", message=".*not writ[e]?able.*", category=UserWarning)
-        return {name: torch.from_numpy(view) for name, view in cell.columns.items()}
+        return {name: torch.from_numpy(view) for name, view in columns.items()}

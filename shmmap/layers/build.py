@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest, InternalError
+from shmmap.errors import BadRequest, InternalError, needed_packages
 from shmmap.layers.contract import BUILT_ANYWHERE, Box, Columns, LayerTable, PointTable
 from shmmap.layers.spec import LayerSpec, parse_layer
 
@@ -57,6 +57,8 @@ def build_layer(
         If the spec or the arrays make no sense.
     MapDataError
         If the points cannot be turned into this layer.
+    PackageMissing
+        If a package that builds it is not installed.
     """
     spec = parse_layer(layer) if isinstance(layer, str) else layer
     given = points if isinstance(points, Mapping) else {"xyz": points}
@@ -64,7 +66,8 @@ def build_layer(
     around = None
     if halo is not None:
         around = np.ascontiguousarray(_checked({"xyz": halo})["xyz"], columns["xyz"].dtype)
-    return build_spec(spec, PointTable(columns, dict(units or {}), box, around))
+    with needed_packages(f"layer {spec.kind.name}"):
+        return build_spec(spec, PointTable(columns, dict(units or {}), box, around))
 
 
 def build_spec(spec: LayerSpec, points: PointTable) -> LayerTable:

@@ -23,7 +23,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, needed_packages
 
 __all__ = ["CONVENTIONS", "Convention", "voxel_covariances"]
 
@@ -55,7 +55,8 @@ def voxel_covariances(
         Both are 0 where the originals refuse a voxel: it has one point, or (``pcl``) all of its
         points are the same.
     """
-    from shmmap.layers.ndt_kernels import inverse_covariances
+    with needed_packages("voxel_covariances()"):
+        from shmmap.layers.ndt_kernels import inverse_covariances
 
     if convention not in CONVENTIONS:
         raise BadRequest(f"no convention {convention!r}", hint=f"conventions are: {', '.join(CONVENTIONS)}")

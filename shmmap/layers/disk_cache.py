@@ -23,14 +23,16 @@ import struct
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
+import msgspec
 import xxhash
 
 from shmmap.errors import CannotWrite, SegmentCorrupt
 from shmmap.layers.contract import Box
 from shmmap.layers.spec import LayerSpec
+from shmmap.segment.header import pack_header, unpack_header
 from shmmap.segment.layout import (
     LAYOUT_VERSION,
     NO_SOURCE,
@@ -38,9 +40,7 @@ from shmmap.segment.layout import (
     SegmentHeader,
     SourceStamp,
     header_size,
-    pack_header,
-    unpack_header,
-)  # fmt: skip
+)
 from shmmap.segment.writer import write_all
 
 __all__ = ["CacheKey", "LayerCache", "neighbour_states"]
@@ -178,7 +178,9 @@ class LayerCache:
             return None
         entry, found = opened
         try:
-            header = replace(found, cell_id=key.cell_id, frame_id=key.frame_id, source=key.stamp)
+            header = msgspec.structs.replace(
+                found, cell_id=key.cell_id, frame_id=key.frame_id, source=key.stamp
+            )
             needed = header_size(len(header.columns), header.cell_id, header.layer, header.frame_id)
             if needed != found.header_bytes:
                 return None  # the columns would have to move

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Final
 
 import msgspec
@@ -37,10 +38,17 @@ def _plain(value: object) -> object:
 
 
 _encoder: Final = msgspec.msgpack.Encoder(enc_hook=_plain)
-_requests: Final[msgspec.msgpack.Decoder[Request]] = msgspec.msgpack.Decoder(Request)
-_replies: Final[msgspec.msgpack.Decoder[Reply]] = msgspec.msgpack.Decoder(Reply)
-
 encode: Final = _encoder.encode
+
+
+@cache  # made when it is first needed: a client never decodes requests, and importing it should be cheap
+def _requests() -> msgspec.msgpack.Decoder[Request]:
+    return msgspec.msgpack.Decoder(Request)
+
+
+@cache
+def _replies() -> msgspec.msgpack.Decoder[Reply]:
+    return msgspec.msgpack.Decoder(Reply)
 
 
 def encode_handle(handle: Handle) -> bytes:
@@ -75,7 +83,7 @@ def encode_cells(
 def decode_request(data: bytes | memoryview) -> Request:
     """Return the request; `BadRequest` says at which element it is wrong."""
     try:
-        return _requests.decode(data)
+        return _requests().decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise BadRequest(f"the request does not decode: {error}") from error
 
@@ -107,7 +115,7 @@ def unpack_versions(packed: bytes) -> tuple[int, ...]:
 def decode_reply(data: bytes | memoryview) -> Reply:
     """Return the reply; `ProtocolMismatch` if it is none of this protocol version."""
     try:
-        return _replies.decode(data)
+        return _replies().decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise ProtocolMismatch(
             f"the daemon's reply does not decode: {error}", hint="update the older of client and daemon"

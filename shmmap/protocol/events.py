@@ -7,6 +7,7 @@ what happened.  Events of one epoch are numbered from 1 without gaps, so that wh
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final, TypeAlias
 
 import msgspec
@@ -188,9 +189,12 @@ class EventPage(msgspec.Struct, array_like=True, tag="events"):
 
 
 _encoder: Final = msgspec.msgpack.Encoder()
-_decoder: Final[msgspec.msgpack.Decoder[Event]] = msgspec.msgpack.Decoder(Event)
-
 encode_event: Final = _encoder.encode
+
+
+@cache  # made when it is first needed: most clients hear no events
+def _events() -> msgspec.msgpack.Decoder[Event]:
+    return msgspec.msgpack.Decoder(Event)
 
 
 def decode_event(data: bytes | memoryview | msgspec.Raw) -> Event | None:
@@ -202,7 +206,7 @@ def decode_event(data: bytes | memoryview | msgspec.Raw) -> Event | None:
         It is no event.
     """
     try:
-        return _decoder.decode(data)
+        return _events().decode(data)
     except msgspec.ValidationError as error:
         try:
             head = msgspec.msgpack.decode(data)

@@ -91,7 +91,23 @@ class PendingCell(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Holder(msgspec.Struct, array_like=True, frozen=True):
-    """Who keeps memory in use; session and pid 0 mean "unknown"."""
+    """Who uses memory of the daemon; ``str`` of it is a line to read.
+
+    Attributes
+    ----------
+    session : int
+        Number of the client's session; 0: a process maps segments without one.
+    pid, uid : int
+        Process and user by the kernel's word; 0 and -1 where it does not tell.
+    client : str
+        What the client calls itself, by default its script's name.
+    bytes : int
+        Memory it uses.
+    cells : int
+        In how many segments; 0 where that is not counted.
+    command : str
+        What the kernel calls the process.
+    """
 
     session: int
     pid: int
@@ -100,6 +116,13 @@ class Holder(msgspec.Struct, array_like=True, frozen=True):
     bytes: int
     cells: int = 0
     command: str = ""
+
+    def __str__(self) -> str:
+        what = f"{self.bytes} bytes" + (f" in {self.cells} cells" if self.cells else "")
+        if self.session == 0:
+            return f"unknown (not through the client library) holds {what}"
+        name = f" ({self.client})" if self.client else ""
+        return f"session {self.session:016x}, pid {self.pid}{name} holds {what}"
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
@@ -191,7 +214,7 @@ class SessionRow(msgspec.Struct, array_like=True, frozen=True):
 
 
 class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
-    """Answer to `Stats`: counters by name, sessions, and pins nobody known holds."""
+    """Answer to `Stats`: counters by name, sessions, and segments in use by processes without a session."""
 
     request: int
     epoch: int
@@ -203,7 +226,7 @@ class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
 
 
 class ShownSegment(msgspec.Struct, array_like=True, frozen=True):
-    """One segment of a shown cell; ``state`` is resident, stale or zombie."""
+    """One segment of a shown cell; ``state`` is resident, stale or zombie (retired, but still in use)."""
 
     layer: str
     version: int

@@ -124,7 +124,7 @@ class Reload(msgspec.Struct, array_like=True, tag="reload"):
 
 
 class Evict(msgspec.Struct, array_like=True, tag="evict"):
-    """Retire cells, all when ``ids`` is nil (privileged); pinned ones are freed when let go."""
+    """Retire cells, all when ``ids`` is nil (privileged); those in use are freed when they are let go."""
 
     request: int
     ids: tuple[str, ...] | None = None
@@ -152,7 +152,7 @@ class Shutdown(msgspec.Struct, array_like=True, tag="shutdown"):
 
 
 class Bye(msgspec.Struct, array_like=True, tag="bye"):
-    """The session ends; there is no reply.  What it still maps stays pinned by the kernel's word."""
+    """The session ends; there is no reply.  What it still maps stays in use, by the kernel's word."""
 
     request: int
 

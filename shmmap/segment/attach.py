@@ -13,25 +13,21 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import posix_ipc
-from numpy.typing import NDArray
 
-from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle, needed_packages
 from shmmap.failpoints import step
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.layout import (
-    PAGE_BYTES,
-    ColumnRow,
-    PublishBlock,
-    SegmentHeader,
-    read_columns,
-    unpack_header,
-    unpack_publish_block,
-)
+from shmmap.segment.header import read_columns, unpack_header
+from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
 from shmmap.segment.pins import lock_slot
+from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["AttachedSegment", "Unmap", "attach", "unmap"]
 
@@ -74,7 +70,7 @@ class _Mapping:
             number = ctypes.get_errno()
             raise SegmentError(
                 f"cannot map {nbytes} bytes: {os.strerror(number)}",
-                hint="vm.max_map_count or RLIMIT_AS may be too low",
+                hint="vm.max_map_count, or the limit of address space (ulimit -v), may be too low",
             )
         self._address = address
         self._nbytes = nbytes
@@ -137,7 +133,8 @@ class AttachedSegment:
         SegmentCorrupt
             Naming the first column whose bytes changed.
         """
-        import xxhash
+        with needed_packages("verify()"):
+            import xxhash
 
         for column in self.header.columns:
             if (
@@ -224,7 +221,7 @@ def attach(
         available = status.st_size
         end = offset + nbytes if nbytes else available
         if end > available or end == 0:
-            raise SegmentCorrupt(f"segment {name} has {available} bytes, the handle needs {end}")
+            raise SegmentCorrupt(f"segment {name} has {available} bytes, the daemon's handle says {end}")
         size = end - offset
         # Reading the header is cheaper than the page fault that looking at it would cost
         page = os.pread(fd, min(size, PAGE_BYTES), offset)

@@ -13,7 +13,7 @@ import os
 
 from shmmap.errors import ConfigError
 from shmmap.failpoints import step
-from shmmap.segment.layout import PublishBlock, pack_publish_block
+from shmmap.segment.publish_block import PublishBlock, pack_publish_block
 
 __all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import signal
 import struct
 import time
 from typing import Final
@@ -36,6 +35,8 @@ _OFD_SETLK: Final = 37
 
 def prepare_process() -> None:
     """Ignore SIGIO; without this an opener that meets our lease would kill this process."""
+    import signal  # for daemons: clients take no lease
+
     signal.signal(signal.SIGIO, signal.SIG_IGN)
 
 
@@ -47,7 +48,8 @@ def lock_slot(fd: int, slot: int) -> None:
 def is_pinned(fd: int) -> bool:
     """Whether anybody but this descriptor has the file open or mapped.
 
-    The caller must own the file (or be root) and hold no other descriptor or mapping of it.
+    That counts as in use, whoever it is; an operator's pins are another thing.  The caller must own the
+    file (or be root) and hold no other descriptor or mapping of it.
     """
     try:
         fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
@@ -61,7 +63,7 @@ def is_pinned(fd: int) -> bool:
 def holders(fd: int, *, limit: int = 1024) -> list[int]:
     """Slots of the sessions that hold the file, ascending, at most ``limit`` of them.
 
-    Pins without a lock are not among them.  The kernel answers with *some* conflicting lock of the
+    Whoever uses it without a lock is not among them.  The kernel answers with *some* conflicting lock of the
     range asked about, so the range is split around each answer.  A reader may hold locks without
     number, and each question takes the kernel longer the more there are: asking ends after
     `PATIENCE_S` or `MOST_RANGES` locks that are nobody's, with what was found by then.

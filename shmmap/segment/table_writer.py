@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp, header_size, pack_header, plan_arrays
+from shmmap.segment.header import pack_header
+from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp, header_size, plan_arrays
 from shmmap.segment.writer import write_all
 
 __all__ = ["SegmentOrigin", "write_table"]
@@ -78,7 +80,7 @@ def write_table(
         cell_id=origin.cell_id,
         layer=layer,
         columns=tuple(
-            replace(column, checksum=xxhash.xxh3_64_intdigest(_bytes(array)))
+            msgspec.structs.replace(column, checksum=xxhash.xxh3_64_intdigest(_bytes(array)))
             for column, array in zip(placed, columns.values(), strict=True)
         ),
         rows=rows,

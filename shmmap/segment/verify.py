@@ -13,7 +13,9 @@ from typing import Final
 import xxhash
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.segment.layout import PAGE_BYTES, PublishBlock, SegmentHeader, unpack_header, unpack_publish_block
+from shmmap.segment.header import unpack_header
+from shmmap.segment.layout import PAGE_BYTES, SegmentHeader
+from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
 
 __all__ = ["read_header", "verify_file"]
 

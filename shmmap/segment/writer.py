@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 
+import msgspec
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.failpoints import step
-from shmmap.segment.layout import Column, SegmentHeader, SourceStamp, header_size, pack_header, plan_columns
+from shmmap.segment.header import pack_header
+from shmmap.segment.layout import Column, SegmentHeader, SourceStamp, header_size, plan_columns
 
 __all__ = ["SegmentWriter", "write_all"]
 
@@ -117,8 +118,8 @@ class SegmentWriter:
                 raise ValueError(
                     f"column {column.name!r}: {end - column.offset} of {column.nbytes} bytes written"
                 )
-            columns.append(replace(column, checksum=digest.intdigest()))
-        header = replace(
+            columns.append(msgspec.structs.replace(column, checksum=digest.intdigest()))
+        header = msgspec.structs.replace(
             self._header,
             columns=tuple(columns),
             z_min=z_min,

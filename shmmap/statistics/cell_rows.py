@@ -39,7 +39,7 @@ class CellRow:
     segment
         Segment name without the prefix ``/shmmap.<instance>.``, at most 16 bytes.
     state
-        ``resident``, ``stale`` or ``zombie``.
+        ``resident``, ``stale`` (its source has changed) or ``zombie`` (retired, but still in use).
     bytes
         Memory it occupies, as measured.
     points

@@ -24,7 +24,8 @@ from shmmap.errors import InternalError, MapDataError
 from shmmap.layers.build import build_layer
 from shmmap.layers.contract import LayerTable
 from shmmap.layers.spec import LayerSpec, parse_layer
-from shmmap.segment.layout import NO_SOURCE, unpack_header
+from shmmap.segment.header import unpack_header
+from shmmap.segment.layout import NO_SOURCE
 from shmmap.segment.table_writer import SegmentOrigin, write_table
 from shmmap.testing.layer_clouds import CORNERS, corner
 

@@ -21,8 +21,8 @@ from pathlib import Path
 
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.layers.points import build_points
-from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name
+from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.verify import verify_file
 from tests.support.divided_map import make_map
 from tests.unit.daemon.inner_daemon import InnerDaemon

@@ -19,6 +19,7 @@ import pytest
 
 import shmmap
 from shmmap.client.connection import Connection
+from shmmap.client.program_name import program_name
 from shmmap.errors import (
     BadRequest,
     LoadFailed,
@@ -67,6 +68,23 @@ def test_everything_says_what_it_is(daemon: Factory, divided_map: DividedMap) ->
         assert repr(window) == "<MapWindow closed, 0 cells of points>"
         with pytest.raises(TypeError, match="AutowareSquare"):
             client.area((1.0, 2.0, 3.0))  # type: ignore[arg-type]
+
+
+def test_a_client_goes_by_its_script(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:
+    one = daemon(divided_map.root)
+    script = tmp_path / "localize.py"
+    script.write_text(
+        "import sys, shmmap\n"
+        "for options in ({}, {'name': 'own'}):\n"
+        "    with shmmap.connect(sys.argv[1], **options) as client:\n"
+        "        print(*sorted(session.client for session in client.stats().sessions))\n"
+        "with shmmap.MapWindow(sys.argv[1]) as window:\n"
+        "    print(*sorted(session.client for session in window.client.stats().sessions))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script), one.endpoint], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["localize.py", "own", "localize.py"]
 
 
 def test_areas(daemon: Factory, divided_map: DividedMap) -> None:
@@ -420,7 +438,7 @@ def test_closing_ends_the_session_unless_something_is_held(daemon: Factory, divi
         keeper = shmmap.connect(one.endpoint, name="keeper")
         kept = keeper.selected(["0_0.pcd"])
         keeper.close()
-        assert {row.client for row in watcher.stats().sessions} == {"", "keeper"}
+        assert {row.client for row in watcher.stats().sessions} == {program_name(), "keeper"}
         assert kept.complete
 
 

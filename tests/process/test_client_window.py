@@ -13,13 +13,15 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
 
 import shmmap
 from shmmap.client.retention import Departed
-from shmmap.errors import BadRequest, DaemonUnreachable, NoAnswer
+from shmmap.client.window_follower import WindowFollower
+from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
 
@@ -105,7 +107,7 @@ def test_a_window_that_stands_still_learns_of_a_reload(daemon: Factory, divided_
 
 def wait_for(window: shmmap.MapWindow, reached: Callable[[], bool]) -> None:
     """Wait until the window's thread has published a state that fits."""
-    assert window._follower is not None
+    assert isinstance(window._follower, WindowFollower)
     with window._follower._changed:
         assert window._follower._changed.wait_for(reached, LONG_S)
 
@@ -183,6 +185,90 @@ def test_a_background_window_survives_its_daemon(daemon: Factory, divided_map: D
         assert set(by_name(update.kept)) == inside & before
         assert set(by_name(update.added)) == inside - before
     client.close()
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_jump_is_not_complete_before_it_is_answered(
+    daemon: Factory, divided_map: DividedMap, background: bool
+) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.MapWindow(one.endpoint, 30, timeout=1.0, background=background) as window:
+        assert [window.complete, window.covers(0, 0)] == [False, False]
+        assert window.move_to(0, 0, wait=LONG_S).complete
+        assert [window.complete, window.covers(0, 0)] == [True, True]
+        assert window.covers(10, 0, 20)
+        assert not window.covers(10, 0, 21)
+        assert window.points_around(10, 0, 20).covered
+        one.send(signal.SIGSTOP)  # whoever reads now reads what was answered before
+        if background:
+            update = window.move_to(45, 0)
+            assert not update.complete
+            assert not update.any
+        else:
+            with pytest.raises(NoAnswer):
+                window.move_to(45, 0, wait=0)
+            assert isinstance(window.error, NoAnswer)
+            assert window.stale_since is not None
+        assert [window.complete] == [False]
+        assert not window.wait_until_current(0)
+        near = window.points_around(45, 0, 10)
+        assert not near.covered
+        assert window.points_around(10, 0, 20).covered, "what is behind is still there"
+        one.send(signal.SIGCONT)
+        assert window.move_to(45, 0, wait=LONG_S).complete
+        assert window.complete
+        assert window.points_around(45, 0, 10).covered
+        assert [window.error, window.stale_since] == [None, None]
+
+
+def test_a_vehicle_that_outruns_a_dead_daemon_is_told(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.MapWindow(one.endpoint, 40, update_distance=10) as window:
+        window.move_to(0, 0, wait=LONG_S)
+        one.kill()
+        told = [
+            (window.move_to(x, 0).complete, window.covers(x, 0, 30)) for x in (5.0, 9.9, 10.0, 11.0, 60.0)
+        ]
+    assert told == [(True, True), (True, True), (False, True), (False, False), (False, False)]
+
+
+def test_a_daemon_that_ends_is_noticed_at_once(daemon: Factory, divided_map: DividedMap) -> None:
+    """By an event: nothing is asked in this test, and no timer of window or client runs out."""
+    one = daemon(divided_map.root)
+    with (
+        shmmap.connect(one.endpoint) as client,
+        shmmap.MapWindow(client, 30, refresh_interval=1e6, timeout=3 * LONG_S) as window,
+    ):
+        window.move_to(0, 0, wait=LONG_S)
+        assert [client.disconnected_since] == [None]
+        lost: SimpleQueue[None] = SimpleQueue()
+        client.session.tell_when_lost(lost)
+        one.kill()
+        lost.get(timeout=LONG_S)
+        assert type(window.error) is ConnectionLost
+        assert [window.stale_since] == [client.disconnected_since] != [None]
+        assert not window.wait_until_current(0)
+        assert window.complete, "it still answers the pose"
+        one.start()
+        assert window.wait_until_current(LONG_S), "it asks again by itself"
+        assert [window.error, window.stale_since, client.disconnected_since] == [None, None, None]
+
+
+def test_a_window_s_timeout_is_its_own(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with (
+        shmmap.connect(one.endpoint, timeout=3 * LONG_S) as client,
+        shmmap.MapWindow(client, 30, update_distance=0, timeout=0.2) as window,
+    ):
+        window.move_to(0, 0, wait=LONG_S)
+        one.send(signal.SIGSTOP)
+        window.move_to(1, 0)
+        wait_for(window, lambda: window.error is not None)
+        assert [type(window.error), client.disconnected_since] == [NoAnswer, None], "it hangs, but is there"
+        one.send(signal.SIGCONT)
+        assert window.wait_until_current(LONG_S)
+    with pytest.raises(BadRequest, match="timeout must be a positive number"):
+        shmmap.MapWindow(one.endpoint, timeout=0)
 
 
 @pytest.mark.parametrize("background", [True, False])
@@ -270,7 +356,7 @@ def test_a_window_nobody_closes_ends_with_the_program(daemon: Factory, divided_m
     window = shmmap.MapWindow(one.endpoint, 30)
     window.move_to(0, 0, wait=LONG_S)
     view = window.cells[0].xyz
-    assert threading.active_count() == before + 1
+    assert threading.active_count() == before + 2, "the window's, and its connection's"
     del window
     assert threading.active_count() == before
     assert np.isfinite(view).all()

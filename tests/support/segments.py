@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.layout import PublishBlock, SegmentHeader, SourceStamp
+from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.names import new_segment_name
+from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.writer import SegmentWriter
 
 Box = tuple[float, float, float, float]

@@ -8,7 +8,8 @@ import random
 import pytest
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.segment.layout import COLUMN, COLUMNS_OFFSET, read_columns
+from shmmap.segment.header import read_columns
+from shmmap.segment.layout import COLUMN, COLUMNS_OFFSET
 from tests.support.fuzz_targets import TARGETS, corpus, repair
 
 MUTATIONS = 40

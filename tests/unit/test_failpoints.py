@@ -11,8 +11,10 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 import shmmap
-from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS, step
+from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 
 EVERY = (*WORKER_STEPS, *DAEMON_STEPS, *CLIENT_STEPS)
 PROGRAM = """
@@ -43,9 +45,26 @@ def test_each_step_is_in_the_code_once() -> None:
     assert found == Counter(EVERY)
 
 
-def test_nothing_happens_without_the_variable() -> None:
-    for label in EVERY:
-        step(label)
+def steps_taken(wanted: str | None) -> tuple[int, list[str]]:
+    """Exit code of a program that takes every step, and the last ones it took."""
+    environment = {name: value for name, value in os.environ.items() if name != "SHMMAP_TEST_CRASH"}
+    if wanted is not None:
+        environment["SHMMAP_TEST_CRASH"] = wanted
+    program = (
+        f"from shmmap.failpoints import step\nfor label in {EVERY}: step(label); print(label, flush=True)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    return done.returncode, done.stdout.split()
+
+
+@pytest.mark.parametrize("wanted", [None, ""])
+def test_nothing_happens_without_the_variable(wanted: str | None) -> None:
+    assert steps_taken(wanted) == (0, list(EVERY))
+
+
+@pytest.mark.parametrize("label", EVERY)
+def test_with_it_that_step_and_no_other_is_the_last(label: str) -> None:
+    assert steps_taken(label) == (-signal.SIGKILL, list(EVERY[: EVERY.index(label)]))
 
 
 def test_the_nth_time_is_the_last() -> None:

@@ -65,7 +65,7 @@ class SearchCell:
         try:
             xyz, tile, start = columns["xyz"], columns["tile"], columns["start"]
         except KeyError as error:
-            raise BadRequest(f"not a search layer: it has no column {error}") from None
+            raise BadRequest(f"not a search layer: {error}") from None
         if xyz.dtype not in (np.dtype("<f4"), np.dtype("<f8")) or not xyz.flags.c_contiguous:
             raise BadRequest(f"xyz of a search layer must be float32 or float64, not {xyz.dtype}")
         return cls(xyz, tile, start, float(lattice.leaf[0]), (lattice.first[0], lattice.first[1]), owner)

@@ -140,7 +140,7 @@ def _as_json(found: CellSet, frame_id: str) -> dict[str, object]:
                 "layer": error.layer,
                 "code": error.code,
                 "message": error.message,
-                "holders": list(error.holders),
+                "holders": [str(holder) for holder in error.holders],
             }
             for error in found.failed
         ],

@@ -29,8 +29,8 @@ from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.layout import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
+from shmmap.segment.publish_block import PublishBlock
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellCache", "Rows"]

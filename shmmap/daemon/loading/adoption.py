@@ -28,8 +28,9 @@ from shmmap.failpoints import step
 from shmmap.layers.spec import layer_spec
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, measured_bytes
-from shmmap.segment.layout import PublishBlock, SegmentHeader
+from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
+from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.verify import read_header
 
 __all__ = ["Adoption", "TakenOver"]

@@ -16,7 +16,8 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Cell
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.layout import PublishBlock, SourceStamp
+from shmmap.segment.layout import SourceStamp
+from shmmap.segment.publish_block import PublishBlock
 from tests.support.segments import Box, publish_segment
 
 

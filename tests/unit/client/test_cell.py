@@ -57,7 +57,7 @@ def test_header_fields(segments: Segments) -> None:
 
 def test_an_unknown_column_is_named_with_those_there_are(segments: Segments) -> None:
     cell = segments.cell("/map/a.pcd", COLUMNS)
-    with pytest.raises(KeyError, match="no column 'colour'; it has xyz, intensity, ring, rgb"):
+    with pytest.raises(KeyError, match=r"no column 'colour' \(it has xyz, intensity, ring, rgb\)"):
         cell["colour"]
     with pytest.raises(KeyError, match="no column 'colour'"):
         cell.unit("colour")
@@ -184,3 +184,11 @@ ctypes.memset(view.ctypes.data, 255, 4)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
     assert done.returncode == -11
     segments.attach(name, handle).verify()
+
+
+def test_the_name_is_the_id_as_the_daemon_shortens_it(segments: Segments) -> None:
+    name, handle = segments.publish("0_0.pcd", COLUMNS)
+    cell = segments.attacher.attach(
+        handle, "/map/pointcloud_map/0_0.pcd", name, shm_dir=segments.path, slot=99
+    )
+    assert (cell.id, cell.name) == ("/map/pointcloud_map/0_0.pcd", "0_0.pcd")

@@ -53,7 +53,8 @@ def test_errors_have_the_kind_of_their_code(code: str, kind: type[errors.CellErr
 def test_holders_are_lines_that_name_who() -> None:
     holders = (Holder(0xAB, 42, 1000, "ndt", 4096, 3), Holder(0, 0, -1, "", 8192))
     error = cell_error(FailedCell("a", "points", "over_budget", "full", holders), "/a")
-    assert error.holders == (
+    assert error.holders == holders
+    assert tuple(map(str, error.holders)) == (
         "session 00000000000000ab, pid 42 (ndt) holds 4096 bytes in 3 cells",
         "unknown (not through the client library) holds 8192 bytes",
     )

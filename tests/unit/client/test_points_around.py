@@ -11,7 +11,7 @@ import pytest
 
 from shmmap.client.cell import Cell
 from shmmap.client.points_around import PointsAround, points_around
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, NoColumn, ShmmapError
 
 if TYPE_CHECKING:
     from tests.unit.client.conftest import Segments
@@ -29,7 +29,7 @@ def grid(make_cell: Callable[..., Cell]) -> list[Cell]:
 
 
 def around(cells: list[Cell], x: float, y: float, radius: float) -> PointsAround:
-    return points_around(cells, np.array([cell.box for cell in cells]), x, y, radius)
+    return points_around(cells, np.array([cell.box for cell in cells]), x, y, radius, covered=True)
 
 
 @pytest.mark.parametrize(
@@ -99,3 +99,38 @@ def test_nothing_around(grid: list[Cell]) -> None:
 def test_impossible_circles_are_refused(grid: list[Cell], x: float, radius: float) -> None:
     with pytest.raises(BadRequest):
         around(grid, x, 0.0, radius)
+
+
+def test_several_columns_at_once_have_their_rows_together(grid: list[Cell]) -> None:
+    found = around(grid, FAR + 61.3, 58.7, 45.0)
+    columns = found.gather("intensity", "xyz")
+    assert list(columns) == ["intensity", "xyz"]
+    np.testing.assert_array_equal(columns["xyz"], found.gather())
+    np.testing.assert_array_equal(columns["intensity"], found.gather("intensity"))
+    nothing = around(grid, -1e6, 0.0, 10.0).gather("xyz", "intensity")
+    assert [nothing[name].shape for name in ("xyz", "intensity")] == [(0, 3), (0,)]
+
+
+def test_a_column_that_is_not_there_is_said_with_those_that_are(grid: list[Cell]) -> None:
+    found = around(grid, FAR + 50, 50, 30.0)
+    for asked in (["colour"], ["xyz", "colour"]):
+        with pytest.raises(NoColumn, match=r"layer points has no column 'colour' \(it has xyz, intensity\)"):
+            found.gather(*asked)
+    with pytest.raises(KeyError, match="no column 'colour'"):
+        found.views("colour")
+
+
+@pytest.mark.parametrize("radius", [8.0, 100.0], ids=["partly inside", "wholly inside"])
+def test_rows_that_are_no_points_lie_nowhere(segments: Segments, radius: float) -> None:
+    """Whether a cell lies wholly in the circle must not decide whether the question makes sense."""
+    heights = {"height": np.zeros((10, 10), np.float32)}
+    cell = segments.cell("/a", heights, layer="elevation(leaf=2.0)", box=(0.0, 0.0, 20.0, 20.0))
+    found = around([cell], 10.0, 10.0, radius)
+    for question in (found.count, found.gather, lambda: found.gather("height"), lambda: found.mask(0)):
+        with pytest.raises(ShmmapError, match=r"layer elevation\(leaf=2.0\) has no column 'xyz'") as refusal:
+            question()
+        assert isinstance(refusal.value, KeyError)
+        assert "views(column) with height" in refusal.value.hint
+        assert "layer='points'" in refusal.value.hint
+    (view,) = found.views("height")
+    assert view is cell["height"]

@@ -10,12 +10,13 @@ import pytest
 
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
-from shmmap.client.window_follower import moved
-from shmmap.client.window_state import EMPTY, WindowState, update_between
+from shmmap.client.window_state import EMPTY, WindowState, moved, update_between
 from shmmap.errors import CellError, LoadFailed, OverBudget
+from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.protocol.messages import Intent
 
 HERE = Intent(0.0, 0.0)
+AREA = Circle(0.0, 0.0, 100.0)
 
 
 def build(
@@ -26,6 +27,7 @@ def build(
         pending=pending,
         failed=failed,
         asked=HERE,
+        area=AREA,
         epoch=1,
         map_version=1,
     )
@@ -47,15 +49,17 @@ def test_the_difference_of_two_states(make_cell: Callable[..., Cell]) -> None:
     new, fresh = make_cell("/changes", box, version=99), make_cell("/new", box)
     pending = (PendingLayer("/later", "points"),)
     before = build(gone, stays, old)
-    update = update_between(before.versions, build(stays, new, fresh, pending=pending))
+    update = update_between(before.versions, build(stays, new, fresh, pending=pending), current=True)
     assert (update.added, update.kept, update.changed) == ((fresh,), (stays,), (new,))
     assert (update.removed, update.pending) == (("/gone",), pending)
     assert update.any
     assert not update.complete
-    same = update_between(before.versions, before)
+    same = update_between(before.versions, before, current=True)
     assert not same.any
+    assert same.complete
+    assert not update_between(before.versions, before, current=False).complete, "of another pose"
     assert set(same.kept) == {gone, stays, old}
-    assert set(update_between(EMPTY.versions, before).added) == {gone, stays, old}
+    assert set(update_between(EMPTY.versions, before, current=True).added) == {gone, stays, old}
 
 
 def test_remembering_versions_keeps_nothing_mapped(make_cell: Callable[..., Cell]) -> None:
@@ -86,3 +90,45 @@ def test_moved_by_the_update_distance() -> None:
     assert moved(state, Intent(1e-9, 0.0), 0.0)
     assert not moved(state, Intent(11.9, 15.9), 20.0)
     assert moved(state, Intent(12.0, 16.0), 20.0)
+
+
+def test_moved_out_of_what_was_answered() -> None:
+    """However far a pose may move before the daemon is asked again, the window must have answered it."""
+    state = build()
+    assert not moved(state, Intent(99.0, 0.0), 1e9)
+    assert moved(state, Intent(101.0, 0.0), 1e9)
+
+
+def test_a_state_covers_what_lies_in_the_area_that_was_answered(make_cell: Callable[..., Cell]) -> None:
+    state = build(make_cell("/a", (0.0, 0.0, 20.0, 20.0)))
+    assert state.covers(0.0, 0.0, 100.0)
+    assert state.covers(70.0, 0.0, 30.0)
+    assert not state.covers(70.1, 0.0, 30.0)
+    assert not state.covers(1e6, 0.0, 0.0)
+    assert not EMPTY.covers(0.0, 0.0, 0.0)
+
+
+def test_a_missing_cell_may_lie_anywhere(make_cell: Callable[..., Cell]) -> None:
+    cell = make_cell("/a", (0.0, 0.0, 20.0, 20.0))
+    for name, covers in (("/b", False), ("/a", True)):  # of /a an older version is here
+        assert build(cell, pending=(PendingLayer(name, "points"),)).covers(0.0, 0.0, 9.0) is covers
+        failure = LoadFailed("broken", cell_id=name, layer="points")
+        state = build(cell, failed=(failure,))
+        assert state.covers(0.0, 0.0, 9.0) is covers
+        assert state.covers(0.0, 0.0, 9.0, "voxel(leaf=1.0)"), "another layer misses nothing"
+        assert state.covers(0.0, 0.0, 9.0, "points") is covers
+
+
+@pytest.mark.parametrize(
+    ("area", "inside", "outside"),
+    [
+        (Circle(10.0, 0.0, 5.0), (12.0, 0.0, 3.0), (12.0, 3.0, 3.0)),
+        (AutowareSquare(10.0, 0.0, 5.0), (12.0, 2.0, 2.9), (12.0, 0.0, 3.1)),
+        (Box(0.0, 0.0, 10.0, 20.0), (5.0, 5.0, 5.0), (5.0, 4.9, 5.0)),
+    ],
+)
+def test_areas_that_contain_a_circle(
+    area: Area, inside: tuple[float, float, float], outside: tuple[float, float, float]
+) -> None:
+    assert area.contains_circle(*inside)
+    assert not area.contains_circle(*outside)

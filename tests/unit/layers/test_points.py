@@ -14,7 +14,7 @@ import xxhash
 
 from shmmap.errors import MapDataError
 from shmmap.layers.points import BUILDER_VERSION, build_points
-from shmmap.segment.layout import unpack_header
+from shmmap.segment.header import unpack_header
 from tests.support.pcd_bytes import Field, column, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")

@@ -13,7 +13,7 @@ import pytest
 from shmmap import errors
 from shmmap.protocol import events
 from shmmap.protocol import messages as m
-from shmmap.segment import layout
+from shmmap.segment import header, layout, publish_block
 from shmmap.statistics import layout as statistics_layout
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
@@ -147,7 +147,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
 @pytest.mark.parametrize(
     ("document", "ends"),
     [
-        (LAYOUT, [layout.FIXED.size + layout.LATTICE.size, layout.COLUMN.size, layout.PUBLISH.size]),
+        (LAYOUT, [header.FIXED.size + header.LATTICE.size, layout.COLUMN.size, publish_block.PUBLISH.size]),
         (
             STATISTICS,
             [

@@ -16,7 +16,7 @@ import pytest
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment.attach import attach, unmap
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.layout import PublishBlock
+from shmmap.segment.publish_block import PublishBlock
 from tests.support.process_costs import mappings_under
 from tests.support.segment_reader import read_segment
 from tests.support.segments import write_segment

@@ -6,25 +6,16 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from shmmap.columns import ColumnSpec
 from shmmap.errors import SegmentCorrupt
-from shmmap.segment.layout import (
-    Lattice,
-    PublishBlock,
-    SegmentHeader,
-    SourceStamp,
-    header_size,
-    pack_header,
-    pack_publish_block,
-    plan_columns,
-    unpack_header,
-    unpack_publish_block,
-)
+from shmmap.segment.header import pack_header, unpack_header
+from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp, header_size, plan_columns
+from shmmap.segment.publish_block import PublishBlock, pack_publish_block, unpack_publish_block
 from tests.support.segment_reader import parse
 
 # offset and bytes of everything that is not zero in the header below

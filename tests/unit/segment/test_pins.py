@@ -9,16 +9,23 @@ import os
 import random
 import signal
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Final
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from shmmap.segment import pins
 from shmmap.segment.attach import AttachedSegment, attach
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import MAX_SLOT, holders, is_pinned, lock_slot, prepare_process
+from shmmap.segment.publish_block import PublishBlock
 from tests.support.mapping_process import MappingProcess
+from tests.support.segments import publish_segment
 from tests.unit.segment.conftest import Publish
 
 
@@ -70,14 +77,51 @@ def test_a_pin_follows_a_rename_and_outlives_a_stop(shm: ShmDirectory, publish: 
     assert not pinned(shm, name + ".zombie")
 
 
-def test_looking_does_not_disturb_whoever_opens_meanwhile(shm: ShmDirectory, publish: Publish) -> None:
-    """A lease is held for a moment only; an open in that moment waits and succeeds."""
-    name = publish()
-    fd = shm.open(name)
-    for _ in range(200):
-        assert not is_pinned(fd)
-        os.close(os.open(f"{shm.path}{name}", os.O_RDONLY))
-    os.close(fd)
+_READER: Final = """
+import sys
+from shmmap.segment.attach import attach
+sys.stdin.readline()
+print(len(attach(sys.argv[1], slot=5).columns), flush=True)
+"""
+
+
+def test_looking_does_not_disturb_whoever_opens_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An open that meets a lease waits until the lease is given back, and succeeds.
+
+    The one who looks holds the lease until the kernel says that somebody is breaking it: the reader is in
+    the middle of its open then.  In the usual directory, as clients open there.
+    """
+    directory = ShmDirectory()
+    columns: dict[str, NDArray[Any]] = {"xyz": np.zeros((9, 3), np.float32)}
+    name, _ = publish_segment(directory, columns, block=PublishBlock(7, 8), instance=f"unit-{os.getpid()}")
+    fd = directory.open(name)
+    met: list[int] = []
+    try:
+        with subprocess.Popen(
+            [sys.executable, "-c", _READER, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as reader:
+            assert reader.stdin is not None
+            assert reader.stdout is not None
+
+            def hold(label: str) -> None:
+                """Keep the lease until the reader has met it."""
+                assert label == "daemon.probe"
+                assert reader.stdin is not None
+                reader.stdin.write("go\n")
+                reader.stdin.flush()
+                while reader.poll() is None and fcntl.fcntl(fd, fcntl.F_GETLEASE) == fcntl.F_WRLCK:
+                    os.sched_yield()
+                met.append(fcntl.fcntl(fd, fcntl.F_GETLEASE))
+
+            monkeypatch.setattr(pins, "step", hold)
+            assert not is_pinned(fd)
+            assert met == [fcntl.F_RDLCK], "the kernel asks for it back, so that a reader can go on"
+            assert reader.stdout.readline() == "1\n"
+            assert reader.wait() == 0
+    finally:
+        os.close(fd)
+        directory.unlink(name)
+        directory.close()
 
 
 def test_who_holds(shm: ShmDirectory, publish: Publish) -> None:

@@ -7,10 +7,12 @@ import itertools
 import math
 import statistics
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction_policy import POLICIES, by_distance, by_last_use
+from shmmap.daemon.config import load_config
 from shmmap.daemon.records import Key, Resident
 
 coordinates = st.floats(-1e5, 1e5)
@@ -82,7 +84,14 @@ def test_examples() -> None:
     assert by_distance([new, old], []) == by_last_use([new, old], []) == [old, new]
 
 
-def test_the_policies_have_names() -> None:
-    assert set(POLICIES.items()) == {("distance", by_distance), ("lru", by_last_use)}
-    for policy in POLICIES.values():
-        assert policy([], [(0.0, 0.0)]) == []
+@pytest.mark.parametrize(("name", "first"), [("distance", "far, just used"), ("lru", "near, long unused")])
+def test_a_policy_does_what_its_name_says(name: str, first: str) -> None:
+    candidates = [made("near, long unused", 0, last_use_s=1.0), made("far, just used", 500, last_use_s=2.0)]
+    for order in (candidates, candidates[::-1]):
+        assert POLICIES[name](order, [(5.0, 5.0)])[0].name == first
+        assert POLICIES[name](order, [])[0].name == "near, long unused", "of distance without any pose"
+
+
+def test_every_policy_can_be_configured() -> None:
+    for name in POLICIES:
+        assert load_config({"map_path": "/map", "eviction": name}, environ={}).eviction == name

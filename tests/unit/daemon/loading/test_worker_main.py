@@ -19,8 +19,8 @@ import pytest
 from shmmap.daemon.loading import worker_messages
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.layout import PublishBlock
 from shmmap.segment.pins import is_pinned, prepare_process
+from shmmap.segment.publish_block import PublishBlock
 from tests.support.daemon_process import wait_ended, wait_readable
 from tests.support.divided_map import random_points
 from tests.support.pcd_files import write_ascii, write_pcd

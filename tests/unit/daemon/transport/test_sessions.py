@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.cell_requests import note_area
-from shmmap.daemon.transport.sessions import Peer, Session, Sessions, command_of, predicted_path
+from shmmap.daemon.transport.sessions import (
+    ROUTE_VERTICES,
+    Peer,
+    Session,
+    Sessions,
+    command_of,
+    predicted_path,
+)
 from shmmap.errors import NoSession
 from shmmap.geometry import Circle
 from shmmap.protocol.messages import Intent
@@ -152,6 +159,15 @@ def test_where_a_client_is_going_counts() -> None:
     straight = predicted_path(Intent(1.0, 2.0, vx=10.0, vy=-1.0))
     assert straight == [(1.0, 2.0), *((1.0 + 10.0 * s, 2.0 - s) for s in (1, 2, 3, 4, 5))]
     route = tuple((float(i), 0.0) for i in range(100))
-    known = predicted_path(Intent(1.0, 2.0, vx=10.0, route=route))
-    assert known[0] == (1.0, 2.0)
-    assert known[1:] == list(route[: len(known) - 1])
+    known = predicted_path(Intent(1.0, 2.0, vx=10.0, route=route[:9]))
+    assert known == [(1.0, 2.0), *route[:9]], "all of the route, and nothing that the velocity says"
+    assert predicted_path(Intent(1.0, 2.0, route=route)) == [(1.0, 2.0), *route[:ROUTE_VERTICES]]
+    assert len(route) > ROUTE_VERTICES
+
+
+def test_eviction_is_told_where_clients_are_going() -> None:
+    sessions = Sessions()
+    session = sessions.open(b"1", Peer(), "", 0.0)
+    session.says_where = True
+    session.intent = Intent(1.0, 2.0, route=((50.0, 60.0), (70.0, 80.0)))
+    assert sessions.poses() == [(1.0, 2.0), (50.0, 60.0), (70.0, 80.0)]

@@ -1,43 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every error shmmap raises on purpose, in one tree.
-
-::
-
-    ShmmapError
-    ├── ConfigError            a setting is wrong (key, where it came from)       exit 78
-    ├── BadRequest             an argument or a message makes no sense            exit 2
-    ├── MapDataError           a file is not what it claims to be                 exit 65
-    ├── MapMissing             there is no map there                              exit 66
-    ├── CannotWrite            an output cannot be made: disk full, no permission exit 73
-    ├── DaemonUnreachable      nobody answers                                     exit 69
-    │   ├── NoSocket           nothing listens: the daemon was never started
-    │   ├── SocketPermission   the socket is there, but not for this user
-    │   ├── StaleSocket        the socket's daemon is gone
-    │   └── NoAnswer           connected, but no reply before the deadline
-    ├── ProtocolMismatch       client and daemon speak different versions         exit 76
-    ├── InstanceBusy           another daemon owns this instance                  exit 75
-    ├── NoSession              the daemon does not know this session: say hello       exit 1
-    ├── NotPermitted           the daemon refuses this to this user               exit 1
-    ├── Busy                   too many requests of this process wait already     exit 75
-    ├── SegmentError           a segment cannot be used
-    │   ├── StaleHandle        it is gone: ask again                              exit 1
-    │   └── SegmentCorrupt     its bytes are wrong (magic, version, checksum)     exit 65
-    ├── CellError              one cell could not be had; others are unaffected   exit 1
-    │   ├── UnknownCell        the map has no such cell
-    │   ├── LoadFailed         its source cannot be read
-    │   ├── LoadTimeout        loading took longer than its deadline
-    │   ├── OverBudget         it does not fit; `holders` says who fills the budget
-    │   └── NoSpace            the shared-memory file system is full
-    └── InternalError          a defect in shmmap: please report it               exit 70
-
-``code`` is what travels on the wire, ``exit_code`` what the command line returns, ``hint`` what the
-reader can do about it.
-"""
+"""The classes of the tree that `shmmap.errors` draws."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from shmmap.protocol.replies import Holder
 
 __all__ = [
     "BadRequest",
@@ -45,6 +15,7 @@ __all__ = [
     "CannotWrite",
     "CellError",
     "ConfigError",
+    "ConnectionLost",
     "DaemonUnreachable",
     "InstanceBusy",
     "InternalError",
@@ -53,11 +24,13 @@ __all__ = [
     "MapDataError",
     "MapMissing",
     "NoAnswer",
+    "NoColumn",
     "NoSession",
     "NoSocket",
     "NoSpace",
     "NotPermitted",
     "OverBudget",
+    "PackageMissing",
     "ProtocolMismatch",
     "SegmentCorrupt",
     "SegmentError",
@@ -110,6 +83,12 @@ class BadRequest(ShmmapError):
 
     code = "bad_request"
     exit_code = 2
+
+
+class NoColumn(BadRequest, KeyError):
+    """A cell's layer has no column of that name, or not the one that the question needs."""
+
+    code = "no_column"
 
 
 class MapDataError(ShmmapError):
@@ -183,7 +162,13 @@ class StaleSocket(DaemonUnreachable):
     code = "stale_socket"
 
 
-class NoAnswer(DaemonUnreachable):
+class ConnectionLost(DaemonUnreachable):
+    """The daemon closed the connection: it ended, or is being restarted."""
+
+    code = "connection_lost"
+
+
+class NoAnswer(DaemonUnreachable, TimeoutError):
     """The daemon did not answer before the deadline: it is stopped, hung or overloaded."""
 
     code = "no_answer"
@@ -218,7 +203,7 @@ class NotPermitted(ShmmapError):
 
 
 class Busy(ShmmapError):
-    """The daemon holds so many unanswered requests of this process that it takes no more: wait."""
+    """The daemon has so many unanswered requests of this process that it takes no more: wait for some."""
 
     code = "busy"
     exit_code = 75
@@ -232,7 +217,7 @@ class SegmentError(ShmmapError):
 
 
 class StaleHandle(SegmentError):
-    """The segment a handle names is gone (evicted or superseded): ask the daemon again."""
+    """The segment that a handle names is gone (evicted, or replaced by a newer version): ask again."""
 
     code = "stale_handle"
     exit_code = 1
@@ -252,7 +237,7 @@ class CellError(ShmmapError):
     cell_id, layer
         Which cell, and which of its layers.
     holders
-        For `OverBudget`: who keeps the budget filled, one line each.
+        For `OverBudget`: who uses the memory, a `Holder` each; ``str`` of one is a line to read.
     """
 
     code = "cell_error"
@@ -264,7 +249,7 @@ class CellError(ShmmapError):
         *,
         cell_id: str = "",
         layer: str = "",
-        holders: Sequence[str] = (),
+        holders: Sequence[Holder] = (),
         hint: str = "",
     ) -> None:
         super().__init__(message, hint=hint)
@@ -292,7 +277,7 @@ class LoadTimeout(CellError):
 
 
 class OverBudget(CellError):
-    """The cell does not fit in the budget or the session's quota; `holders` says who fills it."""
+    """The cell does not fit in the budget or the session's quota; `holders` says who uses the memory."""
 
     code = "over_budget"
 
@@ -301,6 +286,13 @@ class NoSpace(CellError):
     """The shared-memory file system is full."""
 
     code = "no_space"
+
+
+class PackageMissing(ShmmapError, ImportError):
+    """A Python package that this needs is not installed; a client-only install has few of them."""
+
+    code = "package_missing"
+    exit_code = 69
 
 
 class InternalError(ShmmapError):

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One clear line where a Python package is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from shmmap.errors.tree import PackageMissing
+
+__all__ = ["needed_packages"]
+
+_PACKAGES: Final = {"lzf": "python-neo-lzf", "yaml": "PyYAML", "zmq": "pyzmq", "open3d": "open3d-cpu"}
+"""Packages that are not called as the module they bring."""
+
+_OURS: Final = ("shmmap", "shmmap_clients")
+
+
+@contextmanager
+def needed_packages(what: str) -> Iterator[None]:
+    """Say which package is missing where something is imported, instead of a traceback.
+
+    Parameters
+    ----------
+    what
+        Who needs it: a function, a program.
+
+    Raises
+    ------
+    PackageMissing
+        For the `ModuleNotFoundError` of anybody else's module.
+
+    Examples
+    --------
+    >>> with needed_packages("shmmap-ndt"):
+    ...     import numba
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if not module or module in _OURS:
+            raise
+        package = _PACKAGES.get(module, module)
+        raise PackageMissing(
+            f"{what} needs the package {package}, which is not installed",
+            hint=f"pip install {package}; a client-only install has only numpy, pyzmq, posix_ipc and msgspec",
+        ) from None

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A segment's header to bytes and back; ``LAYOUT.md`` is the byte-exact document."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from shmmap.errors import SegmentCorrupt
+from shmmap.segment.layout import (
+    ALIGNMENT_BYTES,
+    COLUMN,
+    COLUMNS_OFFSET,
+    LAYOUT_VERSION,
+    MAX_DIMENSIONS,
+    PAGE_BYTES,
+    TAIL_BYTES,
+    Column,
+    ColumnRow,
+    Lattice,
+    SegmentHeader,
+    SourceStamp,
+)
+
+__all__ = ["check_start", "pack_header", "read_columns", "unpack_header"]
+
+MAGIC: Final = b"SHMMAP\x00\x01"
+BYTE_ORDER: Final = 0x01020304
+
+FIXED: Final = struct.Struct("<8sHHIQQQQQQqq16s4d2d3dIIIIIIIIIIII")
+LATTICE: Final = struct.Struct("<3d3q3Q")  # after the fixed part; all zero: no lattice
+TABLE: Final = struct.Struct("<III")  # column count, offset of the table, bytes of a row
+TABLE_AT: Final = FIXED.size - 11 * 4
+CRC: Final = struct.Struct("<II")
+
+
+@lru_cache(maxsize=64)  # numpy computes ``dtype.str`` in Python
+def _dtype_name(dtype: np.dtype[np.generic]) -> bytes:
+    name: str = dtype.newbyteorder("<").str
+    return name.encode()
+
+
+def pack_header(header: SegmentHeader) -> bytes:
+    """Return the header's bytes, publish block empty.
+
+    Raises
+    ------
+    ValueError
+        If a name or unit is too long, a dtype is not little-endian numeric, or the strings do not
+        fit ``header_bytes``.
+    """
+    page = bytearray(header.header_bytes)
+    at = COLUMNS_OFFSET
+    for column in header.columns:
+        name, unit = column.name.encode(), column.unit.encode()
+        dtype = _dtype_name(column.dtype)
+        if len(name) > 40 or len(unit) > 16 or len(dtype) > 8 or len(column.shape) > MAX_DIMENSIONS:
+            raise ValueError(f"column {column.name!r} does not fit the layout's row")
+        if column.dtype.kind not in "fiu":
+            raise ValueError(f"column {column.name!r}: dtype {column.dtype} is not numeric")
+        shape = (*column.shape, *(0,) * (MAX_DIMENSIONS - len(column.shape)))
+        COLUMN.pack_into(
+            page, at, name, dtype, unit, len(column.shape), 0, *shape,
+            column.offset, column.nbytes, column.checksum,
+        )  # fmt: skip
+        at += COLUMN.size
+    places: list[int] = []
+    for text in (header.cell_id.encode(), header.layer.encode(), header.frame_id.encode()):
+        if at + len(text) > header.header_bytes - TAIL_BYTES:
+            raise ValueError("the header's strings do not fit its pages")
+        page[at : at + len(text)] = text
+        places += (at, len(text))
+        at += len(text)
+    FIXED.pack_into(
+        page, 0, MAGIC, *LAYOUT_VERSION, BYTE_ORDER, header.header_bytes, header.total_bytes,
+        header.rows, header.source_points, header.dropped_points, *header.source,
+        header.source_digest, *header.box, header.z_min, header.z_max, *header.origin,
+        header.builder_version, len(header.columns), COLUMNS_OFFSET, COLUMN.size, *places, 0, 0,
+    )  # fmt: skip
+    if header.lattice is not None:
+        leaf, first, shape_xyz = header.lattice
+        LATTICE.pack_into(page, FIXED.size, *leaf, *first, *shape_xyz)
+    end = header.header_bytes - TAIL_BYTES
+    CRC.pack_into(page, end, zlib.crc32(memoryview(page)[:end]), 0)
+    return bytes(page)
+
+
+_DTYPES: dict[bytes, np.dtype[np.generic]] = {
+    np.dtype(f"<{kind}{size}").str.encode(): np.dtype(f"<{kind}{size}")
+    for kind, sizes in (("f", (2, 4, 8)), ("i", (1, 2, 4, 8)), ("u", (1, 2, 4, 8)))
+    for size in sizes
+}
+
+
+def check_start(start: memoryview, available_bytes: int) -> tuple[int, int]:
+    """Check magic, version and sizes of a segment's first bytes; returns (header, total) bytes.
+
+    ``available_bytes`` is how much is really there (fstat): everything the header claims must lie
+    inside it.
+    """
+    if len(start) < FIXED.size:
+        raise SegmentCorrupt(f"a segment of {len(start)} bytes is shorter than its header")
+    magic, major, minor, order, header_bytes, total_bytes = struct.unpack_from("<8sHHIQQ", start)
+    if magic != MAGIC:
+        raise SegmentCorrupt(f"not a shmmap segment: it starts with {bytes(magic)!r}")
+    if major != LAYOUT_VERSION[0]:
+        raise SegmentCorrupt(
+            f"segment layout {major}.{minor}, this program reads {LAYOUT_VERSION[0]}.x",
+            hint="update the older of daemon and client",
+        )
+    if order != BYTE_ORDER:
+        raise SegmentCorrupt("the segment was written on a machine of other byte order")
+    if header_bytes % PAGE_BYTES or not PAGE_BYTES <= header_bytes <= total_bytes <= available_bytes:
+        raise SegmentCorrupt(
+            f"the segment claims {header_bytes} header and {total_bytes} total bytes, has {available_bytes}"
+        )
+    return header_bytes, total_bytes
+
+
+def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[ColumnRow]]:
+    """Verify a header and read its column table: the part of it that every reader needs.
+
+    Parameters and errors are those of `unpack_header`, which also reads the rest.
+
+    Returns
+    -------
+    header_bytes : int
+        Size of the header.
+    rows : list of tuple
+        One for each column: what `Column` takes, in order.
+    """
+    header_bytes, total_bytes = check_start(page, available_bytes)
+    if len(page) < header_bytes:
+        raise SegmentCorrupt(f"only {len(page)} of {header_bytes} header bytes are there")
+    end = header_bytes - TAIL_BYTES
+    if zlib.crc32(page[:end]) != int.from_bytes(page[end : end + 4], "little"):
+        raise SegmentCorrupt("the header's checksum does not match")
+    count, columns_offset, row_bytes = TABLE.unpack_from(page, TABLE_AT)
+    if row_bytes < COLUMN.size or columns_offset + count * row_bytes > end:
+        raise SegmentCorrupt("the column table does not fit the header")
+    rows: list[ColumnRow] = []
+    for at in range(columns_offset, columns_offset + count * row_bytes, row_bytes):
+        name, dtype, unit, ndim, _, s0, s1, s2, s3, offset, nbytes, checksum = COLUMN.unpack_from(page, at)
+        kind = _DTYPES.get(dtype.rstrip(b"\0"))
+        shape = (s0, s1, s2, s3)[:ndim]
+        if (
+            kind is None
+            or ndim > MAX_DIMENSIONS
+            or math.prod(shape) * kind.itemsize != nbytes
+            or offset < header_bytes
+            or offset % ALIGNMENT_BYTES
+            or offset + nbytes > total_bytes
+            or (nbytes == 0 and max(shape, default=0) > total_bytes)  # numpy has no such array
+        ):
+            raise SegmentCorrupt(f"column {len(rows)} ({bytes(name)!r}) contradicts the layout")
+        rows.append(
+            (
+                _shared_text(name.rstrip(b"\0")),
+                kind,
+                shape,
+                offset,
+                nbytes,
+                _shared_text(unit.rstrip(b"\0")),
+                checksum,
+            )
+        )
+    return header_bytes, rows
+
+
+def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
+    """Read and verify a header.
+
+    Parameters
+    ----------
+    page
+        The segment's bytes, from its start, at least the whole header.
+    available_bytes
+        How many bytes the segment really has.
+
+    Raises
+    ------
+    SegmentCorrupt
+        Wrong magic, other major layout version, bad CRC, or a column outside the segment.
+    """
+    header_bytes, columns = read_columns(page, available_bytes)
+    end = header_bytes - TAIL_BYTES
+    (
+        _magic, _major, _minor, _order, _header_bytes, total_bytes,
+        rows, source_points, dropped_points, source_size, source_mtime_ns, source_ctime_ns, digest,
+        min_x, min_y, max_x, max_y, z_min, z_max, origin_x, origin_y, origin_z,
+        builder_version, _count, _columns_offset, _row_bytes,
+        id_at, id_bytes, layer_at, layer_bytes, frame_at, frame_bytes, _flags, _reserved,
+    ) = FIXED.unpack_from(page)  # fmt: skip
+    if max(id_at + id_bytes, layer_at + layer_bytes, frame_at + frame_bytes) > end:
+        raise SegmentCorrupt("a string lies outside the header")
+    return SegmentHeader(
+        cell_id=_text(page[id_at : id_at + id_bytes]),
+        layer=_text(page[layer_at : layer_at + layer_bytes]),
+        columns=tuple(Column(*column) for column in columns),
+        rows=rows,
+        box=(min_x, min_y, max_x, max_y),
+        header_bytes=header_bytes,
+        total_bytes=total_bytes,
+        z_min=z_min,
+        z_max=z_max,
+        origin=(origin_x, origin_y, origin_z),
+        source_points=source_points,
+        dropped_points=dropped_points,
+        source=SourceStamp(source_size, source_mtime_ns, source_ctime_ns),
+        source_digest=digest,
+        builder_version=builder_version,
+        frame_id=_text(page[frame_at : frame_at + frame_bytes]),
+        lattice=_unpack_lattice(page),
+    )
+
+
+@lru_cache(maxsize=256)  # hundreds of attached segments have the same few names of columns
+def _shared_text(raw: bytes) -> str:
+    return _text(raw)
+
+
+def _text(raw: bytes | memoryview) -> str:
+    try:
+        return str(raw, "utf-8")
+    except UnicodeDecodeError as error:
+        raise SegmentCorrupt(f"{bytes(raw)!r} in the header is no UTF-8") from error
+
+
+def _unpack_lattice(page: memoryview) -> Lattice | None:
+    leaf_x, leaf_y, leaf_z, i, j, k, columns, rows, levels = LATTICE.unpack_from(page, FIXED.size)
+    if leaf_x == 0.0:
+        return None
+    return Lattice((leaf_x, leaf_y, leaf_z), (i, j, k), (columns, rows, levels))

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nearly every request of a moving vehicle is answered the short way, with handles encoded before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+import msgspec
+import pytest
+
+from shmmap.daemon.requests import cell_requests
+from shmmap.protocol.codec import encode_handle, pack_versions
+from shmmap.protocol.messages import BoxMessage, Cells, Differential, HeldCell
+from tests.support.divided_map import make_map
+from tests.unit.daemon.inner_daemon import EVERYWHERE, InnerDaemon
+
+HALF = BoxMessage(-1e3, -1e3, -1.0, 1e3)
+
+
+class LongWay(Exception):
+    """The request took the way that covers everything."""
+
+
+def long_way(*_: object) -> NoReturn:
+    raise LongWay
+
+
+@pytest.fixture
+def warm(tmp_path: Path) -> Iterator[tuple[InnerDaemon, Cells]]:
+    """A daemon that has all of its map in memory, and the reply that says so."""
+    made = make_map(tmp_path / "map", columns=3, rows=2, points=20)
+    inner = InnerDaemon(str(made.root), cache_dir=str(tmp_path / "cache"))
+    yield inner, inner.everything()
+    inner.close()
+
+
+def differential(
+    inner: InnerDaemon, request: int, area: BoxMessage, versions: list[int], **more: object
+) -> Cells:
+    message = Differential(request, area, packed=pack_versions(versions), **more)  # type: ignore[arg-type]
+    inner.cells.differential(inner.session(), message, inner.now_s())
+    return inner.cells_of(request)
+
+
+def test_versions_of_a_warm_area_take_the_short_way(
+    warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inner, everything = warm
+    monkeypatch.setattr(cell_requests, "difference", long_way)
+    held = [cell.version for cell in everything.cells]
+    assert not differential(inner, 2, EVERYWHERE, held).cells
+    assert len(differential(inner, 3, EVERYWHERE, held[2:]).cells) == 2
+    left = differential(inner, 4, HALF, held)
+    assert 0 < len(left.removed_packed) < 8 * len(held)
+    by_name = (HeldCell(everything.cells[0].id, held[0]),)
+    assert len(differential(inner, 5, EVERYWHERE, held[1:], held=by_name).cells) == 0
+
+
+def test_what_the_short_way_cannot_answer_takes_the_long_one(
+    warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that the test above is not true of everything."""
+    inner, everything = warm
+    monkeypatch.setattr(cell_requests, "difference", long_way)
+    with pytest.raises(LongWay):  # no version is given
+        differential(inner, 2, EVERYWHERE, [], held=(HeldCell(everything.cells[0].id),))
+    with pytest.raises(LongWay):  # two layers
+        differential(inner, 3, EVERYWHERE, [], layers=("points", "voxel(leaf=1.0)"))
+
+
+def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
+    """Replies carry the bytes that each segment was given when it came into memory."""
+    inner, everything = warm
+    session = inner.session()
+    inner.cells.differential(session, Differential(2, EVERYWHERE), inner.now_s())
+    (_, first), *_ = [reply for reply in inner.replies if reply[1].request == 2]
+    residents = session.residents()
+    assert len(residents) == len(first.cells) == len(everything.cells)
+    for resident in residents:  # marked, so that it shows whose bytes they are
+        handle = next(cell for cell in first.cells if cell.version == resident.version)
+        resident.handle = encode_handle(msgspec.structs.replace(handle, points=4711))
+    for request, reply in ((3, differential(inner, 3, EVERYWHERE, [])), (4, inner.everything(4))):
+        assert {cell.points for cell in reply.cells} == {4711}, request

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tree of errors: codes, what else an error is, and one clear line for a package that is missing."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+import shmmap
+from shmmap import errors
+from shmmap.errors import (
+    ConnectionLost,
+    DaemonUnreachable,
+    NoAnswer,
+    NoColumn,
+    PackageMissing,
+    ShmmapError,
+    error_from_wire,
+    needed_packages,
+)
+
+
+def kinds(root: type[ShmmapError] = ShmmapError) -> Iterator[type[ShmmapError]]:
+    yield root
+    for kind in root.__subclasses__():
+        yield from kinds(kind)
+
+
+def test_each_kind_has_a_code_of_its_own_and_comes_back_from_it() -> None:
+    found = list(kinds())
+    assert len({kind.code for kind in found}) == len(found)
+    for kind in found:
+        error = error_from_wire(kind.code, "what", "do")
+        assert type(error) is kind
+        assert str(error) == "what (do)"
+        assert (error.message, error.hint) == ("what", "do")
+    assert type(error_from_wire("of_a_later_version", "what")) is ShmmapError
+
+
+def test_the_picture_of_the_tree_is_the_tree() -> None:
+    """Every class stands in it, below its base."""
+    assert errors.__doc__ is not None
+    drawn: dict[str, str] = {}
+    above: list[str] = []
+    for line in errors.__doc__.splitlines():
+        match = re.match(r"    ([│ ]*)(?:[├└]── )?(\w+)", line)
+        if match is None or not (match[2] == "ShmmapError" or "── " in line):
+            continue
+        depth = 0 if match[2] == "ShmmapError" else len(match[1]) // 4 + 1
+        del above[depth:]
+        drawn[match[2]] = above[-1] if above else ""
+        above.append(match[2])
+    assert drawn == {
+        kind.__name__: "" if kind is ShmmapError else kind.__bases__[0].__name__ for kind in kinds()
+    }
+
+
+def test_errors_are_what_python_calls_them_too() -> None:
+    with pytest.raises(TimeoutError, match="late"):
+        raise NoAnswer("late")
+    with pytest.raises(KeyError) as missing:
+        raise NoColumn("no column 'a'", hint="it has b")
+    assert str(missing.value) == "no column 'a' (it has b)", "without the quotes of a KeyError"
+    with pytest.raises(ImportError):
+        raise PackageMissing("numba")
+    assert issubclass(NoAnswer, DaemonUnreachable)
+    assert not issubclass(ConnectionLost, TimeoutError)
+
+
+@pytest.mark.parametrize(
+    ("module", "package"), [("nowhere_to_be_found", "nowhere_to_be_found"), ("yaml.nowhere", "PyYAML")]
+)
+def test_a_package_that_is_missing_is_one_line(module: str, package: str) -> None:
+    with pytest.raises(PackageMissing) as missing, needed_packages("shmmap-ndt"):
+        __import__(module)
+    assert missing.value.message == f"shmmap-ndt needs the package {package}, which is not installed"
+    assert f"pip install {package}; a client-only install has only" in missing.value.hint
+    assert missing.value.__cause__ is None
+    assert missing.value.__suppress_context__
+
+
+def test_a_module_of_ours_that_is_missing_is_a_defect() -> None:
+    with pytest.raises(ModuleNotFoundError) as missing, needed_packages("shmmap-ndt"):
+        __import__("shmmap.nowhere")
+    assert not isinstance(missing.value, PackageMissing)
+
+
+CLIENT_ONLY = """
+import sys
+
+class Without:
+    "What a client-only install lacks."
+
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {packages!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Without())
+import shmmap
+try:
+    print({code})
+except shmmap.ShmmapError as error:
+    print(error.code, error)
+"""
+
+
+@pytest.mark.parametrize(
+    "code", ["shmmap.build_layer", "shmmap.read_cloud", "shmmap.voxel_covariances", "shmmap.write_pcd"]
+)
+def test_every_public_name_of_a_client_only_install_works_or_says_what_it_needs(code: str) -> None:
+    packages = {"xxhash", "lzf", "yaml", "numba", "rich", "open3d", "scipy", "pandas", "laspy"}
+    done = subprocess.run(
+        [sys.executable, "-c", CLIENT_ONLY.format(packages=packages, code=code)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.startswith("<function") or re.fullmatch(
+        rf"package_missing {code} needs the package [\w-]+, which is not installed \(pip install .*\)\n",
+        done.stdout,
+    ), done.stdout
+
+
+def test_build_layer_is_one_of_those() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", CLIENT_ONLY.format(packages={"xxhash"}, code="shmmap.build_layer")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.startswith("package_missing shmmap.build_layer needs the package xxhash")
+    assert "pip install shmmap" not in done.stdout, "it is on no index"
+
+
+@pytest.mark.parametrize(
+    ("call", "what"),
+    [
+        ("shmmap.build_layer('voxel(leaf=1.0)', numpy.zeros((3, 3)))", "layer voxel"),
+        ("shmmap.voxel_covariances(*[numpy.zeros((1, 3, 3))] * 2)", r"voxel_covariances\(\)"),
+    ],
+)
+def test_what_loads_a_package_only_when_it_is_called_says_so_too(call: str, what: str) -> None:
+    code = CLIENT_ONLY.format(packages={"numba"}, code=f"__import__('shmmap') and {call}")
+    done = subprocess.run(
+        [sys.executable, "-c", "import numpy\n" + code], capture_output=True, text=True, check=True
+    )
+    assert re.match(f"package_missing {what} needs the package numba", done.stdout), done.stdout
+
+
+def test_all_public_errors_are_of_the_tree() -> None:
+    for name in shmmap.__all__:
+        value = getattr(shmmap, name)
+        if isinstance(value, type) and issubclass(value, BaseException):
+            assert value in set(kinds())
