@@ -115,6 +115,7 @@ class ServingLoop:
                     return
                 continue
             self.dispatch.handle(heard)
+            self.cache.tell_all()
             now_s = time.monotonic()
             self.inbox.served(heard, now_s - start_s)
             self.statistics.add_duration("request", int((now_s - start_s) * 1e9))

@@ -293,10 +293,10 @@ class Scheduler:
             self._end(load, failure)
             return
         index = self._cache.index_of(load.key.cell_id)
-        if index is not None and message.stamp is not None:
-            self._map_switch.learn(index, message.stamp)
         if failure is not None:
             self._cache.tell(self._cache.events.retried, load.key, failure)
+        if index is not None and message.stamp is not None:
+            self._map_switch.learn(index, message.stamp)
         self._load_after_all(load)
 
     def _load_after_all(self, load: Load) -> None:
