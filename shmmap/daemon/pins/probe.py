@@ -9,9 +9,11 @@ daemon then only believes to have more memory left than it has.
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import mmap
 import os
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from shmmap.daemon.host.inotify import CLOSED, Inotify
@@ -63,43 +65,37 @@ def probe_pins(directory: ShmDirectory) -> PinSupport:
     ``SHMMAP_TEST_PINS`` (``locks``, ``sessions``) makes it find less than there is.
     """
     less = os.environ.get("SHMMAP_TEST_PINS", "")
-    leases = locks = events = False
     fd = directory.create()
     try:
-        os.ftruncate(fd, mmap.PAGESIZE)
+        with contextlib.suppress(OSError):
+            os.ftruncate(fd, mmap.PAGESIZE)
         path = f"/proc/self/fd/{fd}"
-        if less not in ("locks", "sessions"):
-            leases = _leases_tell(fd, path)
-        if less != "sessions":
-            locks = _locks_tell(fd, path)
-        events = _closing_tells(path)
-    except OSError:  # whatever was not reached does not work
-        pass
+        leases = less not in ("locks", "sessions") and _works(_leases_tell, fd, path)
+        locks = less != "sessions" and _works(_locks_tell, fd, path)
+        events = _works(_closing_tells, path)
     finally:
         os.close(fd)
-    return PinSupport(leases, locks, events, _processes_can_be_watched())
+    return PinSupport(leases, locks, events, _works(_processes_can_be_watched))
+
+
+def _works(way: Callable[..., bool], *arguments: object) -> bool:
+    try:
+        return way(*arguments)
+    except (OSError, ValueError):  # what it needs is not there
+        return False
 
 
 def _leases_tell(fd: int, path: str) -> bool:
-    try:
-        if is_pinned(fd):
-            return False
-        with _mapped(path):
-            if not is_pinned(fd):
-                return False
-        return not is_pinned(fd)
-    except OSError:
-        return False
+    before = is_pinned(fd)
+    with _mapped(path):
+        during = is_pinned(fd)
+    return (before, during, is_pinned(fd)) == (False, True, False)
 
 
 def _locks_tell(fd: int, path: str) -> bool:
-    try:
-        with _mapped(path, _SLOT):
-            if holders(fd) != [_SLOT]:
-                return False
-        return holders(fd) == []
-    except OSError:
-        return False
+    with _mapped(path, _SLOT):
+        during = holders(fd)
+    return (during, holders(fd)) == ([_SLOT], [])
 
 
 def _mapped(path: str, slot: int | None = None) -> mmap.mmap:
@@ -114,23 +110,12 @@ def _mapped(path: str, slot: int | None = None) -> mmap.mmap:
 
 
 def _closing_tells(path: str) -> bool:
-    try:
-        events = Inotify()
-    except OSError:
-        return False
-    try:
+    with contextlib.closing(Inotify()) as events:
         events.add(path, CLOSED)
         os.close(os.open(path, os.O_RDONLY | os.O_CLOEXEC))
         return any(event.mask & CLOSED for event in events.read())
-    except OSError:
-        return False
-    finally:
-        events.close()
 
 
 def _processes_can_be_watched() -> bool:
-    try:
-        os.close(os.pidfd_open(os.getpid()))
-    except OSError:
-        return False
+    os.close(os.pidfd_open(os.getpid()))
     return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap import __version__
@@ -53,6 +53,7 @@ class MapQueries:
     epoch: int
     event_log: EventLog
     events_path: str = ""
+    _kinds: tuple[str, ...] = field(init=False, default_factory=lambda: tuple(k.describe() for k in kinds()))
 
     @property
     def _catalogue(self) -> CatalogueView:
@@ -60,28 +61,15 @@ class MapQueries:
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
         """Tell a new client where everything is."""
-        catalogue = self._catalogue
+        cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
         return messages.Welcome(
-            request=message.request,
-            major=messages.PROTOCOL_VERSION[0],
-            minor=messages.PROTOCOL_VERSION[1],
-            daemon=__version__,
-            instance=self.config.instance,
-            epoch=self.epoch,
-            session=session.slot,
-            map_version=catalogue.map_version,
-            map_path=self.config.map_path,
-            frame_id=catalogue.frame_id,
-            shm_dir=self.config.shm_dir,
-            id_prefix=self.cache.id_prefix,
-            segment_prefix=self.cache.segment_prefix,
-            cells=len(catalogue),
-            bounds=catalogue.bounds,
-            layers=tuple(kind.describe() for kind in kinds()),
-            budget_bytes=self.cache.ledger.budget_bytes,
-            pid=os.getpid(),
-            events=self.events_path,
-        )
+            message.request, major, minor, daemon=__version__, instance=self.config.instance,
+            epoch=self.epoch, session=session.slot, map_version=catalogue.map_version,
+            map_path=self.config.map_path, frame_id=catalogue.frame_id, shm_dir=self.config.shm_dir,
+            id_prefix=cache.id_prefix, segment_prefix=cache.segment_prefix, cells=len(catalogue),
+            bounds=catalogue.bounds, layers=self._kinds,
+            budget_bytes=cache.ledger.budget_bytes, pid=os.getpid(), events=self.events_path,
+        )  # fmt: skip
 
     def answer(self, message: messages.Request) -> messages.Reply:
         """Answer one request."""
@@ -95,12 +83,9 @@ class MapQueries:
 
     def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
         cache, catalogue = self.cache, self._catalogue
-        indices: Sequence[int]
-        indices = (
-            range(len(catalogue))
-            if message.area is None
-            else catalogue.query(messages.area_from_message(message.area)).tolist()
-        )
+        indices: Sequence[int] = range(len(catalogue))
+        if message.area is not None:
+            indices = catalogue.query(messages.area_from_message(message.area)).tolist()
         removed: tuple[str, ...] = ()
         known = True
         if message.since is not None:
@@ -109,115 +94,70 @@ class MapQueries:
             if change is not None:
                 touched = {i for cell in change[0] if (i := cache.index_of(cell)) is not None}
                 indices = [i for i in indices if i in touched] if message.area else sorted(touched)
-                removed = tuple(cache.wire_id(cell) for cell in change[1]) if message.start == 0 else ()
+                removed = tuple(map(cache.wire_id, change[1])) if message.start == 0 else ()
         start = max(0, message.start)
         end = start + max(1, min(message.limit, PAGE_ROWS))
+        rows = tuple(map(self._row, indices[start:end]))
+        following = end if end < len(indices) else None
         return messages.MetadataPage(
-            request=message.request,
-            epoch=self.epoch,
-            map_version=catalogue.map_version,
-            rows=tuple(self._row(index) for index in indices[start:end]),
-            next=end if end < len(indices) else None,
-            since_known=known,
-            removed=removed,
+            message.request, self.epoch, catalogue.map_version, rows, following, known, removed
         )
 
     def _row(self, index: int) -> messages.MetadataRow:
         catalogue = self._catalogue
         heights = self.cache.heights.get(index, (None, None))
-        return messages.MetadataRow(
-            self.cache.wire_id(catalogue.id(index)),
-            catalogue.version(index),
-            *catalogue.box(index),
-            catalogue.stamp(index).size,
-            *heights,
-        )
+        wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.stamp(index).size
+        return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
     def stats(self, message: messages.Stats, usage: Usage, now_s: float) -> messages.StatsReply:
         """Answer a request for statistics with what a survey found."""
+        nothing = Share()
+        rows = tuple(_session_row(one, usage.shares.get(one.slot, nothing), now_s) for one in self.sessions)
         return messages.StatsReply(
-            request=message.request,
-            epoch=self.epoch,
-            map_version=self._catalogue.map_version,
-            counters=dict(self.statistics.values),
-            sessions=tuple(
-                self._session_row(session, usage.shares.get(session.slot, Share()), now_s)
-                for session in self.sessions
-            ),
-            unknown_holders=usage.unknown,
-            unknown_bytes=usage.unknown_bytes,
-        )
-
-    def _session_row(self, session: Session, share: Share, now_s: float) -> messages.SessionRow:
-        intent = session.intent
-        return messages.SessionRow(
-            session.slot,
-            session.peer.pid,
-            session.peer.uid,
-            session.peer.gid,
-            session.client,
-            session.command,
-            len(session.held),
-            session.held_bytes,
-            session.requests,
-            now_s - session.last_request_s,
-            (intent.x, intent.y) if intent is not None else None,
-            share.mapped_bytes,
-            share.superseded,
-            share.superseded_bytes,
-        )
+            message.request, self.epoch, self._catalogue.map_version, dict(self.statistics.values), rows,
+            usage.unknown, usage.unknown_bytes,
+        )  # fmt: skip
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
-        cache = self.cache
+        cache, catalogue = self.cache, self._catalogue
         index = cache.index_of(message.id)
+        # a cell that left the map while somebody maps it still shows, with version 0
+        ids = {message.id, cache.id_prefix + message.id} if index is None else {catalogue.id(index)}
+        found = [resident for resident in cache.ledger.everything() if resident.key.cell_id in ids]
+        shown = tuple(map(self._segment, found))
         if index is None:
-            return self._show_gone(message)
-        cell_id = cache.catalogue.id(index)
-        version = cache.catalogue.version(index)
+            if not found or not message.id:
+                raise UnknownCell(
+                    f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is resident"
+                )
+            return messages.ShownCell(message.request, found[0].key.cell_id, 0, *found[0].box, 0, shown)
+        (cell_id,) = ids
         failures = [failure for key, failure in self.loads.failures.items() if key.cell_id == cell_id]
-        shown = []
-        for resident in cache.ledger.everything():
-            if resident.key.cell_id == cell_id:
-                state = (
-                    "zombie"
-                    if resident.name in cache.ledger.retired
-                    else "resident" if cache.is_current(resident) else "stale"
-                )  # fmt: skip
-                shown.append(self._segment(resident, state))
         z_min, z_max = cache.heights.get(index, (None, None))
         return messages.ShownCell(
-            message.request,
-            cell_id,
-            version,
-            *cache.catalogue.box(index),
-            cache.catalogue.stamp(index).size,
-            tuple(shown),
+            message.request, cell_id, catalogue.version(index), *catalogue.box(index),
+            catalogue.stamp(index).size, shown,
             tuple(key.layer for key in self.loads.by_key if key.cell_id == cell_id),
             "; ".join(f"{failure.code}: {failure.message}" for failure in failures),
-            z_min=z_min,
-            z_max=z_max,
-            pinned=self.pins.layers_of(cell_id),
-        )
+            z_min=z_min, z_max=z_max, pinned=self.pins.layers_of(cell_id),
+        )  # fmt: skip
 
-    def _show_gone(self, message: messages.Show) -> messages.ShownCell:
-        """A cell that left the map while somebody maps it: version 0."""
-        everything = self.cache.ledger.everything()
-        names = (message.id, self.cache.id_prefix + message.id)
-        left = [resident for resident in everything if resident.key.cell_id in names and message.id]
-        if not left:
-            raise UnknownCell(
-                f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is resident"
-            )
-        shown = tuple(self._segment(resident, "zombie") for resident in left)
-        return messages.ShownCell(message.request, left[0].key.cell_id, 0, *left[0].box, 0, shown)
-
-    def _segment(self, resident: Resident, state: str) -> messages.ShownSegment:
+    def _segment(self, resident: Resident) -> messages.ShownSegment:
+        state = "resident" if self.cache.is_current(resident) else "stale"
+        if resident.name in self.cache.ledger.retired:
+            state = "zombie"
+        holders = self.cache.holders.of([resident])
         return messages.ShownSegment(
-            resident.key.layer,
-            resident.version,
-            resident.name,
-            state,
-            resident.nbytes,
-            resident.points,
-            self.cache.holders.of([resident]),
-        )
+            resident.key.layer, resident.version, resident.name, state, resident.nbytes, resident.points,
+            holders,
+        )  # fmt: skip
+
+
+def _session_row(session: Session, share: Share, now_s: float) -> messages.SessionRow:
+    intent, peer = session.intent, session.peer
+    return messages.SessionRow(
+        session.slot, peer.pid, peer.uid, peer.gid, session.client, session.command, len(session.held),
+        session.held_bytes, session.requests, now_s - session.last_request_s,
+        (intent.x, intent.y) if intent is not None else None,
+        share.mapped_bytes, share.superseded, share.superseded_bytes,
+    )  # fmt: skip

@@ -29,18 +29,10 @@ class CellRows:
     def show(self, resident: Resident, state: str) -> None:
         """Show a segment as it is now; ``state`` is ``resident``, ``stale`` or ``zombie`` (retired)."""
         row = CellRow(
-            id=resident.key.cell_id.removeprefix(self.id_prefix),
-            layer=resident.key.layer,
-            version=resident.version,
-            segment=resident.name.removeprefix(self.segment_prefix),
-            state=state,
-            bytes=resident.nbytes,
-            points=resident.points,
-            box=resident.box,
-            hits=resident.hits,
-            last_use_monotonic_ns=int(resident.last_use_s * 1e9),
-            load_ns=resident.load_ns,
-        )
+            resident.key.cell_id.removeprefix(self.id_prefix), resident.key.layer, resident.version,
+            resident.name.removeprefix(self.segment_prefix), state, resident.nbytes, resident.points,
+            resident.box, resident.hits, int(resident.last_use_s * 1e9), resident.load_ns,
+        )  # fmt: skip
         self.statistics.cell_changed(resident.name, row)
 
     def hide(self, name: str) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -46,12 +47,5 @@ class RecentCounts:
 
     def _at(self, time_s: float) -> tuple[int, ...]:
         """Return the newest sample that is not younger than ``time_s``, or the oldest one."""
-        samples = self._samples
-        low, high = 0, len(samples) - 1
-        while low < high:
-            middle = (low + high + 1) // 2
-            if samples[middle][0] <= time_s:
-                low = middle
-            else:
-                high = middle - 1
-        return samples[low][1]
+        found = bisect_right(self._samples, time_s, key=lambda sample: sample[0])
+        return self._samples[max(0, found - 1)][1]

@@ -12,21 +12,14 @@ __all__ = ["client_row"]
 
 def client_row(session: Session) -> ClientRow:
     """Return what operators see of a client."""
-    intent = session.intent
+    intent, peer = session.intent, session.peer
     return ClientRow(
-        session.slot,
-        session.peer.pid,
-        session.peer.uid,
-        len(session.held),
-        session.held_bytes,
-        session.requests,
-        int(session.last_request_s * 1e9),
-        session.client,
-        session.command,
+        session.slot, peer.pid, peer.uid, len(session.held), session.held_bytes, session.requests,
+        int(session.last_request_s * 1e9), session.client, session.command,
         (float(intent.x), float(intent.y)) if intent is not None else None,
         None if intent is None or intent.heading is None else float(intent.heading),
         _window(session.area) if session.area is not None else None,
-    )
+    )  # fmt: skip
 
 
 def _window(area: Area) -> Window:

@@ -7,8 +7,10 @@ cannot be loaded is tried again.  Pins end with `unpin` or with the daemon.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -20,12 +22,20 @@ from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
 from shmmap.protocol.messages import PinnedCell
 
-__all__ = ["OperatorPins"]
+__all__ = ["OperatorPins", "cells_named"]
 
 LOOKS_AT_ONCE: Final = 64
 """Pins looked at per beat: about a fifth of a millisecond."""
 
 
+def cells_named(cache: CellCache, ids: Iterable[str]) -> tuple[set[str], tuple[str, ...]]:
+    """Return the whole ids of cells that an operator names, and those names that are no cell's."""
+    indices = {cell: cache.index_of(cell) for cell in ids}
+    known = {cache.catalogue.id(index) for index in indices.values() if index is not None}
+    return known, tuple(cell for cell, index in indices.items() if index is None)
+
+
+@dataclass(eq=False, slots=True)
 class OperatorPins:
     """The pinned cells of one map.
 
@@ -33,14 +43,9 @@ class OperatorPins:
     of the candidates for eviction.
     """
 
-    def __init__(self, cache: CellCache, scheduler: Scheduler) -> None:
-        self._cache = cache
-        self._scheduler = scheduler
-        self._keys: set[Key] = set()
-        self._round: deque[Key] = deque()
-
-    def __len__(self) -> int:
-        return len(self._keys)
+    cache: CellCache
+    scheduler: Scheduler
+    _keys: OrderedDict[Key, None] = field(default_factory=OrderedDict)
 
     def __contains__(self, key: Key) -> bool:
         return key in self._keys
@@ -57,80 +62,58 @@ class OperatorPins:
         OverBudget
             All pins together would take more than the budget.
         """
-        wanted, unknown = self._keys_of(message.ids, canonical_layers(message.layers))
-        total = sum(map(self._size, self._keys | wanted))
-        budget = self._cache.ledger.budget_bytes
-        if wanted and total + self._cache.ledger.overhead_bytes > budget:
+        cells, unknown = cells_named(self.cache, message.ids)
+        wanted = {Key(cell, layer) for cell in cells for layer in canonical_layers(message.layers)}
+        ledger = self.cache.ledger
+        total = sum(map(self._size, self._keys.keys() | wanted))
+        if wanted and total + ledger.overhead_bytes > ledger.budget_bytes:
             raise OverBudget(
-                f"with these cells {total} bytes would be pinned; the budget is {budget} bytes",
+                f"with these cells {total} bytes would be pinned; the budget is {ledger.budget_bytes} bytes",
                 hint="unpin others, or serve with a larger --budget",
             )
-        for key in wanted - self._keys:
-            self._cache.ledger.need(key)
-            self._keys.add(key)
-            self._round.append(key)
+        for key in wanted - self._keys.keys():
+            ledger.need(key)
+            self._keys[key] = None
         for key in wanted:
             self._keep(key, now_s)
-        shown = wanted if message.ids else self._keys
-        return self._answer(message.request, shown, unknown)
+        return self._answer(message.request, wanted if message.ids else self._keys, unknown)
 
     def unpin(self, message: messages.Unpin) -> messages.Pinned:
         """Let cells go, all without ids; answers with what stays pinned."""
-        gone = set(self._keys)
-        unknown: list[str] = []
-        if message.ids is not None:
-            gone, unknown = self._keys_of(message.ids, None)
-        for key in gone & self._keys:
-            self._keys.remove(key)
-            self._cache.ledger.need_no_more(key)
-        self._round = deque(key for key in self._round if key in self._keys)
+        cells, unknown = cells_named(self.cache, message.ids or ())
+        for key in [key for key in self._keys if message.ids is None or key.cell_id in cells]:
+            del self._keys[key]
+            self.cache.ledger.need_no_more(key)
         return self._answer(message.request, self._keys, unknown)
 
     def keep(self, now_s: float) -> None:
         """Look at some pins: what is not in memory at its current version is loaded."""
-        for _ in range(min(LOOKS_AT_ONCE, len(self._round))):
-            key = self._round.popleft()
-            self._round.append(key)
+        for key in list(islice(self._keys, LOOKS_AT_ONCE)):
+            self._keys.move_to_end(key)
             self._keep(key, now_s)
 
     def _keep(self, key: Key, now_s: float) -> None:
-        cache = self._cache
-        index = cache.index_of(key.cell_id)
-        if index is not None and cache.find_warm(index, key.layer, now_s) is None:
-            self._scheduler.want(index, key.layer, BACKGROUND, now_s)
-
-    def _keys_of(self, ids: Iterable[str], layers: tuple[str, ...] | None) -> tuple[set[Key], list[str]]:
-        """Keys of cells by id, in these layers (None: in those that are pinned), and ids unknown."""
-        keys: set[Key] = set()
-        unknown: list[str] = []
-        for cell in ids:
-            index = self._cache.index_of(cell)
-            if index is None:
-                unknown.append(cell)
-                continue
-            cell_id = self._cache.catalogue.id(index)
-            names = self.layers_of(cell_id) if layers is None else layers
-            keys |= {Key(cell_id, layer) for layer in names}
-        return keys, unknown
+        index = self.cache.index_of(key.cell_id)
+        if index is not None and self.cache.find_warm(index, key.layer, now_s) is None:
+            self.scheduler.want(index, key.layer, BACKGROUND, now_s)
 
     def _size(self, key: Key) -> int:
-        resident = self._cache.ledger.by_key.get(key)
+        resident = self.cache.ledger.by_key.get(key)
         if resident is not None:
             return resident.nbytes
-        index = self._cache.index_of(key.cell_id)
-        return 0 if index is None else self._cache.estimate(index, key.layer)
+        index = self.cache.index_of(key.cell_id)
+        return 0 if index is None else self.cache.estimate(index, key.layer)
 
-    def _answer(self, request: int, keys: Iterable[Key], unknown: list[str]) -> messages.Pinned:
-        rows = [self._row(key) for key in sorted(keys)]
-        return messages.Pinned(request, tuple(rows), tuple(unknown))
+    def _answer(self, request: int, keys: Iterable[Key], unknown: tuple[str, ...]) -> messages.Pinned:
+        return messages.Pinned(request, tuple(map(self._row, sorted(keys))), unknown)
 
     def _row(self, key: Key) -> PinnedCell:
-        resident, failure = self._cache.ledger.by_key.get(key), self._scheduler.loads.failures.get(key)
+        resident, failure = self.cache.ledger.by_key.get(key), self.scheduler.loads.failures.get(key)
         if resident is not None:
-            state = "resident" if self._cache.is_current(resident) else "stale"
-        elif self._scheduler.loads.is_promised(key):
+            state = "resident" if self.cache.is_current(resident) else "stale"
+        elif self.scheduler.loads.is_promised(key):
             state = "loading"
         else:
             state = failure.code if failure is not None else "absent"
         nbytes = resident.nbytes if resident is not None else 0
-        return PinnedCell(self._cache.wire_id(key.cell_id), key.layer, state, nbytes)
+        return PinnedCell(self.cache.wire_id(key.cell_id), key.layer, state, nbytes)

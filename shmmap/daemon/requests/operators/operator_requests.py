@@ -9,8 +9,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.records import Resident
-from shmmap.daemon.requests.operators.operator_pins import OperatorPins
+from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
@@ -80,34 +79,17 @@ class OperatorRequests:
                 self.outbox.refuse(session.identity, message.request, result)
                 return
             change = compare(before, result)
-            reloaded = messages.Reloaded(
-                message.request,
-                result.map_version,
-                len(change.changed),
-                len(change.added),
-                len(change.removed),
-                result.problems,
-            )
+            counts = len(change.changed), len(change.added), len(change.removed)
+            reloaded = messages.Reloaded(message.request, result.map_version, *counts, result.problems)
             self.outbox.send(session, encode(reloaded))
 
         self.reloader.ask(answer)
 
     def _evict(self, message: messages.Evict, now_s: float) -> messages.Evicted:
-        cache = self.cache
-        unknown: list[str] = []
-        chosen: list[Resident] = []
-        if message.ids is None:
-            chosen = list(cache.ledger.residents())
-        else:
-            asked: set[str] = set()
-            for cell in message.ids:
-                index = cache.index_of(cell)
-                if index is None:
-                    unknown.append(cell)
-                else:
-                    asked.add(cache.catalogue.id(index))
-            chosen = [r for r in cache.ledger.residents() if r.key.cell_id in asked]
+        cells, unknown = cells_named(self.cache, message.ids or ())
+        residents = self.cache.ledger.residents()
+        chosen = [r for r in residents if message.ids is None or r.key.cell_id in cells]
         loose = [resident for resident in chosen if resident.key not in self.pins]
-        freed = sum(cache.evict(resident, now_s) for resident in loose)
+        freed = sum(self.cache.evict(resident, now_s) for resident in loose)
         kept = len(chosen) - len(loose)
-        return messages.Evicted(message.request, freed, len(loose) - freed, tuple(unknown), kept)
+        return messages.Evicted(message.request, freed, len(loose) - freed, unknown, kept)
