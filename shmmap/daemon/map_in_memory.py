@@ -59,20 +59,11 @@ class MapInMemory:
     ) -> None:
         self.epoch = secrets.randbits(63) | 1
         self.identity = DaemonIdentity(
-            pid=os.getpid(),
-            start_time_ticks=start_time_ticks(os.getpid()),
-            pid_namespace=pid_namespace(),
-            epoch=self.epoch,
-            instance=config.instance,
-            endpoint=socket_path,
-            map_path=config.map_path,
-            map_version=catalogue.map_version,
-            shm_dir=directory.path,
-            id_prefix=catalogue.id_prefix,
-            library_version=__version__,
-            started_unix_ns=time.time_ns(),
-            frame_id=catalogue.frame_id,
-        )
+            pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),
+            epoch=self.epoch, instance=config.instance, endpoint=socket_path, map_path=config.map_path,
+            map_version=catalogue.map_version, shm_dir=directory.path, id_prefix=catalogue.id_prefix,
+            library_version=__version__, started_unix_ns=time.time_ns(), frame_id=catalogue.frame_id,
+        )  # fmt: skip
         budget = choose_budget(  # may refuse: before anything has a name
             config.budget_bytes,
             directory,

@@ -33,15 +33,7 @@ from shmmap.segment.names import another_name, is_zombie, segment_prefix, statis
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.verify import read_header
 
-__all__ = ["Adoption", "TakenOver"]
-
-
-class TakenOver(NamedTuple):
-    """How many segments were adopted, kept for their readers, and removed or refused."""
-
-    adopted: int
-    retired: int
-    dropped: int
+__all__ = ["Adoption"]
 
 
 class _Found(NamedTuple):
@@ -69,36 +61,33 @@ class Adoption:
     mode: int
     gid: int
 
-    def take_over(self, now_s: float) -> TakenOver:
+    def take_over(self, now_s: float) -> None:
         """Look at every name once."""
-        adopted = retired = dropped = 0
+        counts = dict.fromkeys(("taken_over", "still_in_use", "dropped"), 0)
         prefix = segment_prefix(self.instance)
         not_segments = (statistics_name(self.instance), prefix + "lock")
         for name in self.directory.names(prefix):
-            if name.startswith(not_segments):
-                continue
-            try:
-                fd = self.directory.open(name)
-            except OSError as error:
-                self._remove(name, str(error.strerror))
-                dropped += 1
-                continue
-            try:
-                found = self._look(fd, name)
-                if not found.why_not:
-                    self._adopt(fd, name, found, now_s)
-                    adopted += 1
-                elif self._keep_for_readers(fd, name, found, now_s):
-                    retired += 1
-                else:
-                    dropped += 1
-            finally:
-                os.close(fd)
+            if not name.startswith(not_segments):
+                counts[self._take(name, now_s)] += 1
         step("daemon.adopted")
-        if adopted or retired or dropped:
-            counts = {"taken_over": adopted, "still_in_use": retired, "dropped": dropped}
+        if any(counts.values()):
             log.info("segments of an earlier daemon", **counts)
-        return TakenOver(adopted, retired, dropped)
+
+    def _take(self, name: str, now_s: float) -> str:
+        """What becomes of a name."""
+        try:
+            fd = self.directory.open(name)
+        except OSError as error:
+            self._remove(name, str(error.strerror))
+            return "dropped"
+        try:
+            found = self._look(fd, name)
+            if not found.why_not:
+                self._adopt(fd, name, found, now_s)
+                return "taken_over"
+            return "still_in_use" if self._keep_for_readers(fd, name, found, now_s) else "dropped"
+        finally:
+            os.close(fd)
 
     # --- judging ------------------------------------------------------------------------------
 
@@ -132,10 +121,8 @@ class Adoption:
             return "its cell is not in the map"
         if Key(header.cell_id, header.layer) in cache.ledger.by_key:
             return "there is another one"
-        if (block.version, header.source) != (
-            cache.layers.version(index, header.layer),
-            catalogue.stamp(index),
-        ):
+        known = cache.layers.version(index, header.layer), catalogue.stamp(index)
+        if (block.version, header.source) != known:
             return "its source has changed"
         if header.box != catalogue.box(index) or header.frame_id != catalogue.frame_id:
             return "its cell has moved"
@@ -182,21 +169,11 @@ class Adoption:
         nbytes, used_s = measured_bytes(fd), now_s - HAND_OUT_GRACE_S
         header, block = found.header, found.block
         if header is None or block is None:
-            return Resident(
-                live_name, Key("", ""), 0, nbytes, 0, (0.0, 0.0, 0.0, 0.0), 0.0, 0.0, checked=False
-            )
+            return Resident(live_name, Key("", ""), 0, nbytes, 0, (0.0,) * 4, 0.0, 0.0, checked=False)
         return Resident(
-            live_name,
-            Key(header.cell_id, header.layer),
-            block.version,
-            nbytes,
-            header.rows,
-            header.box,
-            header.z_min,
-            header.z_max,
-            last_use_s=used_s,
-            checked=False,
-        )
+            live_name, Key(header.cell_id, header.layer), block.version, nbytes, header.rows, header.box,
+            header.z_min, header.z_max, last_use_s=used_s, checked=False,
+        )  # fmt: skip
 
     def _remove(self, name: str, why: str) -> None:
         try:

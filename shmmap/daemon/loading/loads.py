@@ -12,7 +12,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final
 
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
@@ -31,31 +31,21 @@ LOAD_COST_BYTES: Final = 64 << 10
 """What a load costs besides its bytes: many tiny cells are work, too."""
 
 
-class _Load(Protocol):
-    """What the queue needs to know of a load."""
-
-    estimate: int
-    number: int
-
-
-Queued = TypeVar("Queued", bound=_Load)
-
-
 @dataclass(eq=False, slots=True)
-class _Asker(Generic[Queued]):
+class _Asker:
     """One asker's loads by priority; ``clock`` is the bytes it has been given."""
 
     clock: int
-    heap: list[tuple[float, int, Queued]] = field(default_factory=list)
+    heap: list[tuple[float, int, Load]] = field(default_factory=list)
     best: dict[int, float] = field(default_factory=dict)
 
 
-class LoadQueue(Generic[Queued]):
+class LoadQueue:
     """Loads that wait for a worker or for room; one is here from `push` to `discard`."""
 
     def __init__(self) -> None:
-        self._loads: dict[int, Queued] = {}
-        self._askers: dict[Hashable, _Asker[Queued]] = {}
+        self._loads: dict[int, Load] = {}
+        self._askers: dict[Hashable, _Asker] = {}
         self._clock = 0
         self._chosen: Hashable = None
 
@@ -67,7 +57,7 @@ class LoadQueue(Generic[Queued]):
         mine = self._askers.get(asker)
         return 0 if mine is None else sum(number in self._loads for number in mine.best)
 
-    def push(self, load: Queued, priority: float, asker: Hashable) -> None:
+    def push(self, load: Load, priority: float, asker: Hashable) -> None:
         """Somebody wants this; asked for again, it is never moved back."""
         self._loads[load.number] = load
         mine = self._askers.get(asker)
@@ -78,18 +68,18 @@ class LoadQueue(Generic[Queued]):
             mine.best[load.number] = priority
             heapq.heappush(mine.heap, (priority, load.number, load))
 
-    def discard(self, load: Queued) -> None:
+    def discard(self, load: Load) -> None:
         """It does not wait any more."""
         self._loads.pop(load.number, None)
 
-    def started(self, load: Queued) -> None:
+    def started(self, load: Load) -> None:
         """It does not wait any more, and counts for whose turn it was."""
         self.discard(load)
         chosen = self._askers.get(self._chosen)
         if chosen is not None:
             chosen.clock += load.estimate + LOAD_COST_BYTES
 
-    def next(self) -> Queued | None:
+    def next(self) -> Load | None:
         """The load that comes next, or None."""
         found: tuple[bool, int, float, int] | None = None
         for asker, mine in list(self._askers.items()):
@@ -107,7 +97,7 @@ class LoadQueue(Generic[Queued]):
         self._clock = max(self._clock, chosen.clock)
         return chosen.heap[0][2]
 
-    def _clean(self, mine: _Asker[Queued]) -> None:
+    def _clean(self, mine: _Asker) -> None:
         """Drop what does not wait any more from the front, and from everywhere once it is most."""
         while mine.heap and mine.heap[0][1] not in self._loads:
             mine.best.pop(heapq.heappop(mine.heap)[1], None)
@@ -138,7 +128,7 @@ class Loads:
         self.by_key: dict[Key, Load] = {}
         self.failures: dict[Key, Failure] = {}
         self._keys_failed: dict[str, dict[Key, None]] = {}  # by code, those that failed longest ago first
-        self._queue: LoadQueue[Load] = LoadQueue()
+        self._queue = LoadQueue()
         self._numbers = 0
 
     def __len__(self) -> int:

@@ -3,29 +3,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import count
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.loading.loads import BACKGROUND, LoadQueue
+from shmmap.daemon.records import Key, Load
 
 _numbers = count()
 
 
-@dataclass(eq=False)
-class Load:
-    number: int
-    estimate: int = 1 << 20
-
-
 def load(nbytes: int = 1 << 20) -> Load:
-    return Load(next(_numbers), nbytes)
+    return Load(Key("", ""), nbytes, 0.0, next(_numbers))
 
 
 def test_who_waits_for_how_many() -> None:
-    queue: LoadQueue[Load] = LoadQueue()
+    queue = LoadQueue()
     shared, own = load(), load()
     for one, asker in ((shared, "a"), (shared, "b"), (own, "a"), (own, "a")):
         queue.push(one, 1.0, asker)
@@ -34,7 +28,7 @@ def test_who_waits_for_how_many() -> None:
     assert [queue.count(asker) for asker in "abc"] == [1, 0, 0]
 
 
-def start(queue: LoadQueue[Load]) -> Load | None:
+def start(queue: LoadQueue) -> Load | None:
     one = queue.next()
     if one is not None:
         queue.started(one)
@@ -42,7 +36,7 @@ def start(queue: LoadQueue[Load]) -> Load | None:
 
 
 def test_a_newcomer_waits_for_one_of_anothers() -> None:
-    queue: LoadQueue[Load] = LoadQueue()
+    queue = LoadQueue()
     greedy = [load() for _ in range(100)]
     for one in greedy:
         queue.push(one, 0.0, "greedy")
@@ -55,7 +49,7 @@ def test_a_newcomer_waits_for_one_of_anothers() -> None:
 
 
 def test_turns_are_by_bytes() -> None:
-    queue: LoadQueue[Load] = LoadQueue()
+    queue = LoadQueue()
     large = [load(32 << 20) for _ in range(10)]
     small = [load(1 << 20) for _ in range(200)]
     for one in large:
@@ -67,7 +61,7 @@ def test_turns_are_by_bytes() -> None:
 
 
 def test_wanted_by_two_it_counts_once() -> None:
-    queue: LoadQueue[Load] = LoadQueue()
+    queue = LoadQueue()
     shared, own = load(), load()
     queue.push(shared, 9.0, "a")
     queue.push(own, 1.0, "b")
@@ -80,7 +74,7 @@ def test_wanted_by_two_it_counts_once() -> None:
 
 
 def test_what_nobody_waits_for_comes_last() -> None:
-    queue: LoadQueue[Load] = LoadQueue()
+    queue = LoadQueue()
     check, asked = load(0), load()
     queue.push(check, float("inf"), None)
     queue.push(asked, BACKGROUND / 2, "a")
@@ -96,7 +90,7 @@ def test_what_nobody_waits_for_comes_last() -> None:
     )
 )
 def test_everything_comes_once_and_nearest_first_of_each(steps: list[tuple[str, int, int]]) -> None:
-    queue: LoadQueue[Load] = LoadQueue()
+    queue = LoadQueue()
     waiting: dict[Load, dict[int, int]] = {}
     for what, asker, number in steps:
         chosen = list(waiting)[number % len(waiting)] if waiting else None
