@@ -21,7 +21,7 @@ from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
-from shmmap.daemon.pins.probe import Rung
+from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.transport.sessions import Sessions
@@ -78,7 +78,7 @@ class MapInMemory:
                 key="shm_dir",
                 hint="make room, and lift limits on the size of files (ulimit -f, LimitFSIZE=)",
             ) from error
-        self.statistics.set("pin_source", list(Rung).index(pins.rung))
+        self.statistics.set("pin_source", list(PinSource).index(pins.source))
         self.statistics.set("last_reload_unix_ns", time.time_ns())
         ledger = Ledger(budget)
         ledger.overhead_bytes = self.statistics.size_bytes

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.groups import group_id
-from shmmap.daemon.pins.probe import Rung, probe_pins
+from shmmap.daemon.pins.probe import PinSource, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.errors import ConfigError
 from shmmap.logfmt import log
@@ -48,10 +48,10 @@ def make_runtime_dir(path: Path, gid: int) -> None:
 def choose_pins(directory: ShmDirectory) -> PinWatch:
     """Find out how well this machine tells who uses a segment, and say so."""
     support = probe_pins(directory)
-    if support.rung is not Rung.LEASES:
+    if support.source is not PinSource.LEASES:
         log.warning("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor")
-    source = support.rung.value
+    source = support.source.value
     log.info("segments in use are known from", source=source, **support._asdict())
     return PinWatch(
-        directory, support.rung, events=support.close_events and support.rung is not Rung.SESSIONS
+        directory, support.source, events=support.close_events and support.source is not PinSource.SESSIONS
     )

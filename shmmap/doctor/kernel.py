@@ -35,7 +35,7 @@ def check_pins(patient: Patient) -> Finding:
     if not found.leases:
         return warn(
             name,
-            f"{patient.shm_dir}: no leases, so who uses a segment is known from {found.rung.value} only",
+            f"{patient.shm_dir}: no leases, so who uses a segment is known from {found.source.value} only",
             "name a directory on a tmpfs with shm_dir",
         )
     if not (found.locks and found.close_events and found.process_ends):

@@ -66,6 +66,11 @@ def test_a_second_instance_is_refused_and_the_first_one_goes_on(
 
 def test_two_instances_side_by_side(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
+    first = one.log.splitlines()[0]
+    assert (
+        f"INFO    starting version={shmmap.__version__} instance={one.instance} map={divided_map.root} "
+        in first
+    )
     two = daemon(divided_map.root, shm_dir=one.shm_dir)
     assert len(connect(one).area(circle(0, 0, 5)).cells) == 4
     assert len(connect(two).area(circle(0, 0, 25)).cells) == 12

@@ -16,7 +16,7 @@ from typing import Final, Protocol
 
 from shmmap.daemon.cache.eviction_policy import EvictionPolicy
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.pins.probe import Rung
+from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
@@ -108,7 +108,7 @@ class Reclaimer:
 
     def is_pinned(self, resident: Resident) -> bool | None:
         """The kernel's word on a segment; None if its name is gone."""
-        if self.pins.rung is Rung.SESSIONS:
+        if self.pins.source is PinSource.SESSIONS:
             return bool(resident.sessions)
         return self.pins.is_used(self.name_on_disk(resident))
 

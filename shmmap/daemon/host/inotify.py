@@ -10,17 +10,9 @@ import struct
 from typing import Final, NamedTuple
 
 __all__ = [
-    "CHANGED",
-    "CLOSED",
-    "CREATED",
-    "DIRECTORY",
-    "ENDED",
-    "NAME_GONE",
-    "OVERFLOW",
-    "SELF_MOVED",
-    "Event",
-    "Inotify",
-]
+    "CHANGED", "CLOSED", "CREATED", "DIRECTORY", "ENDED", "NAME_GONE", "OVERFLOW", "SELF_MOVED",
+    "Event", "Inotify",
+]  # fmt: skip
 
 CLOSED: Final = 0x08 | 0x10
 """A descriptor that could write, or could not, is closed for the last time: IN_CLOSE."""

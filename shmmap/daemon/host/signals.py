@@ -12,18 +12,14 @@ from typing import Final
 from shmmap.logfmt import log
 
 __all__ = [
-    "KEEP_SIGNAL",
-    "RELOAD_SIGNAL",
-    "STOP_SIGNALS",
-    "ServingSignals",
-    "StartSignals",
-    "ignore_signals",
-]
+    "KEEP_SIGNAL", "RELOAD_SIGNAL", "STOP_SIGNALS", "ServingSignals", "StartSignals", "ignore_signals"
+]  # fmt: skip
 
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1
 """Ends the daemon and leaves the segments to its next life: see `shmmap.daemon.main`."""
 RELOAD_SIGNAL: Final = signal.SIGHUP
+_ALL: Final = (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL)
 
 
 class StartSignals:
@@ -37,21 +33,15 @@ class StartSignals:
         self.keep = False
         self._held = False
         self._stop = False
-        for number in STOP_SIGNALS:
-            signal.signal(number, self._on_stop)
-        signal.signal(KEEP_SIGNAL, self._on_keep)
-        signal.signal(RELOAD_SIGNAL, self._on_reload)
+        for number in _ALL:
+            signal.signal(number, self._on_signal)
 
-    def _on_reload(self, number: int, frame: object) -> None:
-        del number, frame
-        self.reload_wanted = True
-
-    def _on_keep(self, number: int, frame: object) -> None:
-        self.keep = True
-        self._on_stop(number, frame)
-
-    def _on_stop(self, number: int, frame: object) -> None:
+    def _on_signal(self, number: int, frame: object) -> None:
         del frame
+        self.reload_wanted |= number == RELOAD_SIGNAL
+        self.keep |= number == KEEP_SIGNAL
+        if number == RELOAD_SIGNAL:
+            return
         if not self._stop:
             log.info("stopping", signal=signal.Signals(number).name, during="start")
         self._stop = True
@@ -84,7 +74,7 @@ class ServingSignals:
         self._ours.setblocking(False)
         self._theirs.setblocking(False)
         self.fd = self._ours.fileno()
-        for number in (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL):
+        for number in _ALL:
             signal.signal(number, lambda *_: None)
         self._before = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
 

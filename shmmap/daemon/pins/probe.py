@@ -20,12 +20,12 @@ from shmmap.daemon.host.inotify import CLOSED, Inotify
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import holders, is_pinned, lock_slot
 
-__all__ = ["PinSupport", "Rung", "probe_pins"]
+__all__ = ["PinSource", "PinSupport", "probe_pins"]
 
 _SLOT: Final = 12345
 
 
-class Rung(enum.Enum):
+class PinSource(enum.Enum):
     """Where the word on who uses a segment comes from, best first; the value is for people."""
 
     LEASES = "leases"
@@ -54,9 +54,9 @@ class PinSupport(NamedTuple):
     process_ends: bool
 
     @property
-    def rung(self) -> Rung:
+    def source(self) -> PinSource:
         """The best way that works."""
-        return Rung.LEASES if self.leases else Rung.LOCKS if self.locks else Rung.SESSIONS
+        return PinSource.LEASES if self.leases else PinSource.LOCKS if self.locks else PinSource.SESSIONS
 
 
 def probe_pins(directory: ShmDirectory) -> PinSupport:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from shmmap.daemon.host.inotify import CLOSED, OVERFLOW, Inotify
-from shmmap.daemon.pins.probe import Rung
+from shmmap.daemon.pins.probe import PinSource
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import holders, is_pinned
 
@@ -32,8 +32,8 @@ class PinWatch:
 
     Parameters
     ----------
-    rung
-        Whose word is taken; for `Rung.SESSIONS` the caller asks the sessions.
+    source
+        Whose word is taken; for `PinSource.SESSIONS` the caller asks the sessions.
     events
         Whether to have closes reported.
 
@@ -43,8 +43,10 @@ class PinWatch:
         Readable when `closed` has something to tell; -1 where nothing is reported.
     """
 
-    def __init__(self, directory: ShmDirectory, rung: Rung = Rung.LEASES, *, events: bool = False) -> None:
-        self.rung = rung
+    def __init__(
+        self, directory: ShmDirectory, source: PinSource = PinSource.LEASES, *, events: bool = False
+    ) -> None:
+        self.source = source
         self._directory = directory
         self._kept: dict[str, tuple[int, int]] = {}
         self._names: dict[int, str] = {}
@@ -78,9 +80,9 @@ class PinWatch:
 
     def told(self, fd: int) -> bool:
         """Whether anybody else uses an open segment, by the kernel's word; False where it gives none."""
-        if self.rung is Rung.LEASES:
+        if self.source is PinSource.LEASES:
             return is_pinned(fd)
-        return self.rung is Rung.LOCKS and bool(holders(fd, limit=1))
+        return self.source is PinSource.LOCKS and bool(holders(fd, limit=1))
 
     def is_used(self, name: str) -> bool | None:
         """Whether anybody uses a segment; None if its name is gone."""

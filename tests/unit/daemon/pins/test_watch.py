@@ -8,7 +8,7 @@ import select
 
 import pytest
 
-from shmmap.daemon.pins.probe import PinSupport, Rung, probe_pins
+from shmmap.daemon.pins.probe import PinSource, PinSupport, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.segment.attach import attach, unmap
 from shmmap.segment.directory import ShmDirectory
@@ -36,29 +36,29 @@ def reported(fd: int, timeout_s: float = 10.0) -> bool:
 def test_this_machine_tells_everything(directory: ShmDirectory) -> None:
     support = probe_pins(directory)
     assert support == PinSupport(True, True, True, True)
-    assert support.rung is Rung.LEASES
+    assert support.source is PinSource.LEASES
     assert os.listdir(directory.path) == [NAME[1:]]
 
 
-@pytest.mark.parametrize(("less", "rung"), [("locks", Rung.LOCKS), ("sessions", Rung.SESSIONS)])
+@pytest.mark.parametrize(("less", "source"), [("locks", PinSource.LOCKS), ("sessions", PinSource.SESSIONS)])
 def test_the_next_best_way_is_taken(
-    directory: ShmDirectory, monkeypatch: pytest.MonkeyPatch, less: str, rung: Rung
+    directory: ShmDirectory, monkeypatch: pytest.MonkeyPatch, less: str, source: PinSource
 ) -> None:
     monkeypatch.setenv("SHMMAP_TEST_PINS", less)
-    assert probe_pins(directory).rung is rung
+    assert probe_pins(directory).source is source
 
 
 @pytest.mark.parametrize(
-    ("rung", "lock", "used"),
+    ("source", "lock", "used"),
     [
-        (Rung.LEASES, 77, True),
-        (Rung.LEASES, None, True),
-        (Rung.LOCKS, 77, True),
-        (Rung.LOCKS, None, False),  # overlooked, as documented
+        (PinSource.LEASES, 77, True),
+        (PinSource.LEASES, None, True),
+        (PinSource.LOCKS, 77, True),
+        (PinSource.LOCKS, None, False),  # overlooked, as documented
     ],
 )
-def test_use(directory: ShmDirectory, rung: Rung, lock: int | None, used: bool) -> None:
-    pins = PinWatch(directory, rung)
+def test_use(directory: ShmDirectory, source: PinSource, lock: int | None, used: bool) -> None:
+    pins = PinWatch(directory, source)
     assert pins.is_used(NAME) is False
     mapping = map_segment(directory.path + NAME, lock)
     assert pins.is_used(NAME) is used
