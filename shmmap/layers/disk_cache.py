@@ -32,15 +32,9 @@ import xxhash
 from shmmap.errors import CannotWrite, SegmentCorrupt
 from shmmap.layers.contract import Box
 from shmmap.layers.spec import LayerSpec
+from shmmap.segment import layout
 from shmmap.segment.header import pack_header, unpack_header
-from shmmap.segment.layout import (
-    LAYOUT_VERSION,
-    NO_SOURCE,
-    PAGE_BYTES,
-    SegmentHeader,
-    SourceStamp,
-    header_size,
-)
+from shmmap.segment.layout import SegmentHeader, SourceStamp, header_size
 from shmmap.segment.writer import write_all
 
 __all__ = ["CacheKey", "LayerCache", "neighbour_states"]
@@ -70,7 +64,7 @@ class CacheKey:
     neighbours: tuple[tuple[str, SourceStamp], ...] = ()
 
     def _layer(self) -> bytes:
-        version = struct.pack("<IHH4d", self.spec.builder_version, *LAYOUT_VERSION, *self.box)
+        version = struct.pack("<IHH4d", self.spec.builder_version, *layout.LAYOUT_VERSION, *self.box)
         return str(self.spec).encode() + b"\0" + version
 
     def state_name(self) -> str:
@@ -308,9 +302,9 @@ class LayerCache:
 
 
 def _read_header(fd: int, available: int) -> SegmentHeader:
-    page = os.pread(fd, PAGE_BYTES, 0)
+    page = os.pread(fd, layout.PAGE_BYTES, 0)
     header_bytes = int.from_bytes(page[16:24], "little")
-    if PAGE_BYTES < header_bytes <= available:
+    if layout.PAGE_BYTES < header_bytes <= available:
         page = os.pread(fd, header_bytes, 0)
     return unpack_header(memoryview(page), available)
 
@@ -353,4 +347,4 @@ def _state_of(path: str) -> SourceStamp:
     try:
         return SourceStamp.of(os.stat(path))
     except OSError:
-        return NO_SOURCE
+        return layout.NO_SOURCE

@@ -145,7 +145,7 @@ def test_a_daemon_that_ends_before_it_answers(place: Path) -> None:
     with listening(place / "s.sock") as server:
         thread = threading.Thread(target=lambda: server.accept()[0].close())
         thread.start()
-        with pytest.raises(StaleSocket, match="without a word"):
+        with pytest.raises(StaleSocket, match="closed the connection without an answer"):
             connect(place / "s.sock")
         thread.join()
 
