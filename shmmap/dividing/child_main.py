@@ -62,8 +62,7 @@ def main(arguments: list[str]) -> int:
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     os.nice(_NICENESS)
-    # clients ask in the cloud's own coordinates, so it keeps its frame
-    settings = DivideSettings(translate="none", resume=True)
+    settings = DivideSettings(resume=True)  # as `shmmap divide` does it, so that both give the same map
     try:
         divide([arguments[2]], arguments[3], settings, progress=channel)
     except ShmmapError as error:

@@ -158,7 +158,7 @@ def _moved_note(move: Sequence[float], reach: float) -> str:
     x, y, z = move
     return (
         f"moved by ({x:.12g}, {y:.12g}, {z:.12g}) m: float32 would have lost up to {_loss_mm(reach):.2g} mm "
-        "where the points were; --translate none keeps their frame, in float64"
+        "where the points were; `shmmap divide --translate none` keeps their frame, in float64"
     )
 
 

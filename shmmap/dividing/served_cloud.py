@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from xxhash import xxh3_64_hexdigest
 
+from shmmap.dividing.report import read_report
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.logfmt import log
@@ -38,7 +39,7 @@ from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_chil
 
 __all__ = ["DividedCloud", "find_origin"]
 
-_RECIPE: Final = "cells of 20 m, frame kept, 1"  # changes whenever the same cloud would be divided otherwise
+_RECIPE: Final = "cells of 20 m, frame moved, 1"  # changes whenever the same cloud would be divided otherwise
 _KEPT_CLOUDS: Final = 8
 _MORE_TIME_USEC: Final = 60_000_000
 _LINK: Final = "map"
@@ -135,7 +136,10 @@ class DividedCloud:
             raise CannotWrite(
                 f"{error.filename or self._directory}: {error.strerror}", hint="name another --cache-dir"
             ) from error
-        return MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
+        catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
+        report = read_report(out) or {}
+        catalogue.problems = (*catalogue.problems, *map(str, report.get("notes", ())))
+        return catalogue
 
     def _divide(self, out: str) -> None:
         log.info("dividing", cloud=self.path, into=out)

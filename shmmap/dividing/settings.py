@@ -10,6 +10,7 @@ from shmmap.dividing.cell_order import ORDERS
 from shmmap.dividing.frame import Translation
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.memory import MIN_MEMORY_BYTES
+from shmmap.dividing.row_layout import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd_header import ENCODINGS
 
@@ -40,6 +41,8 @@ class DivideSettings:
         Most memory that the process may take, code and libraries included.
     common_fields
         Keep only what all inputs have, where their fields differ.
+    fields
+        Keep only these, x, y and z among them; empty: all.
     force
         Replace a divided map that is there.
     resume
@@ -61,6 +64,7 @@ class DivideSettings:
     order: str = "input"
     memory_bytes: int = 1 << 30
     common_fields: bool = False
+    fields: tuple[str, ...] = ()
     force: bool = False
     resume: bool = False
     check: bool = False
@@ -90,6 +94,10 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
     for name, value, allowed in choices:
         if value not in allowed:
             raise BadRequest(f"{name} {value!r} is not one of {', '.join(allowed)}")
+    if settings.fields and (missing := [axis for axis in AXES if axis not in settings.fields]):
+        raise BadRequest(
+            f"the fields to keep lack {', '.join(missing)}", hint="name x, y and z, too: x,y,z,intensity"
+        )
     if isinstance(settings.translate, tuple):
         if not all(map(math.isfinite, settings.translate)):
             raise BadRequest("a translation is three numbers of metres")

@@ -12,9 +12,9 @@ from typing import Final
 
 import shmmap
 from shmmap.doctor.finding import Finding, fail, ok, warn
-from shmmap.doctor.memory import size_text
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.errors import ShmmapError
+from shmmap.quantities import format_bytes
 from shmmap.statistics.reader import read_statistics
 
 __all__ = ["check_daemon", "check_leftovers", "check_logind", "check_reload"]
@@ -80,7 +80,7 @@ def check_leftovers(patient: Patient) -> Finding:
     if not orphans:
         return ok(name, "every segment belongs to a daemon that lives" if found else "none")
     listed = ", ".join(
-        f"{one}: {count} segments, {size_text(n)}" for one, (count, n) in sorted(orphans.items())
+        f"{one}: {count} segments, {format_bytes(n)}" for one, (count, n) in sorted(orphans.items())
     )
     return warn(
         name,

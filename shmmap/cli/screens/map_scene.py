@@ -24,7 +24,7 @@ GLYPHS: Final = {
     # state: glyph, style on a terminal
     "resident": ("#", "green"),
     "stale": ("s", "yellow"),
-    "zombie": ("z", "magenta"),
+    "zombie": ("r", "magenta"),
     "disk": (".", "bright_black"),
     "window": ("o", "red"),
     "client": ("@", "bold red"),
@@ -52,6 +52,8 @@ class Scene:
         CLOCK_MONOTONIC of ``rows`` and ``clients``.
     title, note
         Two lines.
+    empty
+        There is nothing to draw, not even on disk.
     """
 
     bounds: BoxTuple
@@ -61,6 +63,7 @@ class Scene:
     now_ns: int
     title: str
     note: str
+    empty: bool = False
 
     def by_cell(self) -> dict[str, list[CellRow]]:
         """Segments of each cell, the most telling state last."""
@@ -162,8 +165,9 @@ def _cell_title(rows: Sequence[CellRow], now_ns: int) -> str:
     lines = [rows[-1].id]
     for row in rows:
         idle_s = max(now_ns - row.last_use_monotonic_ns, 0) * 1e-9
+        state = "retired" if row.state == "zombie" else row.state
         lines.append(
-            f"{row.layer}: {row.state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
+            f"{row.layer}: {state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
             f" used {format_duration(idle_s)} ago, loaded in {format_duration(row.load_ns * 1e-9)}"
         )
     return "\n".join(lines)

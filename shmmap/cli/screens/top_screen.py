@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from shmmap.cli.screens.cache_verdict import cache_verdict
 from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.doctor.cache_size import cache_verdict
 
 if TYPE_CHECKING:
     from shmmap.statistics.client_rows import ClientRow
@@ -29,17 +29,17 @@ _STATE_STYLES: Final = {
     "dead": "bold red",
 }
 _PARTS: Final = (
-    # name, glyph, style
-    ("pinned", "█", "cyan"),
-    ("idle", "▓", "green"),
-    ("zombie", "▒", "yellow"),
-    ("reserved", "░", "magenta"),
-    ("free", "·", "bright_black"),
+    # part, what it is called, glyph, style
+    ("pinned", "in use", "█", "cyan"),
+    ("idle", "idle", "▓", "green"),
+    ("zombie", "retired", "▒", "yellow"),
+    ("reserved", "reserved", "░", "magenta"),
+    ("free", "free", "·", "bright_black"),
 )
 
 
 def budget_parts(counters: dict[str, int]) -> dict[str, int]:
-    """Split the budget: bytes pinned and idle (both can be handed out), zombie, reserved, free.
+    """Split the budget: bytes in use and idle (both can be handed out), retired, reserved, free.
 
     Reserved is what loads under way and the statistics themselves take.
     """
@@ -81,7 +81,7 @@ def screen(
     lines.append([])
     lines.append(_labelled("hits", _hits(counters)))
     verdict = cache_verdict(counters)
-    cache = ("too small", "bold red") if verdict.too_small else ("large enough", "green")
+    cache = ("TOO SMALL", "bold red") if verdict.too_small else ("large enough", "green")
     lines.append(_labelled("cache", [cache, (f": {verdict.why}", "")]))
     if verdict.hint:
         lines.append(_labelled("", [(verdict.hint, "")]))
@@ -101,9 +101,9 @@ def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
     uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
     told = {
         "healthy": f"  up {format_duration(uptime_s)}",
-        "stopped": f"  not beating for {format_duration(found.beat_age_s)}: `kill -CONT {identity.pid}`",
-        "hung": f"  not beating for {format_duration(found.beat_age_s)}",
-        "dead": "  ended without cleaning up; these are its last words",
+        "stopped": f"  no heartbeat for {format_duration(found.beat_age_s)}: `kill -CONT {identity.pid}`",
+        "hung": f"  no heartbeat for {format_duration(found.beat_age_s)}",
+        "dead": "  crashed or was killed; these are its last figures",
     }.get(found.state, "")
     return [
         ("shmmap ", "bold"),
@@ -130,7 +130,7 @@ def _budget(counters: dict[str, int], width: int) -> list[Line]:
     room = max(width - LABEL - 2, 20)
     bar: Line = []
     used = 0
-    for index, (name, glyph, style) in enumerate(_PARTS):
+    for index, (name, _, glyph, style) in enumerate(_PARTS):
         cells = room - used if index == len(_PARTS) - 1 else round(room * parts[name] / total)
         if parts[name] and not cells:
             cells = 1  # what there is can be seen
@@ -138,8 +138,8 @@ def _budget(counters: dict[str, int], width: int) -> list[Line]:
         used += cells
         bar.append((glyph * cells, style))
     legend: Line = []
-    for name, glyph, style in _PARTS:
-        legend += [(glyph, style), (f" {name} {format_bytes(parts[name])}   ", "")]
+    for name, title, glyph, style in _PARTS:
+        legend += [(glyph, style), (f" {title} {format_bytes(parts[name])}   ", "")]
     budget = format_bytes(counters["budget_bytes"])
     return [_labelled("budget", [(budget, "")]), [(" " * LABEL, ""), *bar], [(" " * LABEL, ""), *legend]]
 
@@ -199,7 +199,7 @@ def _pressure(counters: dict[str, int]) -> Line:
             f"refused: budget {counters['refused_over_budget']:,}, quota {counters['refused_quota']:,}   ",
             "red" if counters.get("refused_over_budget_1min") else "",
         ),
-        (f"zombies {counters['zombies']:,}   stale {counters['stale_cells']:,}", ""),
+        (f"retired {counters['zombies']:,}   stale {counters['stale_cells']:,}", ""),
     ]
 
 

@@ -7,8 +7,9 @@ import argparse
 
 import pytest
 
+from shmmap.cli.areas import area_from
 from shmmap.cli.entry import main
-from shmmap.cli.options import area_from, numbers, seconds
+from shmmap.cli.options import numbers, seconds
 from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
 from shmmap.cli.program import join_negative_values
 from shmmap.errors import BadRequest

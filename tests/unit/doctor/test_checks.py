@@ -290,7 +290,7 @@ def test_leftovers(ward: Ward) -> None:
     ward.file("/dev/shm/shmmap.default.statistics", "x")
     ward.file("/dev/shm/shmmap.default.lock", "x")
     found = lifetime.check_leftovers(ward.patient())
-    assert (found.state, "default: 1 segments, 8 KiB" in found.fact) == ("warn", True)
+    assert (found.state, "default: 1 segments, 8.0 KiB" in found.fact) == ("warn", True)
     assert lifetime.check_leftovers(ward.patient(told())).state == "ok"
     ward.file("/dev/shm/shmmap.no-such-instance.0123456789abcdef.zombie", "x")
     found = lifetime.check_leftovers(ward.patient(told()))
