@@ -123,7 +123,7 @@ class _Run:
             wanted=settings.fields,
         )
         progress.stage("looking at coordinates", 0)
-        self._frame = choose_frame(self._sources, row, lattice, settings.translate)
+        self._frame = choose_frame(self._sources, row, lattice, settings.translate, settings.frame_before)
         self._row = np.dtype(
             [(name, self._frame.axis if name in AXES else row[name]) for name in row.names or ()]
         )

@@ -11,9 +11,11 @@ from typing import Any, Final
 
 from shmmap.errors import MapDataError
 
-__all__ = ["REPORT_NAME", "DividedMap", "read_report", "write_report"]
+__all__ = ["LINK_NAME", "REPORT_NAME", "DividedMap", "read_report", "write_report"]
 
 REPORT_NAME: Final = "shmmap_divide.json"
+LINK_NAME: Final = "map"
+"""Beside the divisions of a served cloud, this leads to the one in service."""
 _FORMAT: Final = "shmmap divided map"
 _VERSION: Final = 1
 

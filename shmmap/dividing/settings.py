@@ -29,6 +29,9 @@ class DivideSettings:
         A corner of the lattice of cells, metres, in the frame of the inputs.
     translate
         Added to every point, or ``auto``, or ``none``; see `shmmap.dividing.frame`.
+    frame_before
+        What ``auto`` adds where that leaves float32 precise enough: what an earlier state of the same cloud
+        was moved by, so that its map stays where it is.
     leaf
         Side of the voxels whose points become one, metres; 0 keeps every point.
     prefix
@@ -58,6 +61,7 @@ class DivideSettings:
     cell_size: float = 20.0
     origin: tuple[float, float] = (0.0, 0.0)
     translate: Translation = "auto"
+    frame_before: tuple[float, float, float] | None = None
     leaf: float = 0.0
     prefix: str = ""
     encoding: str = "binary"

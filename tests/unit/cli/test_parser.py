@@ -130,7 +130,7 @@ def test_descriptions_are_filled_and_tables_in_them_are_not(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
-    for verb in ("top", "ls"):
+    for verb in ("top", "clients"):
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         text = capsys.readouterr().out

@@ -27,8 +27,8 @@ def counters(**values: int) -> dict[str, int]:
         (
             {"evictions": 29, "refused_over_budget": 4},
             (
-                "large enough: nothing evicted or refused in the last 10 min (29 evicted and 4 refused since the"
-                " start)"
+                "large enough: nothing evicted or refused in the last 10 min"
+                " (29 evicted and 4 refused since the start)"
             ),
         ),
         ({"refused_quota": 9}, "large enough: nothing evicted or refused"),
