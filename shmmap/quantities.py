@@ -3,7 +3,12 @@
 
 from __future__ import annotations
 
-__all__ = ["format_bytes", "format_duration", "format_metres"]
+__all__ = ["counted", "format_bytes", "format_duration", "format_metres"]
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number of things: ``"1 cell"``, ``"2,400 cells"``."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def format_bytes(count: float) -> str:

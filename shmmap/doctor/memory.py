@@ -8,11 +8,12 @@ import re
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
+from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.quantities import format_bytes
 
-__all__ = ["check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory"]
+__all__ = ["check_cache", "check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory"]
 
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
 OVERHEAD_BYTES: Final = 512 << 20
@@ -74,6 +75,15 @@ def _enough(budget: int) -> str:
     return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
 
 
+def check_cache(patient: Patient) -> Finding:
+    """Is the budget enough for what clients ask for?  The verdict of ``status``."""
+    name = "cache size"
+    if not patient.alive or patient.seen is None:
+        return ok(name, "no daemon runs")
+    verdict = cache_verdict(patient.seen.counters)
+    return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
+
+
 def check_container(patient: Patient) -> Finding:
     """Does a container see enough shared memory?"""
     name = "container"
@@ -83,7 +93,7 @@ def check_container(patient: Patient) -> Finding:
         machine.text("/run/systemd/container")
     )
     if not contained:
-        return ok(name, "this is no container")
+        return ok(name, "not in a container")
     try:
         state = os.statvfs(machine.path(patient.shm_dir))
     except OSError as error:
@@ -92,10 +102,10 @@ def check_container(patient: Patient) -> Finding:
     if 0 < size <= CONTAINER_DEFAULT_BYTES:
         return warn(
             name,
-            f"a container whose {patient.shm_dir} has {format_bytes(size)}, the default",
+            f"in a container whose {patient.shm_dir} has {format_bytes(size)}, the default",
             "a daemon inside needs --shm-size=8g; clients of a daemon outside need --ipc=host",
         )
-    return ok(name, f"a container with {format_bytes(size)} of shared memory")
+    return ok(name, f"in a container with {format_bytes(size)} of shared memory")
 
 
 def _cgroup_limit(machine: Machine, pid: int) -> int:
@@ -123,7 +133,7 @@ def check_memory_limit(patient: Patient) -> Finding:
     name = "memory limit"
     limit, budget = _cgroup_limit(patient.machine, patient.pid), patient.budget_bytes
     if not limit:
-        return ok(name, "the control group sets none")
+        return ok(name, "the control group sets no limit")
     chosen = format_bytes(budget) if budget else "chosen at start"
     fact = f"the control group allows {format_bytes(limit)}; budget {chosen}"
     if budget and budget + OVERHEAD_BYTES > limit:

@@ -193,7 +193,7 @@ def test_top_leaves_the_terminal_as_it_was(shmmap: Shmmap, number: signal.Signal
             [sys.executable, "-m", "shmmap.cli", "top", "--interval", "0.05"],
             env=environment, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
         ) as top:  # fmt: skip
-            seen = read_until(ours, b"nobody is connected")
+            seen = read_until(ours, b"no client is connected")
             assert b"\x1b[?1049h" in seen  # the alternate screen
             top.send_signal(number)
             seen = read_until(ours, b"\x1b[?1049l", seen)

@@ -207,7 +207,7 @@ def html_page(scene: Scene) -> str:
         "<table><tr><th>client</th><th>pid</th><th>cells</th><th>given</th><th>requests</th><th>at</th></tr>"
         f"{rows}</table>"
         if rows
-        else "<p>Nobody is connected.</p>"
+        else "<p>No client is connected.</p>"
     )
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_html(scene.title)}</title>'

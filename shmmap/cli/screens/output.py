@@ -18,15 +18,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, TextIO
 
-from shmmap.quantities import format_bytes, format_duration, format_metres
+from shmmap.quantities import counted, format_bytes, format_duration, format_metres
 
 __all__ = [
     "Column",
     "columns_that_fit",
+    "counted",
     "format_bytes",
     "format_duration",
     "format_metres",
     "json_text",
+    "print_hanging",
     "print_json",
     "print_line",
     "print_pairs",
@@ -142,10 +144,15 @@ def columns_that_fit(
 def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
     """Print ``name  value`` lines with the values aligned; on a terminal long ones go on below themselves."""
     width = max((len(name) for name, _ in pairs), default=0)
-    room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
     for name, value in pairs:
-        lines = [printable(value)]
-        if len(lines[0]) > room >= _NARROWEST:
-            lines = textwrap.wrap(lines[0], room, break_long_words=False, break_on_hyphens=False)
-        for number, line in enumerate(lines):
-            print(f"{'' if number else name:{width}}  {line}".rstrip())
+        print_hanging(f"{name:{width}}  ", value)
+
+
+def print_hanging(head: str, text: str) -> None:
+    """Print ``head`` and ``text`` as a line; on a terminal too narrow for it the text goes on below."""
+    head, lines = printable(head), [printable(text)]
+    room = shutil.get_terminal_size().columns - len(head) if sys.stdout.isatty() else 0
+    if len(lines[0]) > room >= _NARROWEST:
+        lines = textwrap.wrap(lines[0], room, break_long_words=False, break_on_hyphens=False)
+    for number, line in enumerate(lines):
+        print(f"{' ' * len(head) if number else head}{line}".rstrip())

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from shmmap.quantities import format_bytes
+from shmmap.quantities import counted, format_bytes
 
 if TYPE_CHECKING:
     from shmmap.errors import CellError
@@ -77,7 +77,10 @@ def _holder_lines(errors: Iterable[CellError]) -> list[str]:
             if holder.bytes and (known is None or known.bytes < holder.bytes):
                 most[holder.session] = holder
     ranked = sorted(most.values(), key=lambda holder: -holder.bytes)
-    return [f"  in use: {format_bytes(one.bytes)} in {one.cells:,} cells by {_who(one)}" for one in ranked]
+    return [
+        f"  in use: {format_bytes(one.bytes)} in {counted(one.cells, 'cell')} by {_who(one)}"
+        for one in ranked
+    ]
 
 
 def _who(holder: Holder) -> str:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import print_json, print_line
+from shmmap.cli.screens.output import print_hanging, print_json
 
 if TYPE_CHECKING:
     from shmmap.doctor.finding import Finding
@@ -68,6 +68,6 @@ def run(args: argparse.Namespace) -> int:
 def _print(findings: list[Finding]) -> None:
     width = max(len(one.name) for one in findings)
     for one in findings:
-        print_line(f"{one.state.ljust(4)}  {one.name.ljust(width)}  {one.fact}")
+        print_hanging(f"{one.state.ljust(4)}  {one.name.ljust(width)}  ", one.fact)
         if one.advice:
-            print_line(f"{' ' * (width + 6)}  -> {one.advice}")
+            print_hanging(f"{' ' * (width + 6)}  -> ", one.advice)

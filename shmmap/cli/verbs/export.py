@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING, Any
 from shmmap.cli.areas import add_area_options, area_from, area_text, no_cell_there
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
-from shmmap.cli.screens.output import print_json, print_line
+from shmmap.cli.screens.output import counted, print_json, print_line
 from shmmap.cli.screens.refusals import failure_lines
 from shmmap.errors import BadRequest
 
@@ -101,13 +101,18 @@ def run(args: argparse.Namespace) -> int:
             print_json({"files": written})
         else:
             for file in written:
-                print_line(f"{file['path']}: {file['points']:,} points of {len(file['cells']):,} cells")
+                print_line(
+                    f"{file['path']}: {counted(file['points'], 'point')} of "
+                    f"{counted(len(file['cells']), 'cell')}"
+                )
         if written:
             return 0
         if area is not None and not found.cells:
             return no_cell_there(args, client, area)
         where = f" {area_text(area)}" if area is not None and args.crop else ""
-        return nothing_found(args, f"no point{where} in {len(found.cells):,} cells: nothing is written")
+        return nothing_found(
+            args, f"no point{where} in {counted(len(found.cells), 'cell')}: nothing is written"
+        )
 
 
 def _complain_of(found: CellSet, wait_s: float) -> None:

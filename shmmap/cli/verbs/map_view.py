@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
-from shmmap.cli.screens.output import format_bytes, print_line, wants_style
+from shmmap.cli.screens.output import counted, format_bytes, print_hanging, print_line, wants_style
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -123,10 +123,13 @@ def _on_disk(
 
 def _note(found: Snapshot, rows: list[CellRow], cells: int, *, left_out: bool, silent: bool) -> str:
     memory = sum(row.bytes for row in rows)
-    note = f"{len(rows):,} segments in memory, {format_bytes(memory)}, {len(found.clients):,} clients"
+    segments, clients = counted(len(rows), "segment"), counted(len(found.clients), "client")
+    note = f"{segments} in memory, {format_bytes(memory)}, {clients}"
     if silent:
         return f"{note}; the daemon is {found.state}: cells on disk are not shown"
-    return f"{note}, {cells:,} cells in the map" + (" (too many to show those on disk)" if left_out else "")
+    return f"{note}, {counted(cells, 'cell')} in the map" + (
+        " (too many to show those on disk)" if left_out else ""
+    )
 
 
 def _print(scene: Scene) -> None:
@@ -155,5 +158,5 @@ def _print(scene: Scene) -> None:
         for row in grid:
             console.print(Text.assemble(*((solid.get(state, " "), GLYPHS[state][1]) for state in row)))
         console.print(Text.assemble(*((f"{solid[s]} {text}  ", GLYPHS[s][1]) for s, text in legend.items())))
-    print_line(f"{extent_text(scene.bounds)}; {scene.note}")
+    print_hanging("", f"{extent_text(scene.bounds)}; {scene.note}")
     sys.stdout.flush()

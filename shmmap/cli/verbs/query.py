@@ -17,7 +17,16 @@ from shmmap.cli.options import (
     seconds,
 )
 from shmmap.cli.program import add_allow_empty, nothing_found
-from shmmap.cli.screens.output import Column, format_bytes, format_metres, print_json, print_line, print_table
+from shmmap.cli.screens.output import (
+    Column,
+    counted,
+    format_bytes,
+    format_metres,
+    print_hanging,
+    print_json,
+    print_line,
+    print_table,
+)
 from shmmap.cli.screens.refusals import failure_lines, holder_rows
 from shmmap.errors import BadRequest
 
@@ -130,7 +139,7 @@ def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, fo
         empty = [layer for layer, points in rows.items() if not points]
         if empty and not held:
             cells = len({cell.id for cell in found.cells})
-            return nothing_found(args, f"{', '.join(empty)}: empty in all {cells:,} cells")
+            return nothing_found(args, f"{', '.join(empty)}: no points in {counted(cells, 'cell')}")
     elif area is not None and (args.held is None or not len(client.metadata(area))):
         return no_cell_there(args, client, area)
     return 0
@@ -207,6 +216,7 @@ def _print_text(found: CellSet, id_prefix: str) -> None:
     for pending in found.pending:
         print_line(f"pending: {pending.id} ({pending.layer})")
     for line in failure_lines(found.failed):
-        print_line(line)
+        indent = len(line) - len(line.lstrip())
+        print_hanging(line[:indent], line[indent:])
     points, nbytes = (sum(getattr(cell, name) for cell in found.cells) for name in ("points", "nbytes"))
-    print_line(f"{len(found.cells):,} cells, {points:,} points, {format_bytes(nbytes)}")
+    print_line(f"{counted(len(found.cells), 'cell')}, {counted(points, 'point')}, {format_bytes(nbytes)}")

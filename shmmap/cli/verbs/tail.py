@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import complain
-from shmmap.cli.screens.output import format_bytes, format_duration, json_text, print_line
+from shmmap.cli.screens.output import (
+    counted,
+    format_bytes,
+    format_duration,
+    json_text,
+    print_hanging,
+    print_line,
+)
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Happening
@@ -123,7 +130,7 @@ def _print_text(happening: Happening | None) -> None:
     kind = fields["event"]
     at = time.strftime("%H:%M:%S", time.localtime(fields["unix_ns"] // 10**9)) if "unix_ns" in fields else ""
     millis = f".{fields['unix_ns'] // 10**6 % 1000:03d}" if at else " " * 12
-    print_line(f"{at}{millis}  {kind:8}  {_SENTENCES[kind](fields)}")
+    print_hanging(f"{at}{millis}  {kind:8}  ", _SENTENCES[kind](fields))
 
 
 def _loaded(f: dict[str, Any]) -> str:
@@ -142,7 +149,8 @@ def _pressure(f: dict[str, Any]) -> str:
     full = {"over_budget": "the budget is full", "no_space": "the file system is full"}
     cause = full.get(f["code"], "a client's quota is used up")
     return (
-        f"{f['refused']:,} cells refused, {f['id']} among them: {cause}; {format_bytes(f['used_bytes'])} of"
+        f"{counted(f['refused'], 'cell')} refused, such as {f['id']}: {cause}; "
+        f"{format_bytes(f['used_bytes'])} of"
         f" {format_bytes(f['budget_bytes'])} used, {format_bytes(f['pinned_bytes'])} in use by clients"
     )
 
@@ -151,7 +159,7 @@ def _reload(f: dict[str, Any]) -> str:
     if f["error"]:
         return f"the map could not be read again, the one served before stays: {f['error']}"
     counts = ", ".join(f"{f[how]:,} {how}" for how in ("changed", "added", "removed"))
-    return f"the map was read again: cells: {counts}"
+    return f"the map was read again; cells: {counts}"
 
 
 def _epoch(f: dict[str, Any]) -> str:

@@ -84,8 +84,33 @@ def test_the_screen_tells_what_an_operator_asks() -> None:
 
 def test_a_daemon_that_does_not_beat_says_so() -> None:
     assert "STOPPED  no heartbeat" in text(snapshot(FULL, [], state="stopped"))
-    assert "nobody is connected" in text(snapshot(counters(), []))
+    assert "no client is connected" in text(snapshot(counters(), []))
     assert "HUNG" in text(snapshot(FULL, [], state="hung"))
+
+
+@pytest.mark.parametrize("width", [80, 100, 120])
+def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
+    crowded = FULL | {
+        "refused_over_budget": 123_456, "refused_quota": 654_321, "evictions": 10**6, "loads_failed": 99_999,
+        "refused_over_budget_10min": 12, "zombies": 4096, "worker_crashes": 3, "misses": 10**9, "hits": 10**9,
+    }  # fmt: skip
+    named = CLIENT._replace(client="a_perception_node_with_a_very_long_name", pose=(-1234.5, -9876.5))
+    shown = text(snapshot(crowded, [named]), width=width)
+    assert max(map(len, shown.splitlines())) <= width
+    for piece in (
+        "free 25.0 MiB", "asked for since the start", "clients use 50.0 MiB of 100 MiB", "quota 654,321",
+        "retired 4,096", "stale 0", "crashed 3", "-1234.5,-9876.5", "a_perception",
+    ):  # fmt: skip
+        assert piece in " ".join(shown.split()), piece
+
+
+def test_a_name_cannot_draw_on_the_screen() -> None:
+    hostile = CLIENT._replace(client="\x1b[2J\x1b]0;owned\x07")
+    for width in (80, 120):
+        shown = text(snapshot(FULL, [hostile, CLIENT]), width=width)
+        assert all(line.isprintable() for line in shown.splitlines())
+        rows = [line for line in shown.splitlines() if "4242" in line]
+        assert len({line.index("4242") for line in rows}) == 1, "columns stay aligned"
 
 
 def test_more_clients_than_lines_are_counted() -> None:
@@ -173,4 +198,4 @@ def test_the_page_needs_nothing_else() -> None:
     assert tags.references == []
     assert "&lt;city&gt; &amp; more" in page
     assert "<td>localization</td><td>4242</td>" in page
-    assert "Nobody is connected" in html_page(Scene(**{**vars(SCENE), "clients": []}))
+    assert "No client is connected" in html_page(Scene(**{**vars(SCENE), "clients": []}))

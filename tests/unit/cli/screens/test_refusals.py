@@ -24,7 +24,7 @@ def test_one_line_a_cause_and_each_holder_once() -> None:
     assert failure_lines(failed) == [
         f"failed: 36 cells (points): {FULL} [over_budget]: 0_0.pcd, 1_0.pcd, 2_0.pcd, ...",
         "  in use: 900 KiB in 30 cells by ndt, pid 42",
-        "  in use: 2.0 KiB in 1 cells by a process that did not open them through the client library",
+        "  in use: 2.0 KiB in 1 cell by a process that did not open them through the client library",
         "failed: /map/bad.pcd (points): cut off [load_failed]",
     ]
 
