@@ -36,8 +36,11 @@ __all__ = [
 BoxTuple = tuple[float, float, float, float]
 
 
-def add_area_options(parser: argparse.ArgumentParser, group: argparse._MutuallyExclusiveGroup) -> None:
-    """Add ``--circle``, ``--square``, ``--box`` to ``group`` and ``--z`` to the parser."""
+def add_area_options(
+    parser: argparse.ArgumentParser, group: argparse._MutuallyExclusiveGroup, *, heights: bool = True
+) -> None:
+    """Add ``--circle``, ``--square``, ``--box`` to ``group``, and ``--z`` unless heights mean nothing."""
+    parser.set_defaults(z=None)
     group.add_argument(
         "--circle",
         metavar="X,Y,R",
@@ -56,12 +59,13 @@ def add_area_options(parser: argparse.ArgumentParser, group: argparse._MutuallyE
         type=lambda t: numbers(t, "X0,Y0,X1,Y1"),
         help="cells that touch a rectangle",
     )
-    parser.add_argument(
-        "--z",
-        metavar="MIN,MAX",
-        type=lambda t: numbers(t, "MIN,MAX"),
-        help="only cells with points between these heights",
-    )
+    if heights:
+        parser.add_argument(
+            "--z",
+            metavar="MIN,MAX",
+            type=lambda t: numbers(t, "MIN,MAX"),
+            help="only cells with points between these heights",
+        )
 
 
 def area_from(args: argparse.Namespace) -> Area | None:

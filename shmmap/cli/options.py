@@ -125,8 +125,10 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
     """Add what finds a daemon's statistics segment, and ``--json`` unless the verb has none."""
-    group = parser.add_argument_group("which daemon")
-    group.add_argument("--instance", metavar="NAME", help="instance name (default: default)")
+    group = parser.add_argument_group("which daemon to use")
+    group.add_argument(
+        "--instance", metavar="NAME", help="name of the daemon among several (default: default)"
+    )
     group.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
     group.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     group.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
@@ -141,7 +143,7 @@ def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) ->
         "--timeout",
         metavar="SECONDS",
         type=seconds,
-        help="how long to wait for an answer (default: 0.9 to connect, then 5)",
+        help="how long to wait for the daemon (default: 0.9 to connect, 5 for an answer)",
     )
 
 

@@ -84,5 +84,5 @@ def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
     except ValueError as error:
         raise MapDataError(f"cannot be read: {error}", path=path) from error
     if not isinstance(report, dict) or report.get("format") != _FORMAT or report.get("version") != _VERSION:
-        raise MapDataError("not made by this version", path=path)
+        raise MapDataError("written by another version of shmmap", path=path)
     return report

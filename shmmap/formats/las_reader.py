@@ -147,7 +147,7 @@ def _check_start(path: str) -> bool:
     if not head:
         raise refusal("empty_file", "no bytes at all", path=path)
     if not head.startswith(_SIGNATURE):
-        raise refusal("bad_las", "no LAS file: it does not start with LASF", path=path, offset=0)
+        raise refusal("bad_las", "not a LAS file: it does not start with LASF", path=path, offset=0)
     if len(head) < _SHORTEST_HEADER_BYTES:
         raise refusal("truncated", "the file ends within its header", path=path, offset=len(head))
     data_at, form, record_bytes, points = _LEGACY_COUNT.unpack_from(head, 96)

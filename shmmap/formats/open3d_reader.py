@@ -62,7 +62,7 @@ def read_with_open3d(path: str, suffix: str) -> tuple[dict[str, NDArray[Any]], t
     columns = _load(path, suffix)
     found = len(columns.get("xyz", ()))
     if found != expected:
-        raise refusal("bad_cloud", f"{expected} points announced, Open3D reads {found}", path=path)
+        raise refusal("bad_cloud", f"{expected} points expected, Open3D reads {found}", path=path)
     dropped = [name for name, values in columns.items() if len(values) != found]
     for name in dropped:
         del columns[name]

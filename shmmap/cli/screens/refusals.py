@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from shmmap.errors import CellError
     from shmmap.protocol.messages import Holder
 
-__all__ = ["failure_lines", "holder_row", "holder_rows", "holder_texts"]
+__all__ = ["failure_lines", "holder_row", "holder_rows"]
 
 _NAMED_CELLS: Final = 3
 
@@ -33,20 +33,6 @@ def holder_row(holder: Holder) -> dict[str, object]:
 def holder_rows(error: CellError) -> list[dict[str, object]]:
     """Return who holds what keeps a cell out of memory, for JSON."""
     return [holder_row(holder) for holder in error.holders]
-
-
-def holder_texts(error: CellError) -> list[str]:
-    """Return the same as sentences, as ``query --json`` has always told them."""
-    texts = []
-    for holder in error.holders:
-        what = f"{holder.bytes} bytes" + (f" in {holder.cells} cells" if holder.cells else "")
-        name = f" ({holder.client})" if holder.client else ""
-        texts.append(
-            f"session {holder.session:016x}, pid {holder.pid}{name} holds {what}"
-            if holder.session
-            else f"unknown (not through the client library) holds {what}"
-        )
-    return texts
 
 
 def failure_lines(failed: Iterable[CellError]) -> list[str]:

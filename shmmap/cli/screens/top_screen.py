@@ -78,7 +78,7 @@ def screen(
         A snapshot of some seconds ago; latencies are of the time since, without it since the start.
     """
     counters = found.counters
-    lines = [_title(found, identity), *_flowing("map", [[(_map(identity, counters), "")]], width), []]
+    lines = [_title(found, identity), *_flowing("map", _map(identity, counters), width, gap=1), []]
     lines += _budget(counters, width)
     lines.append([])
     lines += _flowing("hits", _hits(counters), width)
@@ -137,11 +137,12 @@ def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
     ]
 
 
-def _map(identity: DaemonIdentity, counters: dict[str, int]) -> str:
+def _map(identity: DaemonIdentity, counters: dict[str, int]) -> list[Line]:
     read_s = max(time.time() - counters.get("last_reload_unix_ns", 0) * 1e-9, 0.0)
     failed = ", LAST RELOAD FAILED" if counters.get("last_reload_failed") else ""
-    cells = f"{counters['map_cells']:,} cells"
-    return f"{identity.map_path}, {cells}, read {format_duration(read_s)} ago{failed}"
+    cells = counted(counters["map_cells"], "cell")
+    read = f"read {format_duration(read_s)} ago{failed}"
+    return [[(f"{identity.map_path},", "")], [(f"{cells},", "")], [(read, "")]]
 
 
 def _budget(counters: dict[str, int], width: int) -> list[Line]:

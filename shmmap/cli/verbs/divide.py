@@ -68,19 +68,23 @@ def add_parser(subparsers: Subparsers) -> None:
         "where needed",
     )
     points.add_argument(
-        "--leaf", metavar="METRES", type=_metres, default=0.0, help="one point, the mean, per voxel"
+        "--leaf",
+        metavar="METRES",
+        type=_metres,
+        default=0.0,
+        help="thin out: one point, the mean, for each voxel of this side",
     )
     points.add_argument(
         "--order",
         choices=("input", "morton"),
         default="input",
-        help="of the points in a cell (default: input)",
+        help="order of the points in a cell: as in the input, or along a Morton curve (default: input)",
     )
     points.add_argument(
         "--encoding",
         choices=("binary", "binary_compressed", "ascii"),
         default="binary",
-        help="of the PCD files (default: binary)",
+        help="encoding of the PCD files (default: binary)",
     )
     points.add_argument(
         "--fields",
@@ -99,7 +103,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="BYTES",
         type=size_bytes,
         default="1G",
-        help="most memory of the process (default: 1G)",
+        help="most memory the process may take (default: 1G)",
     )
     work.add_argument("--force", action="store_true", help="replace a divided map that is there")
     work.add_argument(

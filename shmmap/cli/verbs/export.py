@@ -57,12 +57,14 @@ def add_parser(subparsers: Subparsers) -> None:
     out = parser.add_mutually_exclusive_group(required=True)
     out.add_argument("-o", "--output", metavar="FILE", help="one merged file, .pcd or .npz")
     out.add_argument("--output-dir", metavar="DIR", help="one file per cell, named as the cell")
-    parser.add_argument("--format", choices=_FORMATS, help="default: as FILE ends; pcd in a DIR")
+    parser.add_argument(
+        "--format", choices=_FORMATS, help="format of the files (default: as FILE ends; pcd in a DIR)"
+    )
     parser.add_argument(
         "--encoding",
         choices=("ascii", "binary", "binary_compressed"),
         default="binary",
-        help="of PCD files (default: binary)",
+        help="encoding of PCD files (default: binary)",
     )
     parser.add_argument("--force", action="store_true", help="overwrite files that are there")
     parser.add_argument(

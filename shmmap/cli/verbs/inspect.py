@@ -6,12 +6,14 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import (
     Column,
+    counted,
     format_bytes,
     format_metres,
     print_json,
@@ -113,7 +115,7 @@ def _directory(args: argparse.Namespace) -> int:
     files = [file.path for file in find_inputs([args.path])]
     found: list[CloudDescription] = []
     failed: list[tuple[str, str]] = []
-    progress = StageProgress(quiet=args.json, unit="files", scale=1.0)
+    progress = StageProgress(quiet=not sys.stderr.isatty(), unit="files", scale=1.0)
     progress.stage("inspect", len(files))
     for path in files:
         try:
@@ -154,7 +156,7 @@ def _directory(args: argparse.Namespace) -> int:
     if failed:
         return MapDataError.exit_code
     if bounds is None:
-        return nothing_found(args, f"{args.path}: no finite point in {len(found):,} files")
+        return nothing_found(args, f"{args.path}: no finite point in {counted(len(found), 'file')}")
     return 0
 
 

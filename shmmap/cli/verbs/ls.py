@@ -18,7 +18,7 @@ from shmmap.cli.screens.output import (
     print_line,
     print_table,
 )
-from shmmap.errors import BadRequest, DaemonUnreachable
+from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
     from shmmap.statistics.cell_rows import CellRow
@@ -77,7 +77,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="largest first, but for id (default: id)",
     )
     parser.add_argument("--state", choices=tuple(_STATES), help="only these")
-    add_area_options(parser, parser.add_mutually_exclusive_group())
+    add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
     add_allow_empty(parser)
     add_statistics_options(parser)
 
@@ -99,8 +99,6 @@ def _list(args: argparse.Namespace) -> int:
     from shmmap.cli.daemon_address import snapshot
 
     area = area_from(args)
-    if area is not None and area.z is not None:
-        raise BadRequest("--z: ls does not know heights", hint="`shmmap query` does")
     found, identity = snapshot(args)
     rows = found.cells
     there = around(row.box for row in rows)

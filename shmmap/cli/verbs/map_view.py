@@ -44,7 +44,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--svg", metavar="FILE", type=Path, help="write an SVG picture")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page, complete in one file")
-    add_area_options(parser, parser.add_mutually_exclusive_group())
+    add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
     add_allow_empty(parser)
     add_daemon_options(parser, json=False)
 

@@ -38,7 +38,10 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("inputs", metavar="IN", nargs="+", help="divided maps, directories, clouds")
     parser.add_argument("out", metavar="OUT", help="the PCD file to make")
     parser.add_argument(
-        "--encoding", choices=("binary", "ascii"), default="binary", help="of the PCD file (default: binary)"
+        "--encoding",
+        choices=("binary", "ascii"),
+        default="binary",
+        help="encoding of the PCD file (default: binary)",
     )
     parser.add_argument(
         "--keep-frame",

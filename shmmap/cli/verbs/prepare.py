@@ -40,7 +40,11 @@ def add_parser(subparsers: Subparsers) -> None:
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
     )
     parser.add_argument(
-        "--workers", metavar="N", type=at_least(0), default=0, help="processes (default: all cores)"
+        "--workers",
+        metavar="N",
+        type=at_least(0),
+        default=0,
+        help="number of processes (default: one for each core)",
     )
     parser.add_argument("--cache-dir", metavar="DIR", default="", help="where layers are kept")
     parser.add_argument(

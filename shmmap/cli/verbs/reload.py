@@ -11,7 +11,7 @@ from shmmap.cli.screens.output import print_json, print_line
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"map_version": hex, "changed": cells whose file is another now, "added", "removed",
+  {"map_version": hex, "changed": cells whose file changed, "added", "removed",
    "problems": [text]}"""
 
 

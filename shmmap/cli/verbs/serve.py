@@ -45,8 +45,10 @@ def add_parser(subparsers: Subparsers) -> None:
         help="read the map again when its files change (not on NFS)",
     )
     parser.add_argument("--config", metavar="FILE", default="", help="TOML file of settings")
-    place = parser.add_argument_group("where it is found")
-    place.add_argument("--instance", metavar="NAME", help="instance name (default: default)")
+    place = parser.add_argument_group("how clients find it")
+    place.add_argument(
+        "--instance", metavar="NAME", help="name of this daemon among several (default: default)"
+    )
     place.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
     place.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")

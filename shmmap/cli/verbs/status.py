@@ -31,7 +31,7 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "status",
         run,
-        help="one screen about the daemon",
+        help="state of the daemon: memory, clients, requests, cache size",
         description="Show the state of the daemon: memory, clients, requests, loads, and whether "
         "the cache is large "
         "enough.  Reads its statistics in shared memory: works while the daemon is stopped or hangs.",

@@ -67,7 +67,7 @@ def add_parser(subparsers: Subparsers) -> None:
     show.add_argument("name", metavar="FILE", nargs="?", default="", help="default: shmmapd.service")
     show.add_argument("--list", action="store_true", help="list what there is to print")
     for one in (install, show):
-        one.add_argument("--user", action="store_true", help="the units of a user's own daemon")
+        one.add_argument("--user", action="store_true", help="for this user alone, without root")
 
 
 def run_print(args: argparse.Namespace) -> int:

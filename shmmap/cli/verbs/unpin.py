@@ -21,7 +21,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "unpin",
         run,
         help="undo pin",
-        description="End the pins on cells: they stay in memory until their memory is needed, as others do.  "
+        description="Pinned cells become ordinary ones: they stay in memory until it is needed for others.  "
         "Prints what stays pinned.",
         json=PINS_JSON,
     )

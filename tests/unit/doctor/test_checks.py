@@ -137,9 +137,9 @@ def test_limits_of_the_control_group(
 
 def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
     assert memory.check_cache(ward.patient()).state == "ok"
-    counters = {"refused_over_budget_10min": 3, "budget_bytes": 1 << 20}
-    found = memory.check_cache(ward.patient(told(**counters)))
-    verdict = cache_verdict(counters)
+    seen = told(refused_over_budget_10min=3, budget_bytes=1 << 20)
+    found = memory.check_cache(ward.patient(seen))
+    verdict = cache_verdict(seen.counters)
     assert (found.state, found.fact, found.advice) == ("warn", verdict.text, verdict.hint)
     assert found.fact.startswith("TOO SMALL")
     assert memory.check_cache(ward.patient(told(evictions=3))).state == "ok"
