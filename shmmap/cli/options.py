@@ -8,24 +8,19 @@ import math
 import re
 from collections.abc import Callable
 from threading import TIMEOUT_MAX
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
-from shmmap.errors import BadRequest, ConfigError
-
-if TYPE_CHECKING:
-    from shmmap.geometry import Area
+from shmmap.errors import ConfigError
 
 __all__ = [
     "Subparsers",
-    "add_area_options",
-    "add_cells_argument",
     "add_daemon_options",
     "add_json_option",
+    "add_layer_option",
     "add_statistics_options",
     "add_verb",
-    "area_from",
     "at_least",
-    "cells_or_all",
+    "layers_from",
     "numbers",
     "seconds",
     "size_bytes",
@@ -80,13 +75,20 @@ def size_bytes(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{error.message}; {error.hint}") from None
 
 
+class _Prose(str):
+    """Text whose lines are paragraphs: each is filled, and those after the first hang."""
+
+
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Leaves texts of several lines as they are written, and fills the others."""
+    """Fills prose and texts of one line, and leaves others of several lines as they are written."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        if "\n" in text:
-            return super()._fill_text(text, width, indent)
-        return argparse.HelpFormatter._fill_text(self, text, width, indent)
+        fill = argparse.HelpFormatter._fill_text
+        if isinstance(text, _Prose):
+            first, *others = text.splitlines()
+            hanging = [fill(self, line, width - 2, indent).replace("\n", "\n  ") for line in others]
+            return "\n".join([fill(self, first, width, indent), *hanging])
+        return super()._fill_text(text, width, indent) if "\n" in text else fill(self, text, width, indent)
 
 
 def add_verb(
@@ -99,13 +101,16 @@ def add_verb(
     json: str = "",
     epilog: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a verb that ``run`` carries out; ``json`` and ``epilog`` are shown as written below its options."""
+    """Add a verb that ``run`` carries out.
+
+    The lines of ``description`` are paragraphs; ``json`` and ``epilog`` stand below the options as written.
+    """
     if json:
         epilog = f"JSON (fields may be added, none is removed):\n{json}"
     parser = subparsers.add_parser(
         name,
         help=help,
-        description=description,
+        description=_Prose(description),
         epilog=epilog,
         formatter_class=_HelpFormatter,
     )
@@ -120,8 +125,10 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
     """Add what finds a daemon's statistics segment, and ``--json`` unless the verb has none."""
-    group = parser.add_argument_group("which daemon")
-    group.add_argument("--instance", metavar="NAME", help="instance name (default: default)")
+    group = parser.add_argument_group("which daemon to use")
+    group.add_argument(
+        "--instance", metavar="NAME", help="name of the daemon among several (default: default)"
+    )
     group.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
     group.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     group.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
@@ -136,58 +143,15 @@ def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) ->
         "--timeout",
         metavar="SECONDS",
         type=seconds,
-        help="how long to wait for an answer (default: 0.9 to connect, then 5)",
+        help="how long to wait for the daemon (default: 0.9 to connect, 5 for an answer)",
     )
 
 
-def add_cells_argument(parser: argparse.ArgumentParser) -> None:
-    """Add ``CELL...``."""
-    parser.add_argument("cells", metavar="CELL", nargs="*", help="ids, or file names where unique")
+def add_layer_option(parser: argparse.ArgumentParser, help: str) -> None:  # noqa: A002
+    """Add ``--layer``; given several times, all count."""
+    parser.add_argument("--layer", metavar="SPEC", nargs="+", action="extend", default=[], help=help)
 
 
-def cells_or_all(args: argparse.Namespace, verb: str) -> list[str] | None:
-    """Return the cells that were named, or None for ``--all``; one of both has to be given."""
-    if bool(args.cells) == args.all:
-        raise BadRequest(f"{verb}: say which cells, or --all", hint=f"shmmap {verb} --help")
-    return args.cells or None
-
-
-def add_area_options(parser: argparse.ArgumentParser, group: argparse._MutuallyExclusiveGroup) -> None:
-    """Add ``--circle``, ``--square``, ``--box`` to ``group`` and ``--z`` to the parser."""
-    group.add_argument(
-        "--circle", metavar="X,Y,R", type=lambda t: numbers(t, "X,Y,R"), help="true circle, metres, map frame"
-    )
-    group.add_argument(
-        "--square",
-        metavar="X,Y,R",
-        type=lambda t: numbers(t, "X,Y,R"),
-        help="Autoware's area: a square of half-side R",
-    )
-    group.add_argument(
-        "--box", metavar="X0,Y0,X1,Y1", type=lambda t: numbers(t, "X0,Y0,X1,Y1"), help="rectangle"
-    )
-    parser.add_argument(
-        "--z",
-        metavar="MIN,MAX",
-        type=lambda t: numbers(t, "MIN,MAX"),
-        help="only cells with points in these heights",
-    )
-
-
-def area_from(args: argparse.Namespace) -> Area | None:
-    """Return the area the options describe, or None where they name none."""
-    from shmmap import geometry
-
-    z = geometry.ZRange(*args.z) if args.z is not None else None
-    if args.circle is not None:
-        x, y, radius = args.circle
-        return geometry.Circle(x, y, radius, z)
-    if args.square is not None:
-        x, y, radius = args.square
-        return geometry.AutowareSquare(x, y, radius, z)
-    if args.box is not None:
-        min_x, min_y, max_x, max_y = args.box
-        return geometry.Box(min_x, min_y, max_x, max_y, z)
-    if z is not None:
-        raise BadRequest("--z needs an area", hint="add --circle, --square or --box")
-    return None
+def layers_from(args: argparse.Namespace) -> list[str]:
+    """Return the layers that were named, else ``points``."""
+    return args.layer or ["points"]

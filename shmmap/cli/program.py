@@ -12,7 +12,7 @@ from typing import Any, Final, NoReturn
 
 from shmmap.errors import InternalError, ShmmapError
 
-__all__ = ["Parser", "exit_code_of", "join_negative_values"]
+__all__ = ["Parser", "add_allow_empty", "complain", "exit_code_of", "join_negative_values", "nothing_found"]
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
@@ -47,7 +47,7 @@ class Parser(argparse.ArgumentParser):
         self.error(f"{message}; did you mean {near[0]}?" if near else message)
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message}\nhint: {self.prog} --help", file=sys.stderr)
+        complain(self.prog, message, f"{self.prog} --help")
         sys.exit(2)
 
 
@@ -69,12 +69,12 @@ def join_negative_values(words: Sequence[str], options: Container[str] | None = 
 
 
 def exit_code_of(name: str, run: Callable[[], int]) -> int:
-    """Run a program to its end; returns its exit code, after telling its errors on stderr."""
+    """Run a program to its end and return its exit code; its errors are told on stderr."""
     try:
         code = run()
         sys.stdout.flush()
     except ShmmapError as error:
-        _complain(name, error.message, error.hint)
+        complain(name, error.message, error.hint)
         return error.exit_code
     except BrokenPipeError:
         # the interpreter flushes stdout once more at exit: let that go nowhere
@@ -86,7 +86,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         import traceback
 
         traceback.print_exc()
-        _complain(
+        complain(
             name,
             f"internal error: {type(error).__name__}: {error}",
             "this is a defect in shmmap: please report it with the lines above",
@@ -95,7 +95,25 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     return code
 
 
-def _complain(name: str, message: str, hint: str) -> None:
-    print(f"{name}: {message}", file=sys.stderr)
+def complain(name: str, message: str, hint: str = "") -> None:
+    """Say on stderr what is wrong, and what can be done about it."""
+    from shmmap.cli.screens.output import print_line  # 5 ms, for complaints alone
+
+    print_line(f"{name}: {message}", file=sys.stderr)
     if hint:
-        print(f"hint: {hint}", file=sys.stderr)
+        print_line(f"hint: {hint}", file=sys.stderr)
+
+
+def add_allow_empty(parser: argparse.ArgumentParser) -> None:
+    """Add ``--allow-empty``."""
+    parser.add_argument("--allow-empty", action="store_true", help="exit with 0 also when nothing is found")
+
+
+def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, name: str = "shmmap") -> int:
+    """Say once that there is nothing of what was asked for; returns the exit code.
+
+    A program that goes on with nothing would take it for an answer: so that is 1, unless ``--allow-empty``
+    was given.
+    """
+    complain(name, message, hint)
+    return 0 if args.allow_empty else 1

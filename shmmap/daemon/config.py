@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Final, NamedTuple
 
 from shmmap.daemon.config_file import read_settings_file
-from shmmap.errors import ConfigError
+from shmmap.errors import BadRequest, ConfigError
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
     SYSTEM_RUNTIME_DIR,
@@ -23,7 +23,7 @@ from shmmap.protocol.endpoint import (
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import check_instance
 
-__all__ = ["DaemonConfig", "Setting", "load_config", "parse_bytes", "trace_settings"]
+__all__ = ["FILE_NAMES", "DaemonConfig", "Setting", "load_config", "parse_bytes", "trace_settings"]
 
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 LARGEST_BYTES: Final = 1 << 62
@@ -35,7 +35,9 @@ _RANGES: Final = {
     "load_timeout_s": "seconds, more than 0 and at most a day",
     "eviction": "distance or lru",
 }
-_NOT_SETTINGS: Final = ("SHMMAP_TEST_", "SHMMAP_ENDPOINT")
+_NOT_SETTINGS: Final = ("SHMMAP_TEST_",)
+FILE_NAMES: Final = {"budget_bytes": "budget", "cache_bytes": "cache_size"}
+"""What files, variables and options call a setting, where that is not the attribute's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,8 +182,8 @@ def _convert(name: str, value: Any, origin: str) -> Any:
 
 
 def _unknown(name: str, origin: str) -> ConfigError:
-    names = [field.name for field in fields(DaemonConfig)]
-    near = difflib.get_close_matches(name, [*names, "budget"], n=1)
+    names = [FILE_NAMES.get(field.name, field.name) for field in fields(DaemonConfig)]
+    near = difflib.get_close_matches(name, names, n=1)
     return ConfigError(
         f"{origin}: unknown setting {name!r}",
         key=name,
@@ -198,12 +200,13 @@ def load_config(
     Parameters
     ----------
     flags
-        Settings given on the command line, by attribute name (``budget`` stands for
-        ``budget_bytes``); None means not given.
+        Settings given on the command line, by attribute name or by their name in the file; None means
+        not given.
     file
         TOML file, empty for none.
     environ
-        Variables named ``SHMMAP_`` and the setting in capitals count.
+        Variables named ``SHMMAP_`` and the setting in capitals count.  As for clients, ``SHMMAP_ENDPOINT``
+        does not count beside a flag that names another instance or directory.
 
     Raises
     ------
@@ -228,16 +231,32 @@ def trace_settings(
     given: list[tuple[str, Any, str]] = []  # later ones override earlier ones
     if file:
         given += [(name, value, origin) for name, (value, origin) in read_settings_file(file).items()]
+    elsewhere = any(flags.get(name) is not None for name in ("instance", "runtime_dir"))
     given += [
         (name.removeprefix(_ENVIRONMENT).lower(), value, name)
         for name, value in environ.items()
-        if name.startswith(_ENVIRONMENT) and not name.startswith(_NOT_SETTINGS)
+        if name.startswith(_ENVIRONMENT)
+        and not name.startswith(_NOT_SETTINGS)
+        and not (name == "SHMMAP_ENDPOINT" and elsewhere)
     ]
     given += [(name, value, "command line") for name, value in flags.items() if value is not None]
     settings = {field.name: Setting(field.default, "default") for field in fields(DaemonConfig)}
+    attributes = {called: name for name, called in FILE_NAMES.items()}
     for word, value, origin in given:
-        name = "budget_bytes" if word == "budget" else word
+        name = attributes.get(word, word)
         if name not in settings:
             raise _unknown(word, origin)
         settings[name] = Setting(_convert(name, value, origin), origin)
+    endpoint = settings["endpoint"]
+    if endpoint.value and settings["instance"].origin == "default":
+        # clients that know the socket alone look for the segments of the instance it is named after
+        settings["instance"] = Setting(instance_of(endpoint.value), endpoint.origin)
     return settings
+
+
+def instance_of(endpoint: str) -> str:
+    """Return the instance that a socket's name stands for; the default one where it cannot be a name."""
+    try:
+        return check_instance(os.path.basename(endpoint_path(endpoint)).removesuffix(".sock"))
+    except (BadRequest, ConfigError):
+        return DEFAULT_INSTANCE

@@ -17,8 +17,9 @@ import time
 from typing import Final
 
 from shmmap.dividing.divide import divide
+from shmmap.dividing.report import LINK_NAME, read_report
 from shmmap.dividing.settings import DivideSettings
-from shmmap.errors import ShmmapError
+from shmmap.errors import MapDataError, ShmmapError
 from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["main"]
@@ -56,14 +57,26 @@ class _Channel:
         self.say(stage=self._name, done=self._done, total=self._total)
 
 
+def _frame_before(out: str) -> tuple[float, float, float] | None:
+    """Return what the cloud's division in service was moved by; None where there is none."""
+    try:
+        report = read_report(os.path.join(os.path.dirname(out), LINK_NAME))
+    except MapDataError:
+        return None  # of another version: divided anew
+    if report is None:
+        return None
+    x, y, z = (0.0 - float(part) for part in report["origin"])
+    return x, y, z
+
+
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT``; returns the error's exit code."""
     channel = _Channel(socket.socket(fileno=int(arguments[0])))
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     os.nice(_NICENESS)
-    # clients ask in the cloud's own coordinates, so it keeps its frame
-    settings = DivideSettings(translate="none", resume=True)
+    # as `shmmap divide` does it, so that both give the same map; changed clouds keep the frame clients know
+    settings = DivideSettings(resume=True, frame_before=_frame_before(arguments[3]))
     try:
         divide([arguments[2]], arguments[3], settings, progress=channel)
     except ShmmapError as error:

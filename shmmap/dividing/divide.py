@@ -35,8 +35,10 @@ from shmmap.dividing.sources import Source, open_source
 from shmmap.dividing.stream import Stream
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
+from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
+from shmmap.quantities import format_bytes
 
 __all__ = ["divide"]
 
@@ -118,9 +120,10 @@ class _Run:
             [source.row for source in self._sources],
             [source.path for source in self._sources],
             common_only=settings.common_fields,
+            wanted=settings.fields,
         )
         progress.stage("looking at coordinates", 0)
-        self._frame = choose_frame(self._sources, row, lattice, settings.translate)
+        self._frame = choose_frame(self._sources, row, lattice, settings.translate, settings.frame_before)
         self._row = np.dtype(
             [(name, self._frame.axis if name in AXES else row[name]) for name in row.names or ()]
         )
@@ -268,8 +271,8 @@ class _Run:
             return  # much of it is there already
         if needed > free:
             raise CannotWrite(
-                f"the map needs about {needed >> 20} MiB in {os.path.dirname(self._space.out)}, "
-                f"{free >> 20} MiB are free",
+                f"the map needs about {format_bytes(needed)} in {os.path.dirname(self._space.out)}, "
+                f"{format_bytes(free)} are free",
                 hint="free some space, or choose another disk",
             )
 
@@ -277,6 +280,9 @@ class _Run:
         notes = [*self._frame.notes]
         for source in self._sources:
             notes += [f"{source.path}: {warning}" for warning in source.warnings]
+        if not any(GEOGRAPHIC_SYSTEM in note for note in notes):
+            low, high = stream.extremes + self._frame.origin
+            notes += [warning] if (warning := degrees_warning(low, high)) else []
         if not self._lattice.whole:
             notes.append(
                 "cells have fractional corners: Autoware's loader, which reads whole metres, refuses them"

@@ -100,7 +100,11 @@ def _source_bounds(sources: Sequence[Source]) -> Bound3:
 
 
 def choose_frame(
-    sources: Sequence[Source], row: np.dtype[np.void], lattice: CellLattice, translation: Translation
+    sources: Sequence[Source],
+    row: np.dtype[np.void],
+    lattice: CellLattice,
+    translation: Translation,
+    before: tuple[float, float, float] | None = None,
 ) -> Frame:
     """Choose the frame of a map made of ``sources``, whose common rows are ``row``.
 
@@ -110,6 +114,8 @@ def choose_frame(
         Numbers to add to x, y and z; ``none`` to keep the frame; ``auto`` to move it where the
         inputs are float64 and float32 would lose more than half a millimetre.  An automatic frame
         lies at whole metres and whole cells, so that the cells stay the same squares of ground.
+    before
+        With ``auto``, the move to prefer where float32 is precise enough with it.
     """
     single, double = np.dtype(np.float32), np.dtype(np.float64)
     if row["x"].itemsize == 4 and not isinstance(translation, tuple):
@@ -123,6 +129,9 @@ def choose_frame(
             return Frame(translation, single)
         return Frame(translation, double, (_kept_note(reach),))
     reach = _reach(low, high, NO_MOVE)
+    if translation == "auto" and before is not None and _reach(low, high, before) < FLOAT32_REACH_M:
+        notes = (_moved_note(before, reach),) if before != NO_MOVE else ()
+        return Frame(before, single, notes, FLOAT32_REACH_M)
     if reach < FLOAT32_REACH_M:
         return Frame(NO_MOVE, single, (), FLOAT32_REACH_M)
     if translation == "none":
@@ -158,7 +167,7 @@ def _moved_note(move: Sequence[float], reach: float) -> str:
     x, y, z = move
     return (
         f"moved by ({x:.12g}, {y:.12g}, {z:.12g}) m: float32 would have lost up to {_loss_mm(reach):.2g} mm "
-        "where the points were; --translate none keeps their frame, in float64"
+        "where the points were; `shmmap divide --translate none` keeps their frame, in float64"
     )
 
 

@@ -115,14 +115,14 @@ def check_output_directory(out: str, *, force: bool) -> None:
     if not os.path.lexists(out):
         return
     if os.path.islink(out) or not os.path.isdir(out):
-        raise BadRequest(f"{out} exists and is no directory", hint="choose another output")
+        raise BadRequest(f"{out} is not a directory", hint="choose another output")
     there = set(os.listdir(out))
     if not there:
         return
     if there - _MAP_PARTS or METADATA_NAME not in there:
         odd = sorted(there - _MAP_PARTS) or sorted(there)
         raise BadRequest(
-            f"{out} is no divided map, it has {', '.join(odd[:3])}{', ...' if len(odd) > 3 else ''}",
+            f"{out} is not a divided map: it has {', '.join(odd[:3])}{', ...' if len(odd) > 3 else ''}",
             hint="choose another output; nothing but a divided map is ever replaced",
         )
     if not force:

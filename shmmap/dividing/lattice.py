@@ -123,5 +123,5 @@ class CellLattice:
 
 def _decimal(value: float) -> Decimal:
     if not math.isfinite(value):
-        raise BadRequest(f"{value!r} is no number of metres")
+        raise BadRequest(f"{value!r} is not a number of metres")
     return Decimal(repr(float(value))).normalize()

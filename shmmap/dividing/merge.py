@@ -17,9 +17,10 @@ from shmmap.dividing.progress import NoProgress, Progress
 from shmmap.dividing.report import read_report
 from shmmap.dividing.row_layout import AXES, NO_MOVE, RowLayout, common_rows
 from shmmap.dividing.sources import Source, open_source
-from shmmap.errors import BadRequest, CannotWrite
+from shmmap.errors import BadRequest, CannotWrite, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd_writer import pcd_header, pcd_rows
+from shmmap.quantities import format_bytes
 
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
 
@@ -95,7 +96,7 @@ def merge(
     if encoding not in MERGED_ENCODINGS:
         raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(MERGED_ENCODINGS)}")
     if os.path.isdir(out) or (os.path.lexists(out) and not force):
-        raise BadRequest(f"{out} exists already", hint="--force replaces a file")
+        raise BadRequest(f"{out} is there already", hint="--force replaces a file")
     with contextlib.ExitStack() as stack:
         sources: list[Source] = []
         read: list[InputFile] = []
@@ -126,6 +127,8 @@ def merge(
                 [(name, np.dtype("<f8") if name in AXES else row[name]) for name in row.names or ()]
             )
         points = sum(source.points for source in sources)
+        if not points:
+            raise MapDataError("there is no point in any of the inputs", cause="no_points")
         header = pcd_header(_fields(row), points, encoding)
         stack.enter_context(writing_errors(out))
         _check_space(out, len(header) + points * row.itemsize)
@@ -163,7 +166,7 @@ def _check_space(out: str, needed: int) -> None:
     free = have.f_bavail * have.f_frsize
     if needed > free:
         raise CannotWrite(
-            f"{out} needs about {needed >> 20} MiB, {free >> 20} MiB are free",
+            f"{out} needs about {format_bytes(needed)}, {format_bytes(free)} are free",
             hint="free some space, or choose another disk",
         )
 

@@ -11,9 +11,11 @@ from typing import Any, Final
 
 from shmmap.errors import MapDataError
 
-__all__ = ["REPORT_NAME", "DividedMap", "read_report", "write_report"]
+__all__ = ["LINK_NAME", "REPORT_NAME", "DividedMap", "read_report", "write_report"]
 
 REPORT_NAME: Final = "shmmap_divide.json"
+LINK_NAME: Final = "map"
+"""Beside the divisions of a served cloud, this leads to the one in service."""
 _FORMAT: Final = "shmmap divided map"
 _VERSION: Final = 1
 
@@ -82,5 +84,5 @@ def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
     except ValueError as error:
         raise MapDataError(f"cannot be read: {error}", path=path) from error
     if not isinstance(report, dict) or report.get("format") != _FORMAT or report.get("version") != _VERSION:
-        raise MapDataError("not made by this version", path=path)
+        raise MapDataError("written by another version of shmmap", path=path)
     return report

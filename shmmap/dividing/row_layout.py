@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import MapDataError
+from shmmap.errors import BadRequest, MapDataError
 
 __all__ = ["AXES", "NO_MOVE", "RowLayout", "common_rows", "word_view"]
 
@@ -52,15 +52,33 @@ class RowLayout:
 
 
 def common_rows(
-    rows: Sequence[np.dtype[np.void]], paths: Sequence[str], *, common_only: bool
+    rows: Sequence[np.dtype[np.void]],
+    paths: Sequence[str],
+    *,
+    common_only: bool,
+    wanted: Sequence[str] = (),
 ) -> np.dtype[np.void]:
     """Fields that the rows of all inputs share, in the order of the first; axes in the widest type.
 
+    Parameters
+    ----------
+    wanted
+        Only these count; empty: all.
+
     Raises
     ------
+    BadRequest
+        A field that is wanted is in none of the inputs.
     MapDataError
         The inputs have different fields, and ``common_only`` does not say to leave out what some lack.
     """
+    if wanted:
+        known = dict.fromkeys(name for row in rows for name in row.names or ())
+        if missing := [name for name in wanted if name not in known]:
+            raise BadRequest(
+                f"no input has a field {', '.join(missing)}", hint=f"there are: {', '.join(known)}"
+            )
+        rows = [_chosen(row, wanted) for row in rows]
     fields: list[tuple[str, Any]] = []
     for name in rows[0].names or ():
         if name in AXES:
@@ -80,6 +98,10 @@ def common_rows(
                     hint="--common-fields keeps only what all inputs have",
                 )
     return np.dtype(fields)
+
+
+def _chosen(row: np.dtype[np.void], wanted: Sequence[str]) -> np.dtype[np.void]:
+    return np.dtype([(name, row[name]) for name in row.names or () if name in wanted])
 
 
 def word_view(rows: NDArray[np.void]) -> NDArray[Any]:

@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from xxhash import xxh3_64_hexdigest
 
+from shmmap.dividing.report import LINK_NAME, read_report
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.logfmt import log
@@ -38,10 +39,9 @@ from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_chil
 
 __all__ = ["DividedCloud", "find_origin"]
 
-_RECIPE: Final = "cells of 20 m, frame kept, 1"  # changes whenever the same cloud would be divided otherwise
+_RECIPE: Final = "cells of 20 m, frame moved, 1"  # changes whenever the same cloud would be divided otherwise
 _KEPT_CLOUDS: Final = 8
 _MORE_TIME_USEC: Final = 60_000_000
-_LINK: Final = "map"
 _USE_LOCK: Final = ".use"  # held shared by every daemon that serves the cloud
 _MAKING_LOCK: Final = ".making"  # held by the one that divides it
 
@@ -122,7 +122,7 @@ class DividedCloud:
             raise MapMissing(f"cannot read {self.path}: {error.strerror}") from error
         name = xxh3_64_hexdigest(json.dumps([_RECIPE, *stamp]).encode())
         out = os.path.join(self._directory, name)
-        link = os.path.join(self._directory, _LINK)
+        link = os.path.join(self._directory, LINK_NAME)
         try:
             self._hold()
             with self._alone():
@@ -135,7 +135,10 @@ class DividedCloud:
             raise CannotWrite(
                 f"{error.filename or self._directory}: {error.strerror}", hint="name another --cache-dir"
             ) from error
-        return MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
+        catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
+        report = read_report(out) or {}
+        catalogue.problems = (*catalogue.problems, *map(str, report.get("notes", ())))
+        return catalogue
 
     def _divide(self, out: str) -> None:
         log.info("dividing", cloud=self.path, into=out)

@@ -10,6 +10,7 @@ from shmmap.dividing.cell_order import ORDERS
 from shmmap.dividing.frame import Translation
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.memory import MIN_MEMORY_BYTES
+from shmmap.dividing.row_layout import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd_header import ENCODINGS
 
@@ -28,6 +29,9 @@ class DivideSettings:
         A corner of the lattice of cells, metres, in the frame of the inputs.
     translate
         Added to every point, or ``auto``, or ``none``; see `shmmap.dividing.frame`.
+    frame_before
+        What ``auto`` adds where that leaves float32 precise enough: what an earlier state of the same cloud
+        was moved by, so that its map stays where it is.
     leaf
         Side of the voxels whose points become one, metres; 0 keeps every point.
     prefix
@@ -40,6 +44,8 @@ class DivideSettings:
         Most memory that the process may take, code and libraries included.
     common_fields
         Keep only what all inputs have, where their fields differ.
+    fields
+        Keep only these, x, y and z among them; empty: all.
     force
         Replace a divided map that is there.
     resume
@@ -55,12 +61,14 @@ class DivideSettings:
     cell_size: float = 20.0
     origin: tuple[float, float] = (0.0, 0.0)
     translate: Translation = "auto"
+    frame_before: tuple[float, float, float] | None = None
     leaf: float = 0.0
     prefix: str = ""
     encoding: str = "binary"
     order: str = "input"
     memory_bytes: int = 1 << 30
     common_fields: bool = False
+    fields: tuple[str, ...] = ()
     force: bool = False
     resume: bool = False
     check: bool = False
@@ -90,6 +98,10 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
     for name, value, allowed in choices:
         if value not in allowed:
             raise BadRequest(f"{name} {value!r} is not one of {', '.join(allowed)}")
+    if settings.fields and (missing := [axis for axis in AXES if axis not in settings.fields]):
+        raise BadRequest(
+            f"the fields to keep lack {', '.join(missing)}", hint="name x, y and z, too: x,y,z,intensity"
+        )
     if isinstance(settings.translate, tuple):
         if not all(map(math.isfinite, settings.translate)):
             raise BadRequest("a translation is three numbers of metres")

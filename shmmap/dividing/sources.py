@@ -19,6 +19,7 @@ from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.open3d_reader import read_with_open3d
 from shmmap.formats.pcd_mapped import expanded_blocks
 from shmmap.formats.pcd_reader import PcdReader
+from shmmap.quantities import format_bytes
 
 __all__ = ["Bound3", "Source", "open_source"]
 
@@ -271,6 +272,7 @@ class _Las(_Stream):
         with LasReader(path) as reader:
             super().__init__(path, reader.points, reader.columns)
             self.claimed_bounds = reader.bounds
+            self.warnings = reader.warnings
 
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
         with LasReader(self.path) as reader:
@@ -291,7 +293,8 @@ class _Whole(_Stream):
             raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
         if size * _OPEN3D_FACTOR > memory_bytes:
             raise BadRequest(
-                f"{path} must be read whole, which takes about {size * _OPEN3D_FACTOR >> 20} MiB of memory",
+                f"{path} must be read whole, which takes about"
+                f" {format_bytes(size * _OPEN3D_FACTOR)} of memory",
                 hint="give more --max-memory, or convert it to PCD or LAS, which are streamed",
             )
         self._columns, warnings = read_with_open3d(path, suffix)

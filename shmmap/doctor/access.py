@@ -81,7 +81,9 @@ def check_group(patient: Patient) -> Finding:
             "log in again, or `newgrp " + group + "`",
         )
     return fail(
-        name, f"{account} is no member of {group}", f"sudo usermod -aG {group} {account}, then log in again"
+        name,
+        f"{account} is not a member of {group}",
+        f"sudo usermod -aG {group} {account}, then log in again",
     )
 
 

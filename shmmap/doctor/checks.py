@@ -10,7 +10,13 @@ from shmmap.doctor.access import check_group, check_map_access, check_socket
 from shmmap.doctor.finding import Finding
 from shmmap.doctor.kernel import check_descriptors, check_pins
 from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
-from shmmap.doctor.memory import check_container, check_huge_pages, check_memory_limit, check_shared_memory
+from shmmap.doctor.memory import (
+    check_cache,
+    check_container,
+    check_huge_pages,
+    check_memory_limit,
+    check_shared_memory,
+)
 from shmmap.doctor.patient import Patient
 
 __all__ = ["CHECKS", "diagnose"]
@@ -22,6 +28,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_map_access,
     check_reload,
     check_shared_memory,
+    check_cache,
     check_memory_limit,
     check_container,
     check_huge_pages,

@@ -20,8 +20,8 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
 def check_pins(patient: Patient) -> Finding:
-    """Can the kernel tell who uses a segment, and name them?"""
-    name = "pins"
+    """Can the kernel tell which processes map a segment?"""
+    name = "leases"
     try:
         directory = ShmDirectory(patient.shm_dir)
     except ConfigError as error:
@@ -35,16 +35,17 @@ def check_pins(patient: Patient) -> Finding:
     if not found.leases:
         return warn(
             name,
-            f"{patient.shm_dir}: no leases, so who uses a segment is known from {found.source.value} only",
+            f"{patient.shm_dir} grants none: memory in use is known from {found.source.value} only",
             "name a directory on a tmpfs with shm_dir",
         )
-    if not (found.locks and found.close_events and found.process_ends):
+    parts = {"locks": found.locks, "inotify": found.close_events, "pidfds": found.process_ends}
+    if lacking := ", ".join(f"no {part}" for part, works in parts.items() if not works):
         return warn(
             name,
-            f"leases work; locks: {found.locks}, inotify: {found.close_events}, pidfds: {found.process_ends}",
-            "holders may stay unnamed, or memory be freed late: use a newer kernel",
+            f"they work, but not all of what goes with them: {lacking}",
+            "clients may stay unnamed, or memory be freed late: use a newer kernel",
         )
-    return ok(name, "leases and locks work: the kernel tells who uses a segment")
+    return ok(name, "leases and locks work: the kernel tells which processes map a segment")
 
 
 def check_descriptors(patient: Patient) -> Finding:
@@ -53,8 +54,8 @@ def check_descriptors(patient: Patient) -> Finding:
     hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     whose = f"of the daemon (pid {patient.pid})" if limits else "here"
     if not hard.isdigit() or int(hard) < 0:
-        return ok("descriptors", f"no limit {whose}")
+        return ok("open files", f"no limit {whose}")
     fact = f"limit {whose}: {hard}, enough for {int(hard) // 2} clients"
     if int(hard) < FEW_DESCRIPTORS:
-        return warn("descriptors", fact, "raise it: LimitNOFILE=65536 in the unit, or `ulimit -Hn`")
-    return ok("descriptors", fact)
+        return warn("open files", fact, "raise it: LimitNOFILE=65536 in the unit, or `ulimit -Hn`")
+    return ok("open files", fact)

@@ -12,9 +12,9 @@ from typing import Final
 
 import shmmap
 from shmmap.doctor.finding import Finding, fail, ok, warn
-from shmmap.doctor.memory import size_text
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.errors import ShmmapError
+from shmmap.quantities import counted, format_bytes
 from shmmap.statistics.reader import read_statistics
 
 __all__ = ["check_daemon", "check_leftovers", "check_logind", "check_reload"]
@@ -41,7 +41,7 @@ def check_daemon(patient: Patient) -> Finding:
     fact = f"instance {instance}, pid {identity.pid}, is {state}"
     if state == "dead":
         return fail(
-            name, f"{fact}: it ended without cleaning up", "start it again: it takes over what is left"
+            name, f"{fact}: it crashed or was killed", "start it again: it keeps the cells that are in memory"
         )
     if state == "stopped":
         return fail(name, fact, f"continue it: kill -CONT {identity.pid}")
@@ -78,13 +78,14 @@ def check_leftovers(patient: Patient) -> Finding:
         return warn(name, f"{patient.shm_dir}: {error.strerror}", "run it with sudo")
     orphans = {name: held for name, held in found.items() if not _looked_after(patient, name)}
     if not orphans:
-        return ok(name, "every segment belongs to a daemon that lives" if found else "none")
+        return ok(name, "every segment belongs to a running daemon" if found else "none")
     listed = ", ".join(
-        f"{one}: {count} segments, {size_text(n)}" for one, (count, n) in sorted(orphans.items())
+        f"{one}: {counted(count, 'segment')}, {format_bytes(n)}"
+        for one, (count, n) in sorted(orphans.items())
     )
     return warn(
         name,
-        f"no daemon looks after {listed}",
+        f"segments of daemons that do not run: {listed}",
         "start that instance: it serves or frees them; or `rm " + patient.shm_dir + "/shmmap.INSTANCE.*`",
     )
 
@@ -117,7 +118,7 @@ def check_logind(patient: Patient) -> Finding:
     """Will the session manager delete the segments at logout?"""
     name, machine, uid = "logout", patient.machine, patient.runs_as
     if uid <= SYSTEM_UIDS:
-        return ok(name, "the daemon's is a system account: logind leaves its segments alone")
+        return ok(name, "the daemon runs as a system account: logind does not delete its segments")
     if not machine.path("/run/systemd/system").exists():
         return ok(name, "no systemd here: nothing is deleted at logout")
     if _logind_setting(machine, "RemoveIPC").lower() in ("no", "0", "false", "off"):
@@ -136,19 +137,19 @@ def check_logind(patient: Patient) -> Finding:
 
 
 def check_reload(patient: Patient) -> Finding:
-    """Did the map's last reading succeed?"""
+    """Could the map be read the last time?"""
     name = "reload"
     if not patient.alive or patient.seen is None:
         return ok(name, "no daemon runs")
     count = patient.seen.counters
     at_ns = count.get("last_reload_unix_ns", 0)
-    fact = f"read again {count.get('reloads', 0)} times"
+    fact = f"the map was read again {counted(count.get('reloads', 0), 'time')}"
     if at_ns:
-        fact += f", last {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at_ns * 1e-9))}"
+        fact += f", last at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at_ns * 1e-9))}"
     if count.get("last_reload_failed", 0):
         return fail(
             name,
-            f"{fact}; the last attempt failed, the old state of the map is served",
+            f"{fact}; the last attempt failed, the map read before is served",
             "`shmmap reload` says why",
         )
     return ok(name, fact)

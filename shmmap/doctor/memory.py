@@ -8,10 +8,12 @@ import re
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
+from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Machine, Patient
+from shmmap.quantities import format_bytes
 
-__all__ = ["check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory", "size_text"]
+__all__ = ["check_cache", "check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory"]
 
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
 OVERHEAD_BYTES: Final = 512 << 20
@@ -22,14 +24,6 @@ class _Mount(NamedTuple):
     point: str
     kind: str
     options: tuple[str, ...]
-
-
-def size_text(nbytes: float) -> str:
-    """Return bytes for a reader; powers of 1024, as the budget."""
-    for unit, size in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
-        if nbytes >= size:
-            return f"{nbytes / size:.1f} {unit}".replace(".0 ", " ")
-    return f"{nbytes:.0f} B"
 
 
 def _mount_of(machine: Machine, path: str) -> _Mount:
@@ -65,10 +59,10 @@ def check_shared_memory(patient: Patient) -> Finding:
         count = patient.seen.counters
         used = sum(count.get(f"bytes_{kind}", 0) for kind in ("resident", "zombie", "statistics"))
     budget = patient.budget_bytes
-    fact = f"{path}: {size_text(size)}, {size_text(free)} free"
+    fact = f"{path}: {format_bytes(size)}, {format_bytes(free)} free"
     if not budget:
         return ok(name, f"{fact}; the budget is chosen at start")
-    fact += f"; budget {size_text(budget)}, of which {size_text(used)} are in use"
+    fact += f"; budget {format_bytes(budget)}, of which {format_bytes(used)} are in use"
     enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={_enough(budget)} {mount.point}`"
     if budget > free + used:
         return fail(name, fact, enlarge)
@@ -81,6 +75,15 @@ def _enough(budget: int) -> str:
     return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
 
 
+def check_cache(patient: Patient) -> Finding:
+    """Is the budget enough for what clients ask for?  The verdict of ``status``."""
+    name = "cache size"
+    if not patient.alive or patient.seen is None:
+        return ok(name, "no daemon runs")
+    verdict = cache_verdict(patient.seen.counters)
+    return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
+
+
 def check_container(patient: Patient) -> Finding:
     """Does a container see enough shared memory?"""
     name = "container"
@@ -90,7 +93,7 @@ def check_container(patient: Patient) -> Finding:
         machine.text("/run/systemd/container")
     )
     if not contained:
-        return ok(name, "this is no container")
+        return ok(name, "not in a container")
     try:
         state = os.statvfs(machine.path(patient.shm_dir))
     except OSError as error:
@@ -99,10 +102,10 @@ def check_container(patient: Patient) -> Finding:
     if 0 < size <= CONTAINER_DEFAULT_BYTES:
         return warn(
             name,
-            f"a container whose {patient.shm_dir} has {size_text(size)}, the default",
+            f"in a container whose {patient.shm_dir} has {format_bytes(size)}, the default",
             "a daemon inside needs --shm-size=8g; clients of a daemon outside need --ipc=host",
         )
-    return ok(name, f"a container with {size_text(size)} of shared memory")
+    return ok(name, f"in a container with {format_bytes(size)} of shared memory")
 
 
 def _cgroup_limit(machine: Machine, pid: int) -> int:
@@ -130,15 +133,15 @@ def check_memory_limit(patient: Patient) -> Finding:
     name = "memory limit"
     limit, budget = _cgroup_limit(patient.machine, patient.pid), patient.budget_bytes
     if not limit:
-        return ok(name, "the control group sets none")
-    chosen = size_text(budget) if budget else "chosen at start"
-    fact = f"the control group allows {size_text(limit)}; budget {chosen}"
+        return ok(name, "the control group sets no limit")
+    chosen = format_bytes(budget) if budget else "chosen at start"
+    fact = f"the control group allows {format_bytes(limit)}; budget {chosen}"
     if budget and budget + OVERHEAD_BYTES > limit:
         return fail(
             name,
             fact,
             "crossing it kills the daemon (segments are charged to it): lower the budget to"
-            f" {size_text(max(limit - OVERHEAD_BYTES, 1 << 20))}, or raise MemoryMax=",
+            f" {format_bytes(max(limit - OVERHEAD_BYTES, 1 << 20))}, or raise MemoryMax=",
         )
     return ok(name, fact)
 

@@ -29,7 +29,7 @@ CAUSES: Final[dict[str, str]] = {
     "changed": "the file changed while it was being read",
     "truncated": "the file ends before its data does",
     "bad_lzf": "the compressed block contradicts its sizes or cannot be decompressed",
-    "bad_row": "a row of an ascii file has too few or many values, or one that is no number of its type",
+    "bad_row": "a row of an ascii file has too few or many values, or one that is not a number of its type",
     "coordinate_range": "a 64-bit integer coordinate that float64 cannot hold exactly",
     "unsupported_format": "a file format that is not read",
     "bad_cloud": "Open3D could not read the file",

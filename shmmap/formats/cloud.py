@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
+from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.finite import Bounds
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.open3d_reader import OPEN3D_SUFFIXES, read_with_open3d
@@ -160,6 +161,13 @@ def describe(path: str | os.PathLike[str]) -> CloudDescription:
     MapDataError
         As `read_cloud`.
     """
+    found = _described(path)
+    if GEOGRAPHIC_SYSTEM not in found.warnings and (warning := degrees_warning(*found.bounds)):
+        found = replace(found, warnings=(*found.warnings, warning))
+    return found
+
+
+def _described(path: str | os.PathLike[str]) -> CloudDescription:
     suffix = _suffix(path)
     if suffix in LAS_SUFFIXES:
         return _describe_las(path, suffix)
@@ -225,6 +233,7 @@ def _describe_las(path: str | os.PathLike[str], suffix: str) -> CloudDescription
             height=1,
             columns=reader.columns,
             bounds=bounds.result(),
+            warnings=reader.warnings,
         )
 
 

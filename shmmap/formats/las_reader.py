@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LAS, LAZ and COPC through laspy, block by block (the optional dependency ``shmmap[las]``).
+"""LAS, LAZ and COPC through laspy, block by block (laspy with lazrs, optional dependencies).
 
 The format is that of the ASPRS LAS specification 1.4 R15; COPC is LAZ with its points in the order
 of an octree.  Coordinates are stored as scaled integers and come out as float64.  Every dimension
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats.causes import refusal
+from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, is_geographic
 from shmmap.formats.source_file import open_regular
 
 __all__ = ["LAS_SUFFIXES", "LasReader"]
@@ -50,6 +51,8 @@ class LasReader:
         Whether it is LAZ.
     version
         Of the LAS format, such as ``1.4``.
+    warnings
+        Oddities of the file.
 
     Raises
     ------
@@ -71,6 +74,7 @@ class LasReader:
         self.points = int(header.point_count)
         self.version = str(header.version)
         self.bounds = (np.array(header.mins, np.float64), np.array(header.maxs, np.float64))
+        self.warnings = (GEOGRAPHIC_SYSTEM,) if is_geographic(header) else ()
         self._names = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
         empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
         self._columns = column_names(self._names)
@@ -143,7 +147,7 @@ def _check_start(path: str) -> bool:
     if not head:
         raise refusal("empty_file", "no bytes at all", path=path)
     if not head.startswith(_SIGNATURE):
-        raise refusal("bad_las", "no LAS file: it does not start with LASF", path=path, offset=0)
+        raise refusal("bad_las", "not a LAS file: it does not start with LASF", path=path, offset=0)
     if len(head) < _SHORTEST_HEADER_BYTES:
         raise refusal("truncated", "the file ends within its header", path=path, offset=len(head))
     data_at, form, record_bytes, points = _LEGACY_COUNT.unpack_from(head, 96)
@@ -164,7 +168,8 @@ def _laspy(path: str) -> Any:
         import laspy
     except ImportError as error:
         raise ShmmapError(
-            f"laspy is needed to read {path}: {error}", hint="pip install 'shmmap[las]'"
+            f"{path}: LAS and LAZ need the Python package laspy, which cannot be loaded: {error}",
+            hint="pip install 'laspy[lazrs]'",
         ) from error
     return laspy
 

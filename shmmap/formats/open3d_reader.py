@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import column_names
-from shmmap.errors import ShmmapError
 from shmmap.formats.causes import refusal
+from shmmap.formats.open3d_package import load_open3d
 from shmmap.formats.source_file import open_regular
 
 __all__ = ["OPEN3D_SUFFIXES", "read_with_open3d"]
@@ -62,7 +62,7 @@ def read_with_open3d(path: str, suffix: str) -> tuple[dict[str, NDArray[Any]], t
     columns = _load(path, suffix)
     found = len(columns.get("xyz", ()))
     if found != expected:
-        raise refusal("bad_cloud", f"{expected} points announced, Open3D reads {found}", path=path)
+        raise refusal("bad_cloud", f"{expected} points expected, Open3D reads {found}", path=path)
     dropped = [name for name, values in columns.items() if len(values) != found]
     for name in dropped:
         del columns[name]
@@ -70,13 +70,7 @@ def read_with_open3d(path: str, suffix: str) -> tuple[dict[str, NDArray[Any]], t
 
 
 def _load(path: str, suffix: str) -> dict[str, NDArray[Any]]:
-    try:
-        import open3d as o3d  # 1-2 s and 100-200 MB: only here
-    except ImportError as error:
-        raise ShmmapError(
-            f"Open3D cannot be loaded to read {path}: {error}",
-            hint="it needs the system packages libegl1 libgl1 libx11-6 libusb-1.0-0",
-        ) from error
+    o3d = load_open3d(f"{path}: {suffix[1:].upper()}", instead="or convert the file to PCD or LAS")
     # Open3D 0.18 takes no Path, and a str only where it is UTF-8; the stubs of 0.20 know nothing of bytes
     encoded: Any = os.fsencode(path)
     try:

@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.formats.open3d_package import load_open3d
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
-from shmmap.layers.neighbourhood import load_open3d, local_coordinates
+from shmmap.layers.neighbourhood import local_coordinates
 
 __all__ = ["KIND", "build_denoise"]
 
@@ -36,7 +37,7 @@ def build_denoise(points: PointTable, parameters: Parameters) -> LayerTable:
 
 def _mean_distances(xyz: NDArray[np.float64], queries: int, neighbours: int) -> NDArray[np.float64]:
     """Mean distance of the first ``queries`` points to their nearest others."""
-    o3d = load_open3d("denoise")
+    o3d = load_open3d("the layer denoise")
     core = o3d.core
     search = core.nns.NearestNeighborSearch(core.Tensor(xyz))
     search.knn_index()

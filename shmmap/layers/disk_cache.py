@@ -19,66 +19,27 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import msgspec
 import xxhash
 
 from shmmap.errors import CannotWrite, SegmentCorrupt
-from shmmap.layers.contract import Box
-from shmmap.layers.spec import LayerSpec
-from shmmap.segment import layout
+from shmmap.layers.cache_key import CacheKey
 from shmmap.segment.header import pack_header, unpack_header
-from shmmap.segment.layout import SegmentHeader, SourceStamp, header_size
+from shmmap.segment.layout import PAGE_BYTES, SegmentHeader, header_size
 from shmmap.segment.writer import write_all
 
-__all__ = ["CacheKey", "LayerCache", "neighbour_states"]
+__all__ = ["LayerCache"]
 
 _BLOCK_BYTES: Final = 1 << 18  # stays in the second-level cache while it is hashed and written
 _TOUCH_AGE_S: Final = 3600.0
 _STALE_INTERIM_S: Final = 3600.0
 _SPARE_SHARE: Final = 0.05
 """Part of the file system that the cache leaves free."""
-
-
-@dataclass(frozen=True, slots=True)
-class CacheKey:
-    """What an entry is of.
-
-    Attributes
-    ----------
-    stamp, neighbours
-        State of the cell's file, and paths and states of those around it for a layer with a halo.
-    """
-
-    spec: LayerSpec
-    cell_id: str
-    box: Box
-    frame_id: str
-    stamp: SourceStamp
-    neighbours: tuple[tuple[str, SourceStamp], ...] = ()
-
-    def _layer(self) -> bytes:
-        version = struct.pack("<IHH4d", self.spec.builder_version, *layout.LAYOUT_VERSION, *self.box)
-        return str(self.spec).encode() + b"\0" + version
-
-    def state_name(self) -> str:
-        """Name of the entry for this state of the files."""
-        words = [self._layer()]
-        for path, stamp in ((self.cell_id, self.stamp), *self.neighbours):
-            words.append(os.fsencode(path) + b"\0" + struct.pack("<Qqq", *stamp))
-        name: str = xxhash.xxh3_128_hexdigest(b"".join(words))
-        return name
-
-    def content_name(self, digest: bytes) -> str:
-        """Name of the entry for what was computed from, by `shmmap.layers.derive.combined_digest`."""
-        name: str = digest.hex() + xxhash.xxh3_64_hexdigest(self._layer())
-        return name
 
 
 class LayerCache:
@@ -302,9 +263,9 @@ class LayerCache:
 
 
 def _read_header(fd: int, available: int) -> SegmentHeader:
-    page = os.pread(fd, layout.PAGE_BYTES, 0)
+    page = os.pread(fd, PAGE_BYTES, 0)
     header_bytes = int.from_bytes(page[16:24], "little")
-    if layout.PAGE_BYTES < header_bytes <= available:
+    if PAGE_BYTES < header_bytes <= available:
         page = os.pread(fd, header_bytes, 0)
     return unpack_header(memoryview(page), available)
 
@@ -336,15 +297,3 @@ def _copy_all(source: int, target: int, nbytes: int) -> None:
             raise OSError("the segment is shorter than its header says")
         write_all(target, memoryview(block), at)
         at += len(block)
-
-
-def neighbour_states(paths: Sequence[str]) -> tuple[tuple[str, SourceStamp], ...]:
-    """Return paths with the stamps of what lies there now; zeros where nothing does."""
-    return tuple((path, _state_of(path)) for path in paths)
-
-
-def _state_of(path: str) -> SourceStamp:
-    try:
-        return SourceStamp.of(os.stat(path))
-    except OSError:
-        return layout.NO_SOURCE

@@ -8,8 +8,9 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from shmmap.layers.cache_key import CacheKey, neighbour_states
 from shmmap.layers.derive import CellJob, derive
-from shmmap.layers.disk_cache import CacheKey, LayerCache, neighbour_states
+from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER, build_points
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec

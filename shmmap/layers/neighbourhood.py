@@ -1,35 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open3D for builders that look at the points around each point, loaded when the first one runs."""
+"""Coordinates for builders that look at the points around each point."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import ShmmapError
 from shmmap.layers.contract import PointTable
 
-__all__ = ["load_open3d", "local_coordinates"]
-
-
-def load_open3d(layer: str) -> Any:
-    """Return the open3d module: 1-2 s and 100-200 MB, once in a process.
-
-    Raises
-    ------
-    ShmmapError
-        If it cannot be loaded; the hint says what it lacks.
-    """
-    try:
-        import open3d
-    except ImportError as error:
-        raise ShmmapError(
-            f"Open3D cannot be loaded to build {layer}: {error}",
-            hint="it needs the system packages libegl1 libgl1 libx11-6 libusb-1.0-0",
-        ) from error
-    return open3d
+__all__ = ["local_coordinates"]
 
 
 def local_coordinates(points: PointTable, finite: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -7,8 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from shmmap.formats.open3d_package import load_open3d
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
-from shmmap.layers.neighbourhood import load_open3d, local_coordinates
+from shmmap.layers.neighbourhood import local_coordinates
 
 __all__ = ["KIND", "build_normals"]
 
@@ -19,7 +20,7 @@ def build_normals(points: PointTable, parameters: Parameters) -> LayerTable:
     Normals have length 1 and point up.  As in Open3D, a point with fewer than three points around it,
     itself included, has the normal (0, 0, 1).
     """
-    o3d = load_open3d("normals")
+    o3d = load_open3d("the layer normals")
     finite = points.finite()
     table = points.selected(finite)
     normals = np.zeros((table.rows, 3), np.float32)

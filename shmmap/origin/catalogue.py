@@ -67,7 +67,7 @@ class Catalogue:
         if bad.any():
             first = int(np.flatnonzero(bad)[0])
             raise MapDataError(
-                f"the box {tuple(boxes[first].tolist())} is no rectangle",
+                f"the box {tuple(boxes[first].tolist())} is not a rectangle",
                 path=self.id(first),
                 cause="bad_box",
             )

@@ -141,7 +141,7 @@ def _list_directory(
                 problem = f"cannot be read ({error.strerror})"
             else:
                 if not _is_utf8(name):
-                    problem = "the name is no UTF-8"
+                    problem = "the name is not UTF-8"
                 elif is_directory:
                     inner.append(entry.path)
                     continue

@@ -161,7 +161,7 @@ def _joined(
                 path=metadata,
                 cause="missing_files",
             )
-        problems.append(f"{metadata}: entries without a file, not served: {listed}")
+        problems.append(f"{metadata}: entries whose file is missing, not served: {listed}")
     names = files.names[has_entry]
     if not has_entry.all():
         listed = list_some([os.fsdecode(name) for name in files.names[~has_entry].tolist()])

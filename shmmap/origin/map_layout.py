@@ -61,7 +61,7 @@ def absolute_path(path: str | os.PathLike[str]) -> str:
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise MapDataError("the path is no UTF-8", path=ascii(text), cause="bad_path") from error
+        raise MapDataError("the path is not UTF-8", path=ascii(text), cause="bad_path") from error
     # "link/.." is where the link leads, not where it lies
     misled = os.path.exists(path) and not (os.path.exists(text) and os.path.samefile(path, text))
     return os.path.realpath(path) if misled else text

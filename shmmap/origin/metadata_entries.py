@@ -101,7 +101,7 @@ class EntryCollector:
         if corner_x is None or corner_y is None:
             return False
         if not (_INTEGER.fullmatch(x) and _INTEGER.fullmatch(y)):
-            self.report("corner is no integer, Autoware's loader refuses it", key)
+            self.report("corner is not an integer: Autoware's loader refuses it", key)
         self._names.append(key)
         self._corners.append((corner_x, corner_y))
         if len(self._names) >= _FLUSH_ENTRIES:

@@ -77,7 +77,7 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
             if isinstance(event, yaml.CollectionStartEvent):
                 is_mapping = isinstance(event, yaml.MappingStartEvent)
                 if (depth == 0) != is_mapping and depth == 0:
-                    raise refuse("the file is no mapping", event.start_mark, "bad_yaml")
+                    raise refuse("the file is not a YAML mapping", event.start_mark, "bad_yaml")
                 if depth == 1 and key is None:
                     raise refuse("a key must be a name", event.start_mark, "bad_yaml")
                 if depth >= _MAX_DEPTH:
@@ -88,7 +88,7 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
                 depth -= 1
             elif isinstance(event, yaml.ScalarEvent):
                 if depth == 0:
-                    raise refuse("the file is no mapping", event.start_mark, "bad_yaml")
+                    raise refuse("the file is not a YAML mapping", event.start_mark, "bad_yaml")
                 if depth == 1 and key is None:
                     key, value, nested = event.value, [], False
                     continue
@@ -115,10 +115,10 @@ def _take(entries: EntryCollector, key: str, value: list[str] | str | None, refu
             return
         if key in ("x_resolution", "y_resolution"):
             raise refuse(f"{key} must be a positive number of metres, not {value!r}", mark, "no_resolution")
-        raise refuse(f"{key} is no [x, y] corner", mark, "unknown_key")
+        raise refuse(f"{key} is not an [x, y] corner", mark, "unknown_key")
     if value is None:
         if entries.strict:
-            raise refuse(f"{key} is no [x, y] corner", mark, "unknown_key")
+            raise refuse(f"{key} is not an [x, y] corner", mark, "unknown_key")
         entries.report("unknown key ignored", name)
         return
     if len(value) < 2:

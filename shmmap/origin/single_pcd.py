@@ -8,6 +8,7 @@ import os
 import numpy as np
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.formats.degrees import degrees_warning
 from shmmap.formats.pcd_reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.stamp import Stamp
@@ -57,7 +58,8 @@ def load_single_pcd(path: str) -> Catalogue:
     if not np.isfinite(lower).all():
         raise MapDataError("no finite point, so the map has no extent", path=path, cause="no_points")
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
-    return Catalogue.from_cells([(path, box, Stamp.of(status))])
+    problems = [f"{path}: {warning}"] if (warning := degrees_warning(lower, upper)) else []
+    return Catalogue.from_cells([(path, box, Stamp.of(status))], problems=problems)
 
 
 def _refuse_large(path: str, what: str, size: int, limit: int) -> None:

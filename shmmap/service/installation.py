@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from shmmap.errors import CannotWrite, MapMissing
-from shmmap.service.program import daemon_command, hidden_directories, is_hidden, quoted
+from shmmap.service.program import check_readable, daemon_command, hidden_directories, is_hidden, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
 
 __all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_text", "write"]
@@ -52,9 +52,9 @@ class PlannedFile:
         return "same" if old == self.text else "changed"
 
 
-def unit_text(name: str) -> str:
-    """Return a shipped unit with the program of this installation in it."""
-    return shipped_text(name).replace(SHIPPED_PROGRAM, daemon_command())
+def unit_text(name: str, root: str = "/") -> str:
+    """Return a shipped unit with the program of this installation in it, as ``root`` will see it."""
+    return shipped_text(name).replace(SHIPPED_PROGRAM, daemon_command(root))
 
 
 def configuration(map_path: str = "", *, group: bool = True) -> str:
@@ -98,18 +98,21 @@ def plan_system(map_path: str = "", root: str = "/") -> list[PlannedFile]:
     ------
     MapMissing
         There is nothing at ``map_path``.
+    ConfigError
+        The service's account could not read this program.
     """
     map_path = _map_path(map_path)
+    check_readable()
     etc = Path(root) / "etc"
     units = etc / "systemd" / "system"
     planned = [
-        PlannedFile(units / Path(name).name, unit_text(name))
+        PlannedFile(units / Path(name).name, unit_text(name, root))
         for name in shipped_names()
         if name.startswith("system/") and not name.endswith(".mount")
     ]
     why = "This Python lies where ProtectHome= or PrivateTmp= would hide it."
     for service in ("shmmapd.service", "shmmapd@.service"):
-        planned += _drop_in(units / f"{service}.d" / "10-program.conf", hidden_directories(), why)
+        planned += _drop_in(units / f"{service}.d" / "10-program.conf", hidden_directories(root=root), why)
     if map_path:
         shown = [map_path] if is_hidden(map_path) else []
         why = "The map lies where ProtectHome= or PrivateTmp= would hide it."

@@ -55,7 +55,7 @@ def test_areas_and_ids(shmmap: Shmmap, divided_map: DividedMap) -> None:
     assert names("--circle=-5,3,25") == divided_map.in_circle(-5, 3, 25)
     assert names("--square", "-5,3,25") == divided_map.in_square(-5, 3, 25)
     assert names("--box", "-1,-1,1,1") == ["-20_-20.pcd", "-20_0.pcd", "0_-20.pcd", "0_0.pcd"]
-    assert names("--box", "-1,-1,1,1", "--z", "100,200") == []
+    assert names("--box", "-1,-1,1,1", "--z", "100,200", code=1) == []
     assert names("--id", "0_0.pcd", divided_map.id("20_0.pcd"), "0_0.pcd") == [
         "0_0.pcd",
         "20_0.pcd",
@@ -94,7 +94,7 @@ def test_query_names_what_failed(shmmap: Shmmap, divided_map: DividedMap) -> Non
     found = shmmap.json("query", "--id", "0_0.pcd", "20_0.pcd", code=1)
     assert [Path(cell["id"]).name for cell in found["cells"]] == ["20_0.pcd"]
     (failed,) = found["failed"]
-    assert sorted(failed) == ["code", "holders", "id", "layer", "message"]
+    assert sorted(failed) == ["code", "holder_rows", "holders", "id", "layer", "message"]
     assert (failed["id"], failed["code"]) == (divided_map.id("0_0.pcd"), "load_failed")
     text = shmmap("query", "--id", "0_0.pcd", code=1)
     assert "load_failed" in text
@@ -220,7 +220,8 @@ def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     assert "--force" in done.stderr
     assert target.read_bytes() == b"precious"
     shmmap("export", "--id", "nowhere.pcd", "0_0.pcd", "-o", "other.pcd", code=1)
-    shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", code=2)
+    shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", code=1)
+    shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", "--allow-empty")
     shmmap("export", "--id", "0_0.pcd", "-o", "other.xyz", code=2)
     shmmap("export", "--id", "0_0.pcd", "-o", "out.pcd/beneath.pcd", code=73)
     (divided_map.pcd_dir / "20_0.pcd").write_bytes(b"broken")
@@ -251,13 +252,14 @@ def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:
         (["inspect", "missing.pcd"], 66),
         (["inspect", "missing"], 66),
         (["inspect", "broken.pcd"], 65),
-        (["inspect", "."], 65),
+        (["inspect", "empty"], 66),
         (["prepare", "missing", "--layer", "ndt"], 66),
         (["prepare", "broken.pcd", "--layer", "ndt"], 2),
     ],
 )
 def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path) -> None:
     (tmp_path / "broken.pcd").write_bytes(b"\0" * 100)
+    (tmp_path / "empty").mkdir()
     environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")} | {
         "PYTHONPATH": str(ROOT),
         "XDG_RUNTIME_DIR": str(tmp_path),

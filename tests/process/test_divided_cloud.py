@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -13,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shmmap.dividing.divide import divide
 from tests.process.conftest import DaemonFactory
-from tests.support.clouds import Columns, expected_rows, rows_of, xyzircaedt
+from tests.support.clouds import Columns, rows_of, xyzircaedt
 from tests.support.daemon_process import DaemonProcess, wait_ended
 from tests.support.las_files import write_las
 from tests.support.patience import LIMIT_S
@@ -26,11 +28,12 @@ Connect = Callable[..., RawClient]
 FAR = (512000.0, 5403000.0, 300.0)
 
 
-def cloud(path: Path, count: int = 3000, *, seed: int = 0) -> Columns:
+def cloud(path: Path, count: int = 3000, *, seed: int = 0, stretch: float = 0.0) -> Columns:
     """Write a LAZ file far from its frame's origin; returns its points as the file has them."""
     columns = xyzircaedt(count, seed=seed)
     for axis, shift in zip("xyz", FAR, strict=True):
         columns[axis] = columns[axis].astype(np.float64) + shift
+    columns["x"][0] += stretch
     las = write_las(path, columns, offset=FAR)
     for axis in "xyz":
         columns[axis] = np.asarray(getattr(las, axis))
@@ -38,23 +41,34 @@ def cloud(path: Path, count: int = 3000, *, seed: int = 0) -> Columns:
 
 
 def served(client: RawClient) -> list[tuple[float, ...]]:
-    """Every point of the map, read from the cells' files, after all cells were loaded."""
-    reply = client.area(circle(FAR[0], FAR[1], 1000.0))
+    """Every point of the map in the cloud's frame, read from the cells' files after all were loaded."""
+    reply = client.area(circle(0.0, 0.0, 4000.0))
     assert (reply.pending, reply.failed) == ([], [])
     rows = []
+    origin = frame(Path(reply.cells[0].id))
     for cell in reply.cells:
         columns = read_pcd(Path(cell.id))
         assert len(columns["x"]) == cell.points
         box = cell.box
         assert ((columns["x"] >= box[0]) & (columns["x"] < box[2])).all()
         assert ((columns["y"] >= box[1]) & (columns["y"] < box[3])).all()
-        names = ("x", "y", "z", "time_stamp")
-        rows += rows_of({name: columns[name] for name in names})
+        assert columns["x"].dtype == np.float32
+        for axis, there in zip("xyz", origin, strict=True):
+            columns[axis] = columns[axis].astype(np.float64) + there
+        rows += points(columns)
     return sorted(rows, key=lambda row: row[-1])
 
 
 def points(columns: Columns) -> list[tuple[float, ...]]:
-    return rows_of({name: columns[name] for name in ("x", "y", "z", "time_stamp")})
+    """Coordinates to the millimetre that LAS files have, and what tells the points apart."""
+    rounded = {axis: np.round(columns[axis], 3) for axis in "xyz"}
+    return rows_of({**rounded, "time_stamp": columns["time_stamp"]})
+
+
+def frame(cell: Path) -> list[float]:
+    """Where the origin of the map of this cell lies in the frame of the cloud."""
+    origin: list[float] = json.loads((cell.parent.parent / "shmmap_divide.json").read_text())["origin"]
+    return origin
 
 
 def divisions(one: DaemonProcess) -> int:
@@ -62,7 +76,7 @@ def divisions(one: DaemonProcess) -> int:
     return len(re.findall(r"dividing cloud=\S+ into=", one.log))
 
 
-def test_a_cloud_is_divided_once_in_its_own_frame(
+def test_a_cloud_is_divided_once_and_as_divide_does_it(
     daemon: DaemonFactory, connect: Connect, tmp_path: Path
 ) -> None:
     columns = cloud(tmp_path / "town.laz")
@@ -70,9 +84,13 @@ def test_a_cloud_is_divided_once_in_its_own_frame(
     assert served(connect(one)) == points(columns)
     assert one.stop() == 0
     one.start()
-    reply = connect(one).area(circle(FAR[0], FAR[1], 1000.0))
-    assert len(reply.cells) == len(expected_rows(rows_of(columns)))
+    reply = connect(one).area(circle(0.0, 0.0, 4000.0))
     assert divisions(one) == 1
+    made = divide([tmp_path / "town.laz"], tmp_path / "map")
+    assert list(made.origin) == frame(Path(reply.cells[0].id))
+    ours = {path.name: path.read_bytes() for path in (tmp_path / "map" / "pointcloud_map.pcd").iterdir()}
+    assert {Path(cell.id).name: Path(cell.id).read_bytes() for cell in reply.cells} == ours
+    assert "moved by (" in one.log
 
 
 def test_a_changed_cloud_is_divided_again(daemon: DaemonFactory, connect: Connect, tmp_path: Path) -> None:
@@ -86,6 +104,13 @@ def test_a_changed_cloud_is_divided_again(daemon: DaemonFactory, connect: Connec
         client.ask("reload")
         assert served(client) == points(columns)
     assert divisions(one) == 3
+    # a survey that goes farther east moves no cell that was there before
+    before = frame(cells_of(one))
+    columns = cloud(tmp_path / "new.laz", 2000, seed=3, stretch=900.0)
+    (tmp_path / "new.laz").rename(tmp_path / "town.laz")
+    client.ask("reload")
+    assert served(client) == points(columns)
+    assert frame(cells_of(one)) == before
     kept = [path.name for path in cache_of(one).iterdir() if not path.name.startswith(".")]
     assert len(kept) == 2  # the map, and the link to it
     (tmp_path / "town.laz").write_bytes(b"LASF, but no more")
@@ -142,6 +167,11 @@ def test_a_cloud_that_cannot_be_read(
     one = daemon(tmp_path / name, start=False)
     assert one.run_to_end() == code
     assert name in one.log
+
+
+def cells_of(one: DaemonProcess) -> Path:
+    """One of the cells in service."""
+    return next((cache_of(one) / "map" / "pointcloud_map.pcd").iterdir())
 
 
 def cache_of(one: DaemonProcess) -> Path:

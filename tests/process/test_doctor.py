@@ -39,7 +39,17 @@ def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) ->
     one = daemon(divided_map.root)
     code, found = doctor(one)
     assert code == 0, found
-    well = ("daemon", "socket", "map", "shared memory", "pins", "descriptors", "leftovers", "reload")
+    well = (
+        "daemon",
+        "socket",
+        "map",
+        "shared memory",
+        "cache size",
+        "leases",
+        "open files",
+        "leftovers",
+        "reload",
+    )
     assert {name: found[name]["state"] for name in well} == dict.fromkeys(well, "ok")
     assert f"pid {one.pid}" in found["daemon"]["fact"]
     assert "answers" in found["socket"]["fact"]

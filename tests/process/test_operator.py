@@ -87,7 +87,7 @@ def test_six_questions(tight: Shmmap) -> None:
         told = tight("tail")
         assert re.search(r"^\d\d:\d\d:\d\d\.\d{3}  joined    localization, pid ", told, re.MULTILINE)
         assert re.search(r"loaded    0_0\.pcd points ", told)
-        assert re.search(r"pressure  [\d,]+ cells refused, .* of 1\.0 MiB used, .* mapped by clients", told)
+        assert re.search(r"pressure  [\d,]+ cells refused, .* of 1\.0 MiB used, .* in use by clients", told)
 
         # is the cache too small?
         after(tight, lambda told: told["refused_over_budget_10min"] > 0)
@@ -193,7 +193,7 @@ def test_top_leaves_the_terminal_as_it_was(shmmap: Shmmap, number: signal.Signal
             [sys.executable, "-m", "shmmap.cli", "top", "--interval", "0.05"],
             env=environment, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
         ) as top:  # fmt: skip
-            seen = read_until(ours, b"nobody is connected")
+            seen = read_until(ours, b"no client is connected")
             assert b"\x1b[?1049h" in seen  # the alternate screen
             top.send_signal(number)
             seen = read_until(ours, b"\x1b[?1049l", seen)

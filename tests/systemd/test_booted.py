@@ -309,7 +309,7 @@ def test_the_doctor_tells_each_user_what_is_wrong(fresh: BootedSystemd) -> None:
     assert well["group"].startswith("ok: alice is a member of shmmap")
     assert well["descriptors"].startswith("ok: limit of the daemon")
     stranger = findings("mallory")
-    assert stranger["group"].startswith("fail: mallory is no member of shmmap")
+    assert stranger["group"].startswith("fail: mallory is not a member of shmmap")
     assert "usermod -aG shmmap mallory" in stranger["group"]
     assert stranger["socket"].startswith("fail")
     fresh.run("systemctl", "stop", "shmmapd")

@@ -21,13 +21,14 @@ PACKAGE = Path(shmmap.__file__).parent
 CLIENTS = Path(shmmap_clients.__file__).parent
 TESTS = Path(__file__).parents[1]
 
-BASE = {"errors", "columns", "failpoints", "logfmt", "processes", "geometry"}
+BASE = {"errors", "columns", "failpoints", "logfmt", "processes", "geometry", "quantities"}
 PARTS = {
     # part: what it may import besides itself
     "errors": set[str](),
     "columns": set[str](),
     "failpoints": set[str](),
     "logfmt": set[str](),
+    "quantities": set[str](),
     "processes": set[str](),
     "geometry": {"errors"},
     "formats": {"errors", "columns", "geometry", "logfmt"},

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.screens.output import format_bytes, format_duration, printable
 from shmmap.cli.screens.picture import CellSquare, Vehicle, WindowBox, top_view_svg
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ GLYPHS: Final = {
     # state: glyph, style on a terminal
     "resident": ("#", "green"),
     "stale": ("s", "yellow"),
-    "zombie": ("z", "magenta"),
+    "zombie": ("r", "magenta"),
     "disk": (".", "bright_black"),
     "window": ("o", "red"),
     "client": ("@", "bold red"),
@@ -52,6 +52,8 @@ class Scene:
         CLOCK_MONOTONIC of ``rows`` and ``clients``.
     title, note
         Two lines.
+    empty
+        There is nothing to draw, not even on disk.
     """
 
     bounds: BoxTuple
@@ -61,6 +63,7 @@ class Scene:
     now_ns: int
     title: str
     note: str
+    empty: bool = False
 
     def by_cell(self) -> dict[str, list[CellRow]]:
         """Segments of each cell, the most telling state last."""
@@ -162,8 +165,9 @@ def _cell_title(rows: Sequence[CellRow], now_ns: int) -> str:
     lines = [rows[-1].id]
     for row in rows:
         idle_s = max(now_ns - row.last_use_monotonic_ns, 0) * 1e-9
+        state = "retired" if row.state == "zombie" else row.state
         lines.append(
-            f"{row.layer}: {row.state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
+            f"{row.layer}: {state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
             f" used {format_duration(idle_s)} ago, loaded in {format_duration(row.load_ns * 1e-9)}"
         )
     return "\n".join(lines)
@@ -187,21 +191,25 @@ _STYLE: Final = """
 """
 
 
+def _html(text: str) -> str:
+    return escape(printable(text))
+
+
 def html_page(scene: Scene) -> str:
     """Return a page that needs nothing else: the picture, its tooltips, and the clients as a table."""
     rows = "".join(
-        f"<tr><td>{escape(c.client or c.command or '?')}</td><td>{c.pid or '?'}</td><td>{c.cells:,}</td>"
+        f"<tr><td>{_html(c.client or c.command or '?')}</td><td>{c.pid or '?'}</td><td>{c.cells:,}</td>"
         f"<td>{format_bytes(c.bytes)}</td><td>{c.requests:,}</td>"
         f"<td>{f'{c.pose[0]:.1f}, {c.pose[1]:.1f}' if c.pose is not None else ''}</td></tr>"
         for c in scene.clients
     )
     table = (
-        "<table><tr><th>client</th><th>pid</th><th>cells</th><th>holds</th><th>requests</th><th>at</th></tr>"
+        "<table><tr><th>client</th><th>pid</th><th>cells</th><th>given</th><th>requests</th><th>at</th></tr>"
         f"{rows}</table>"
         if rows
-        else "<p>Nobody is connected.</p>"
+        else "<p>No client is connected.</p>"
     )
     return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(scene.title)}</title>'
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_html(scene.title)}</title>'
         f"<style>{_STYLE}</style></head>\n<body>\n{svg(scene)}{table}\n</body></html>\n"
     )

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How verbs print: aligned text, a table on a terminal, or JSON."""
+"""How verbs print: lines, aligned text, a table on a terminal, or JSON.
+
+Everything a verb prints leaves through here.  Names of clients, processes, files and cells were chosen by
+others: a name may hold the codes that move a terminal's cursor or rename its window.  So whatever cannot be
+printed is shown escaped (``\\x1b``), in this one place.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +16,24 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, TextIO
+
+from shmmap.quantities import counted, format_bytes, format_duration, format_metres
 
 __all__ = [
     "Column",
     "columns_that_fit",
+    "counted",
     "format_bytes",
     "format_duration",
+    "format_metres",
+    "json_text",
+    "print_hanging",
     "print_json",
+    "print_line",
     "print_pairs",
     "print_table",
+    "printable",
     "wants_style",
 ]
 
@@ -39,15 +52,43 @@ class Column:
     spare: int = 0
 
 
+def printable(text: str) -> str:
+    """Return ``text`` with everything that no terminal should be sent written as Python writes it.
+
+    That is control and format characters, line breaks, and the bytes of a file's name that are no text.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode("ascii")
+        for one in text
+    )
+
+
+def print_line(text: str = "", *, file: TextIO | None = None, flush: bool = False) -> None:
+    """Print one line."""
+    print(printable(text), file=file, flush=flush)
+
+
+def json_text(value: object, *, indent: int | None = None) -> str:
+    """Return one JSON document whose strings hold nothing that a terminal obeys."""
+    text = json.dumps(value, indent=indent, allow_nan=False, ensure_ascii=False)
+    if text.replace("\n", "").isprintable():
+        return text
+    # outside its strings JSON has no other such character than the line break
+    return "".join(
+        one if one == "\n" or one.isprintable() else json.dumps(one, ensure_ascii=True)[1:-1] for one in text
+    )
+
+
 def print_json(value: object) -> None:
     """Print one JSON document; a number JSON cannot hold (NaN, infinity) is a defect."""
-    indent = 2 if sys.stdout.isatty() else None
-    json.dump(value, sys.stdout, indent=indent, allow_nan=False, ensure_ascii=False)
-    sys.stdout.write("\n")
+    sys.stdout.write(json_text(value, indent=2 if sys.stdout.isatty() else None) + "\n")
 
 
 def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under headings: ruled and coloured on a terminal, plain and aligned in a pipe."""
+    rows = [[printable(text) for text in row] for row in rows]
     if wants_style() and importlib.util.find_spec("rich") is not None:  # a client-only install lacks it
         _print_rich(columns, rows)
         return
@@ -83,7 +124,8 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         table.add_row(*(Text(row[index]) for index in shown))
     console.print(table)
     if missing := [column.name for index, column in enumerate(columns) if index not in shown]:
-        console.print(Text(f"no room for {', '.join(missing)}", style="bright_black"))
+        hidden = Text(f"hidden (narrow terminal): {', '.join(missing)}", style="bright_black")
+        console.print(hidden, soft_wrap=True)
 
 
 def columns_that_fit(
@@ -102,36 +144,15 @@ def columns_that_fit(
 def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
     """Print ``name  value`` lines with the values aligned; on a terminal long ones go on below themselves."""
     width = max((len(name) for name, _ in pairs), default=0)
-    room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
     for name, value in pairs:
-        lines = [value]
-        if len(value) > room >= _NARROWEST:
-            lines = textwrap.wrap(value, room, break_long_words=False, break_on_hyphens=False)
-        for number, line in enumerate(lines):
-            print(f"{'' if number else name:{width}}  {line}".rstrip())
+        print_hanging(f"{name:{width}}  ", value)
 
 
-def format_bytes(count: float) -> str:
-    """Return bytes for a reader, ``"4.1 KiB"`` or ``"103 MiB"``; powers of 1024, as ``--budget``."""
-    value = float(count)
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if abs(value) < 1023.5 or unit == "GiB":
-            break
-        value /= 1024.0
-    digits = 0 if unit == "B" or abs(value) >= 99.95 else 1
-    return f"{value:.{digits}f} {unit}"
-
-
-def format_duration(duration_s: float) -> str:
-    """Return a time span for a reader: ``"12 us"``, ``"3.4 ms"``, ``"5.0 s"``, ``"3 min"``, ``"2 h"``."""
-    if duration_s < 0.9995e-3:
-        return f"{duration_s * 1e6:.0f} us"
-    if duration_s < 0.9995:
-        return f"{duration_s * 1e3:.1f} ms"
-    if duration_s < 119.5:
-        return f"{duration_s:.1f} s"
-    if duration_s < 7170:
-        return f"{duration_s / 60:.0f} min"
-    if duration_s < 2 * 86400:
-        return f"{duration_s / 3600:.0f} h"
-    return f"{duration_s / 86400:.0f} d"
+def print_hanging(head: str, text: str) -> None:
+    """Print ``head`` and ``text`` as a line; on a terminal too narrow for it the text goes on below."""
+    head, lines = printable(head), [printable(text)]
+    room = shutil.get_terminal_size().columns - len(head) if sys.stdout.isatty() else 0
+    if len(lines[0]) > room >= _NARROWEST:
+        lines = textwrap.wrap(lines[0], room, break_long_words=False, break_on_hyphens=False)
+    for number, line in enumerate(lines):
+        print(f"{' ' * len(head) if number else head}{line}".rstrip())

@@ -11,7 +11,9 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
-from xml.sax.saxutils import escape
+from xml.sax import saxutils
+
+from shmmap.cli.screens.output import printable
 
 __all__ = ["CellSquare", "Raster", "Vehicle", "WindowBox", "top_view_svg"]
 
@@ -76,6 +78,11 @@ class WindowBox:
 
     box: BoxTuple
     title: str = ""
+
+
+def escape(text: str) -> str:
+    """Return text for XML, which cannot hold control characters at all: line breaks stay."""
+    return saxutils.escape("\n".join(map(printable, text.split("\n"))))
 
 
 class _Page:

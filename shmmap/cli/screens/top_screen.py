@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from shmmap.cli.screens.cache_verdict import cache_verdict
-from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
+from shmmap.doctor.cache_size import cache_verdict
 
 if TYPE_CHECKING:
     from shmmap.statistics.client_rows import ClientRow
@@ -21,6 +21,8 @@ __all__ = ["Line", "budget_parts", "screen"]
 Line: TypeAlias = list[tuple[str, str]]  # (text, style) pieces
 
 LABEL: Final = 12
+_WIDE: Final = 100  # columns from which there is room for everything about a client
+_SHORTEST_NAME: Final = 14
 SPAN_TITLES: Final = (("10s", "10 s"), ("1min", "1 min"), ("10min", "10 min"))
 _STATE_STYLES: Final = {
     "healthy": "bold green",
@@ -29,17 +31,17 @@ _STATE_STYLES: Final = {
     "dead": "bold red",
 }
 _PARTS: Final = (
-    # name, glyph, style
-    ("pinned", "█", "cyan"),
-    ("idle", "▓", "green"),
-    ("zombie", "▒", "yellow"),
-    ("reserved", "░", "magenta"),
-    ("free", "·", "bright_black"),
+    # part, what it is called, glyph, style
+    ("pinned", "in use", "█", "cyan"),
+    ("idle", "idle", "▓", "green"),
+    ("zombie", "retired", "▒", "yellow"),
+    ("reserved", "reserved", "░", "magenta"),
+    ("free", "free", "·", "bright_black"),
 )
 
 
 def budget_parts(counters: dict[str, int]) -> dict[str, int]:
-    """Split the budget: bytes pinned and idle (both can be handed out), zombie, reserved, free.
+    """Split the budget: bytes in use and idle (both can be handed out), retired, reserved, free.
 
     Reserved is what loads under way and the statistics themselves take.
     """
@@ -76,18 +78,19 @@ def screen(
         A snapshot of some seconds ago; latencies are of the time since, without it since the start.
     """
     counters = found.counters
-    lines = [_title(found, identity), _labelled("map", [(_map(identity, counters), "")]), []]
+    lines = [_title(found, identity), *_flowing("map", _map(identity, counters), width, gap=1), []]
     lines += _budget(counters, width)
     lines.append([])
-    lines.append(_labelled("hits", _hits(counters)))
+    lines += _flowing("hits", _hits(counters), width)
     verdict = cache_verdict(counters)
-    cache = ("too small", "bold red") if verdict.too_small else ("large enough", "green")
-    lines.append(_labelled("cache", [cache, (f": {verdict.why}", "")]))
+    cache = ("TOO SMALL:", "bold red") if verdict.too_small else ("large enough:", "green")
+    words: list[Line] = [[cache], *([(word, "")] for word in verdict.why.split())]
+    lines += _flowing("cache", words, width, gap=1)
     if verdict.hint:
-        lines.append(_labelled("", [(verdict.hint, "")]))
+        lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
     lines += _latencies(found, earlier)
-    lines.append(_labelled("loads", _loads(counters)))
-    lines.append(_labelled("pressure", _pressure(counters)))
+    lines += _flowing("loads", _loads(counters), width)
+    lines += _flowing("pressure", _pressure(counters), width)
     lines.append([])
     lines += _clients(found.clients, counters["sessions"], found.beat_monotonic_ns, width, max_clients)
     return lines
@@ -97,13 +100,30 @@ def _labelled(label: str, pieces: Line) -> Line:
     return [(label.ljust(LABEL), "bold"), *pieces]
 
 
+def _flowing(label: str, units: Sequence[Line], width: int, *, gap: int = 3) -> list[Line]:
+    """Put units side by side behind a label, and go on below the first where the line is full."""
+    lines: list[Line] = [_labelled(label, [])]
+    used = LABEL
+    for unit in units:
+        length = sum(len(text) for text, _ in unit)
+        if used > LABEL and used + gap + length > width:
+            lines.append(_labelled("", []))
+            used = LABEL
+        if used > LABEL:
+            lines[-1].append((" " * gap, ""))
+            used += gap
+        lines[-1] += unit
+        used += length
+    return lines
+
+
 def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
     uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
     told = {
         "healthy": f"  up {format_duration(uptime_s)}",
-        "stopped": f"  not beating for {format_duration(found.beat_age_s)}: `kill -CONT {identity.pid}`",
-        "hung": f"  not beating for {format_duration(found.beat_age_s)}",
-        "dead": "  ended without cleaning up; these are its last words",
+        "stopped": f"  no heartbeat for {format_duration(found.beat_age_s)}: `kill -CONT {identity.pid}`",
+        "hung": f"  no heartbeat for {format_duration(found.beat_age_s)}",
+        "dead": "  crashed or was killed; these are its last figures",
     }.get(found.state, "")
     return [
         ("shmmap ", "bold"),
@@ -117,11 +137,12 @@ def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
     ]
 
 
-def _map(identity: DaemonIdentity, counters: dict[str, int]) -> str:
+def _map(identity: DaemonIdentity, counters: dict[str, int]) -> list[Line]:
     read_s = max(time.time() - counters.get("last_reload_unix_ns", 0) * 1e-9, 0.0)
     failed = ", LAST RELOAD FAILED" if counters.get("last_reload_failed") else ""
-    cells = f"{counters['map_cells']:,} cells"
-    return f"{identity.map_path}, {cells}, read {format_duration(read_s)} ago{failed}"
+    cells = counted(counters["map_cells"], "cell")
+    read = f"read {format_duration(read_s)} ago{failed}"
+    return [[(f"{identity.map_path},", "")], [(f"{cells},", "")], [(read, "")]]
 
 
 def _budget(counters: dict[str, int], width: int) -> list[Line]:
@@ -130,28 +151,29 @@ def _budget(counters: dict[str, int], width: int) -> list[Line]:
     room = max(width - LABEL - 2, 20)
     bar: Line = []
     used = 0
-    for index, (name, glyph, style) in enumerate(_PARTS):
+    for index, (name, _, glyph, style) in enumerate(_PARTS):
         cells = room - used if index == len(_PARTS) - 1 else round(room * parts[name] / total)
         if parts[name] and not cells:
             cells = 1  # what there is can be seen
         cells = min(cells, room - used)
         used += cells
         bar.append((glyph * cells, style))
-    legend: Line = []
-    for name, glyph, style in _PARTS:
-        legend += [(glyph, style), (f" {name} {format_bytes(parts[name])}   ", "")]
+    legend: list[Line] = [
+        [(glyph, style), (f" {title} {format_bytes(parts[name])}", "")]
+        for name, title, glyph, style in _PARTS
+    ]
     budget = format_bytes(counters["budget_bytes"])
-    return [_labelled("budget", [(budget, "")]), [(" " * LABEL, ""), *bar], [(" " * LABEL, ""), *legend]]
+    return [_labelled("budget", [(budget, "")]), [(" " * LABEL, ""), *bar], *_flowing("", legend, width)]
 
 
-def _hits(counters: dict[str, int]) -> Line:
-    pieces: Line = []
+def _hits(counters: dict[str, int]) -> list[Line]:
+    pieces: list[Line] = []
     for suffix, title in SPAN_TITLES:
         hits, misses = counters.get(f"hits_{suffix}", 0), counters.get(f"misses_{suffix}", 0)
         ratio = f"{100 * hits / (hits + misses):.1f} %" if hits + misses else "–"
-        pieces.append((f"{title}: {ratio}   ", ""))
+        pieces.append([(f"{title}: {ratio}", "")])
     total = counters["hits"] + counters["misses"]
-    pieces.append((f"of {total:,} cells asked for since the start", "bright_black"))
+    pieces.append([(f"of {counted(total, 'cell')} asked for since the start", "bright_black")])
     return pieces
 
 
@@ -179,48 +201,55 @@ def _quantiles(histogram: Histogram) -> str:
     return f"p50 {format_duration(median)}   p99 {format_duration(slow)}   {histogram.total:,} "
 
 
-def _loads(counters: dict[str, int]) -> Line:
-    pieces: Line = [
-        (f"queue {counters['load_queue']:,}   ", ""),
-        (f"waiting requests {counters['waiting_requests']:,}   ", ""),
-        (f"workers {counters['workers']:,}   done {counters['loads_finished']:,}   ", ""),
+def _loads(counters: dict[str, int]) -> list[Line]:
+    pieces: list[Line] = [
+        [(f"queue {counters['load_queue']:,}", "")],
+        [(f"waiting requests {counters['waiting_requests']:,}", "")],
+        [(f"loaders {counters['workers']:,}", "")],
+        [(f"done {counters['loads_finished']:,}", "")],
     ]
     troubles = {"loads_failed": "failed", "loads_timed_out": "timed out", "worker_crashes": "crashed"}
-    for name, title in troubles.items():
-        if counters[name]:
-            pieces.append((f"{title} {counters[name]:,}   ", "red"))
-    return pieces
+    return pieces + [
+        [(f"{title} {counters[name]:,}", "red")] for name, title in troubles.items() if counters[name]
+    ]
 
 
-def _pressure(counters: dict[str, int]) -> Line:
+def _pressure(counters: dict[str, int]) -> list[Line]:
+    refused = f"refused: budget {counters['refused_over_budget']:,}, quota {counters['refused_quota']:,}"
     return [
-        (f"evictions {counters['evictions']:,} ({counters.get('evictions_1min', 0):,} in 1 min)   ", ""),
-        (
-            f"refused: budget {counters['refused_over_budget']:,}, quota {counters['refused_quota']:,}   ",
-            "red" if counters.get("refused_over_budget_1min") else "",
-        ),
-        (f"zombies {counters['zombies']:,}   stale {counters['stale_cells']:,}", ""),
+        [(f"evictions {counters['evictions']:,} ({counters.get('evictions_1min', 0):,} in 1 min)", "")],
+        [(refused, "red" if counters.get("refused_over_budget_1min") else "")],
+        [(f"retired {counters['zombies']:,}", "")],
+        [(f"stale {counters['stale_cells']:,}", "")],
     ]
 
 
 def _clients(
     clients: Sequence[ClientRow], sessions: int, now_ns: int, width: int, max_clients: int
 ) -> list[Line]:
-    head = f"{'CLIENT':20} {'PID':>8} {'UID':>6} {'CELLS':>6} {'HOLDS':>9} {'REQUESTS':>9} {'IDLE':>8}  AT"
-    lines: list[Line] = [[(head[:width], "bold")]]
     ranked = sorted(clients, key=lambda client: -client.bytes)
-    for client in ranked[:max_clients]:
+    shown = ranked[:max_clients]
+    names = [printable(client.client or client.command or "–") for client in shown]
+    with_uid = width >= _WIDE
+    rest = f" {'PID':>8}{' UID':>7} {'CELLS':>6}" if with_uid else f" {'PID':>8} {'CELLS':>6}"
+    rest += f" {'GIVEN':>9} {'REQUESTS':>9} {'IDLE':>8}  AT"
+    places = [f"{one.pose[0]:.1f},{one.pose[1]:.1f}" if one.pose is not None else "–" for one in shown]
+    # the name gets what the numbers leave
+    room = width - len(rest) - max(map(len, places), default=0) + len("AT")
+    column = max(_SHORTEST_NAME, min(max(map(len, names), default=0), room))
+    lines: list[Line] = [[(f"{'CLIENT':{column}}{rest}"[:width], "bold")]]
+    for client, name, at in zip(shown, names, places, strict=True):
         idle_s = max(now_ns - client.last_request_monotonic_ns, 0) * 1e-9
-        at = f"{client.pose[0]:.1f},{client.pose[1]:.1f}" if client.pose is not None else "–"
-        name = client.client or client.command or "–"
+        called = name if len(name) <= column else f"{name[: column - 1]}…"
+        uid = f" {client.uid:>6}" if with_uid else ""
         row = (
-            f"{name[:20]:20} {client.pid or '?':>8} {client.uid:>6} {client.cells:>6,}"
+            f"{called:{column}} {client.pid or '?':>8}{uid} {client.cells:>6,}"
             f" {format_bytes(client.bytes):>9} {client.requests:>9,} {format_duration(idle_s):>8}  {at}"
         )
         lines.append([(row[:width], "")])
-    more = sessions - min(len(ranked), max_clients)
+    more = sessions - len(shown)
     if more > 0:
         lines.append([(f"and {more:,} more", "bright_black")])
     if not sessions:
-        lines.append([("nobody is connected", "bright_black")])
+        lines.append([("no client is connected", "bright_black")])
     return lines

@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap clients``: who is connected, and what each holds."""
+"""``shmmap clients``: who is connected, and how much memory each uses."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.accounts import user_name
-from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_json, print_table
+from shmmap.cli.screens.output import (
+    Column,
+    format_bytes,
+    format_duration,
+    print_json,
+    print_line,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from shmmap.protocol.messages import SessionRow
@@ -17,10 +25,10 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"clients": [{"session": hex, "pid": as the kernel says, 0 where it does not, "uid", "user", "gid",
-                "client", "command", "cells": handed to it and not given back, "bytes": theirs, "requests",
-                "idle_s", "pose": [x, y] or null, "mapped_bytes": what it maps by the kernel's word,
-                "superseded": segments among those that nobody new gets, "superseded_bytes"}],
-   "unknown_holders": segments mapped by nobody known, "unknown_bytes"}
+                "client", "command", "cells": given to it and not returned, "bytes": theirs, "requests",
+                "idle_s", "pose": [x, y] or null, "mapped_bytes": mapped now, according to the kernel,
+                "superseded": segments among those that were replaced or evicted, "superseded_bytes"}],
+   "unknown_holders": segments mapped by unidentified processes, "unknown_bytes"}
 The list includes this program itself."""
 
 _COLUMNS = (
@@ -28,14 +36,20 @@ _COLUMNS = (
     Column("PID", "right"),
     Column("USER", spare=2),
     Column("CELLS", "right"),
-    Column("HANDED", "right"),
-    Column("MAPS", "right"),
-    Column("OLD", "right", spare=1),
+    Column("GIVEN", "right"),
+    Column("MAPPED", "right"),
+    Column("RETIRED", "right", spare=1),
     Column("REQUESTS", "right", spare=4),
     Column("IDLE", "right", spare=5),
     Column("AT", spare=3),
     Column("COMMAND", spare=6),
 )
+
+
+_LEGEND = """\
+CELLS, GIVEN: cells it was given and has not returned, and their memory
+MAPPED: mapped now, according to the kernel
+RETIRED: the part of MAPPED that was replaced or evicted; freed when it lets go"""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -44,10 +58,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "clients",
         run,
-        help="who is connected and holds what",
-        description="List the sessions the daemon knows, and memory that nobody known holds.\n"
-        "HANDED is what a client was given and did not say it dropped, MAPS what it has mapped by the\n"
-        "kernel's word, OLD the part of that which was replaced or evicted and goes when it lets go.",
+        help="connected clients, and the memory each uses",
+        description="List connected clients, and memory mapped by unidentified processes.\n" + _LEGEND + "\n"
+        "IDLE: time since its last request.  AT: where it said it is, metres, map frame.",
         json=_JSON,
     )
     add_daemon_options(parser)
@@ -70,9 +83,11 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print_table(_COLUMNS, [_as_text(row) for row in stats.sessions])
     if stats.unknown_holders:
-        print(
-            f"{stats.unknown_holders:,} segments, {format_bytes(stats.unknown_bytes)}: held by nobody known"
-        )
+        unknown = f"{stats.unknown_holders:,} segments, {format_bytes(stats.unknown_bytes)}"
+        print_line(f"{unknown}: mapped by unidentified processes (not through the client library)")
+    if sys.stdout.isatty():
+        for line in _LEGEND.splitlines():
+            print_line(line)
     return 0
 
 

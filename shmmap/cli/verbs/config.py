@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap config``: check settings, say where each comes from, write a file to start with."""
+"""``shmmap config``: check settings, show where each comes from, create a file with all of them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.screens.output import print_json, print_line
 from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapMissing
 
 __all__ = ["add_parser", "run_check", "run_init", "run_show"]
 
 _SHOW_JSON = """\
-  {"file": path or null, "settings": {name: {"value", "origin": FILE:LINE, a variable or "default"}}}"""
+  {"file": path or null, "settings": {name: {"value", "origin": FILE:LINE, a variable or "default"}}}
+Sizes stand there under two names, such as budget (as in the file) and budget_bytes."""
 
 _CHECK_JSON = """\
   {"file": path or null, "good": true}
-Exit code: 0 good, 66 no map there, 78 a mistake; those that the daemon would end with."""
+Exit code: 0 good, 66 no map there, 78 a mistake: the codes that the daemon would exit with."""
 
 _EPILOG = """\
 `check` and `show` read FILE, or the one that the installed service reads, and SHMMAP_* variables."""
@@ -32,8 +33,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "config",
         run_show,
-        help="check, show or start a configuration",
-        description="Look for mistakes in the settings, show them, or write a file with all of them.",
+        help="check, show or create a configuration file",
+        description="Find mistakes in the settings, show their values, or create a file that "
+        "explains them all.",
         epilog=_EPILOG,
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
@@ -41,8 +43,8 @@ def add_parser(subparsers: Subparsers) -> None:
         actions,
         "check",
         run_check,
-        help="look for mistakes",
-        description="Look for mistakes in the settings.",
+        help="find mistakes",
+        description="Find mistakes in the settings that would keep the daemon from starting.",
         json=_CHECK_JSON,
     )
     show = add_verb(
@@ -50,7 +52,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "show",
         run_show,
         help="print every setting",
-        description="Print every setting as it counts.",
+        description="Print every setting with the value in force, under its name in the file.",
         json=_SHOW_JSON,
     )
     show.add_argument("--origin", action="store_true", help="say where each setting comes from")
@@ -63,8 +65,8 @@ def add_parser(subparsers: Subparsers) -> None:
         actions,
         "init",
         run_init,
-        help="write a file that explains every setting",
-        description="Write a file that explains every setting.  Nothing is overwritten.",
+        help="create a file that explains every setting",
+        description="Create a file that explains every setting.  Nothing is overwritten.",
     )
     init.add_argument("file", metavar="FILE", nargs="?", default="shmmap.toml", help="default: shmmap.toml")
     init.add_argument("--map", metavar="DIR", default="", help="the map to serve")
@@ -86,25 +88,26 @@ def run_check(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"file": file or None, "good": True})
     else:
-        print(f"{file or 'no file'}: good")
+        print_line(f"{file or 'no file'}: good")
     return 0
 
 
 def run_show(args: argparse.Namespace) -> int:
     """Print every setting."""
-    from shmmap.daemon.config import trace_settings
+    from shmmap.daemon.config import FILE_NAMES, trace_settings
     from shmmap.daemon.config_file import installed_config_file
 
     file = args.file or installed_config_file()
     settings = trace_settings({}, file=file)
     if args.json:
         shown = {name: {"value": one.value, "origin": one.origin} for name, one in settings.items()}
+        shown |= {called: shown[name] for name, called in FILE_NAMES.items()}
         print_json({"file": file or None, "settings": shown})
         return 0
-    lines = {name: f"{name} = {_toml(one.value)}" for name, one in settings.items()}
+    lines = {name: f"{FILE_NAMES.get(name, name)} = {_toml(one.value)}" for name, one in settings.items()}
     width = max(map(len, lines.values()))
     for name, line in lines.items():
-        print(f"{line.ljust(width)}  # {settings[name].origin}" if args.origin else line)
+        print_line(f"{line.ljust(width)}  # {settings[name].origin}" if args.origin else line)
     return 0
 
 
@@ -123,8 +126,8 @@ def run_init(args: argparse.Namespace) -> int:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise BadRequest(f"{path} exists", hint="name another FILE, or move it away") from None
+        raise BadRequest(f"{path} is there already", hint="name another FILE, or move it away") from None
     except OSError as error:
         raise CannotWrite(f"cannot write {path}: {error.strerror}") from error
-    print(f"{path}: every setting, explained; `shmmap serve --config {path}` uses it")
+    print_line(f"{path}: every setting, explained; `shmmap serve --config {path}` uses it")
     return 0

@@ -7,6 +7,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb, numbers, size_bytes
+from shmmap.cli.program import complain
 from shmmap.cli.screens.work_result import fields_text, print_result
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ _EPILOG = """\
 IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb) or a directory
 of files; all together become one map.  PCD, LAS and LAZ may be larger than memory.
 A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite are
-left out and counted.  All fields are kept, with their types.
+left out and counted.  All fields are kept, with their types, unless --fields names those to keep.
 OUT appears complete or not at all.  Autoware's map loader reads it.
 JSON (fields may be added, none is removed):
   {"path", "cells", "points": in the map, "points_read", "dropped": not finite,
@@ -27,8 +28,8 @@ JSON (fields may be added, none is removed):
    "encoding", "fields": [[name, dtype]], "bounds": [[x, y, z], [x, y, z]],
    "sources": [{"path", "size", "mtime_ns", "ctime_ns", "points"}], "notes": [text],
    "resumed_points", "seconds", "peak_memory_bytes"}
-Exit code: 0, 2 wrong usage or OUT exists, 65 bad data, 66 no such input, 73 OUT cannot be written,
-75 another run is making OUT."""
+Exit code: 0, 2 wrong usage or OUT is there already, 65 bad data or no finite point, 66 no such input,
+73 OUT cannot be written, 75 another run is making OUT."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -62,22 +63,36 @@ def add_parser(subparsers: Subparsers) -> None:
         type=_translation,
         default="auto",
         help="added to every point; auto (the default) moves float64 and LAS points near the origin where "
-        "float32 would lose more than 0.5 mm; none keeps their frame, in float64 where needed",
+        "float32 would lose more than 0.5 mm, as `serve` does with a cloud; none keeps their frame, "
+        "in float64 "
+        "where needed",
     )
     points.add_argument(
-        "--leaf", metavar="METRES", type=_metres, default=0.0, help="one point, the mean, per voxel"
+        "--leaf",
+        metavar="METRES",
+        type=_metres,
+        default=0.0,
+        help="thin out: one point, the mean, for each voxel of this side",
     )
     points.add_argument(
         "--order",
         choices=("input", "morton"),
         default="input",
-        help="of the points in a cell (default: input)",
+        help="order of the points in a cell: as in the input, or along a Morton curve (default: input)",
     )
     points.add_argument(
         "--encoding",
         choices=("binary", "binary_compressed", "ascii"),
         default="binary",
-        help="of the PCD files (default: binary)",
+        help="encoding of the PCD files (default: binary)",
+    )
+    points.add_argument(
+        "--fields",
+        metavar="NAME,...",
+        type=lambda text: [name.strip() for name in text.split(",")],
+        action="extend",
+        default=[],
+        help="keep only these fields, such as x,y,z,intensity (default: all)",
     )
     points.add_argument(
         "--common-fields", action="store_true", help="keep only the fields that all inputs have"
@@ -88,20 +103,21 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="BYTES",
         type=size_bytes,
         default="1G",
-        help="most memory of the process (default: 1G)",
+        help="most memory the process may take (default: 1G)",
     )
     work.add_argument("--force", action="store_true", help="replace a divided map that is there")
     work.add_argument(
         "--resume", action="store_true", help="go on where a killed run of the same command stopped"
     )
-    work.add_argument("--check", action="store_true", help="read the map back and prove it before it appears")
+    work.add_argument(
+        "--check", action="store_true", help="read the map back and verify it before it appears"
+    )
     work.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json_option(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Divide, and say what came out."""
-    import sys
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
@@ -119,6 +135,7 @@ def run(args: argparse.Namespace) -> int:
         order=args.order,
         memory_bytes=args.max_memory,
         common_fields=args.common_fields,
+        fields=tuple(dict.fromkeys(args.fields)),
         force=args.force,
         resume=args.resume,
         check=args.check,
@@ -127,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
     except KeyboardInterrupt:
-        print("shmmap: interrupted\nhint: the same command with --resume goes on", file=sys.stderr)
+        complain("shmmap", "interrupted", "the same command with --resume goes on")
         raise
     seconds = time.monotonic() - began_s
     print_result(made, _lines(made), seconds=seconds, as_json=args.json)

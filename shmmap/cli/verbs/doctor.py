@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap doctor``: what on this machine hinders the daemon or its clients, and what to do."""
+"""``shmmap doctor``: find problems of the daemon and its clients, and suggest fixes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.screens.output import print_hanging, print_json
 
 if TYPE_CHECKING:
     from shmmap.doctor.finding import Finding
@@ -18,7 +18,7 @@ __all__ = ["add_parser", "run"]
 _JSON = """\
   {"worst": "ok" | "warn" | "fail",
    "findings": [{"name", "state": "ok" | "warn" | "fail", "fact", "advice": text, may be empty}]}
-Exit code: 0 nothing failed, 1 something did, 78 the configuration has a mistake."""
+Exit code: 0 no finding is `fail`, 1 one is, 78 the configuration has a mistake."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -27,9 +27,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "doctor",
         run,
-        help="what hinders the daemon or its clients, and what to do",
-        description="Look at shared memory, limits, groups, the socket, leftovers and the session manager.  "
-        "Nothing is changed.  Run it as the user whose program has a problem.",
+        help="find problems and suggest fixes",
+        description="Check the daemon, its socket and group, the map, shared memory and its limits, "
+        "and what was left "
+        "behind.  Changes nothing.  Run it as the user whose program has a problem.",
         json=_JSON,
     )
     parser.add_argument(
@@ -67,6 +68,6 @@ def run(args: argparse.Namespace) -> int:
 def _print(findings: list[Finding]) -> None:
     width = max(len(one.name) for one in findings)
     for one in findings:
-        print(f"{one.state.ljust(4)}  {one.name.ljust(width)}  {one.fact}")
+        print_hanging(f"{one.state.ljust(4)}  {one.name.ljust(width)}  ", one.fact)
         if one.advice:
-            print(f"{' ' * (width + 6)}  -> {one.advice}")
+            print_hanging(f"{' ' * (width + 6)}  -> ", one.advice)

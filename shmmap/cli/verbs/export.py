@@ -4,19 +4,24 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from shmmap.cli.options import Subparsers, add_area_options, add_daemon_options, add_verb, area_from, seconds
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.areas import add_area_options, area_from, area_text, no_cell_there
+from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
+from shmmap.cli.program import add_allow_empty, complain, nothing_found
+from shmmap.cli.screens.output import counted, print_json, print_line
+from shmmap.cli.screens.refusals import failure_lines
 from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from shmmap.client.cell import Cell
+    from shmmap.client.cell_set import CellSet
+    from shmmap.geometry import Area
 
 __all__ = ["add_parser", "run"]
 
@@ -24,7 +29,8 @@ _FORMATS = ("pcd", "npz")
 
 _JSON = """\
   {"files": [{"path", "points", "cells": [id]}]}
-Exit code: 0, 1 when a cell could not be had (then nothing is written), 73 a file cannot be written."""
+Exit code: 0; 1 when a cell could not be had, or there is no cell or no point (then nothing is written);
+73 a file cannot be written."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -34,26 +40,37 @@ def add_parser(subparsers: Subparsers) -> None:
         "export",
         run,
         help="write cells to PCD or NPZ files",
-        description="Write cells, as the daemon serves them, to one merged file or to one file per cell.",
+        description="Write cells, as the daemon serves them, to one merged file or to one file per cell.  "
+        "Whole cells are written, unless --crop is given.",
         json=_JSON,
     )
     what = parser.add_mutually_exclusive_group(required=True)
     add_area_options(parser, what)
-    what.add_argument("--id", metavar="ID", nargs="+", help="cells by id, or by file name where unique")
+    what.add_argument(
+        "--id",
+        metavar="ID",
+        nargs="+",
+        action="extend",
+        help="cells by id, or by file name where it is unique",
+    )
+    parser.add_argument("--crop", action="store_true", help="leave out points outside the area (and --z)")
     out = parser.add_mutually_exclusive_group(required=True)
     out.add_argument("-o", "--output", metavar="FILE", help="one merged file, .pcd or .npz")
     out.add_argument("--output-dir", metavar="DIR", help="one file per cell, named as the cell")
-    parser.add_argument("--format", choices=_FORMATS, help="default: as FILE ends; pcd in a DIR")
+    parser.add_argument(
+        "--format", choices=_FORMATS, help="format of the files (default: as FILE ends; pcd in a DIR)"
+    )
     parser.add_argument(
         "--encoding",
         choices=("ascii", "binary", "binary_compressed"),
         default="binary",
-        help="of PCD files (default: binary)",
+        help="encoding of PCD files (default: binary)",
     )
-    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+    parser.add_argument("--force", action="store_true", help="overwrite files that are there")
     parser.add_argument(
         "--wait", metavar="SECONDS", type=seconds, default=60.0, help="how long loads may take (default: 60)"
     )
+    add_allow_empty(parser)
     add_daemon_options(parser)
 
 
@@ -62,32 +79,50 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.daemon_address import connect
 
     area = area_from(args)
+    if args.crop and area is None:
+        raise BadRequest("--crop needs an area", hint="add --circle, --square or --box")
     kind = _format(args)
     with connect(args) as client:
         found = client.area(area, wait=args.wait) if area else client.selected(args.id, wait=args.wait)
-        for error in found.failed:
-            print(f"shmmap: {error.message}", file=sys.stderr)
-        for pending in found.pending:
-            print(f"shmmap: {pending.id}: not loaded within {args.wait:g} s", file=sys.stderr)
         if not found.complete:
+            _complain_of(found, args.wait)
             return 1
-        if not found.cells:
-            raise BadRequest("there is no cell in this area")
-        plan = _plan(args, found.cells, kind)
-        for path, _ in plan:
-            if path.exists() and not args.force:
-                raise _exists(path)
-        written = []
-        for path, cells in plan:
-            columns = _merged_columns(cells)
-            _write(path, columns, kind, args)
-            written.append({"path": str(path), "points": len(columns["xyz"]), "cells": [c.id for c in cells]})
-    if args.json:
-        print_json({"files": written})
-    else:
-        for path, cells in plan:
-            print(f"{path}: {sum(cell.points for cell in cells):,} points of {len(cells):,} cells")
-    return 0
+        written: list[dict[str, Any]] = []
+        if found.cells:
+            plan = _plan(args, found.cells, kind)
+            for path, _ in plan:
+                if path.exists() and not args.force:
+                    raise _exists(path)
+            for path, cells in plan:
+                columns = _merged_columns(cells, area if args.crop else None)
+                if len(columns["xyz"]):
+                    _write(path, columns, kind, args)
+                    ids = [cell.id for cell in cells]
+                    written.append({"path": str(path), "points": len(columns["xyz"]), "cells": ids})
+        if args.json:
+            print_json({"files": written})
+        else:
+            for file in written:
+                print_line(
+                    f"{file['path']}: {counted(file['points'], 'point')} of "
+                    f"{counted(len(file['cells']), 'cell')}"
+                )
+        if written:
+            return 0
+        if area is not None and not found.cells:
+            return no_cell_there(args, client, area)
+        where = f" {area_text(area)}" if area is not None and args.crop else ""
+        return nothing_found(
+            args, f"no point{where} in {counted(len(found.cells), 'cell')}: nothing is written"
+        )
+
+
+def _complain_of(found: CellSet, wait_s: float) -> None:
+    """Say which cells could not be had."""
+    for line in failure_lines(found.failed):
+        complain("shmmap", line)
+    for pending in found.pending:
+        complain("shmmap", f"{pending.id}: not loaded within {wait_s:g} s")
 
 
 def _format(args: argparse.Namespace) -> str:
@@ -111,8 +146,8 @@ def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tu
     return [(Path(args.output_dir, name), [cell]) for name, cell in zip(names, unique, strict=True)]
 
 
-def _merged_columns(cells: Sequence[Cell]) -> dict[str, NDArray[Any]]:
-    """Put the points of several cells one after the other.
+def _merged_columns(cells: Sequence[Cell], area: Area | None) -> dict[str, NDArray[Any]]:
+    """Put the points of several cells one after the other; given an area, only those in it.
 
     Raises
     ------
@@ -131,7 +166,24 @@ def _merged_columns(cells: Sequence[Cell]) -> dict[str, NDArray[Any]]:
         raise BadRequest(
             f"the cells have different columns: {described}", hint="export them with --output-dir"
         )
-    return {name: np.concatenate([cell[name] for cell in cells]) for name in cells[0].column_names}
+    if area is None:
+        return {name: np.concatenate([cell[name] for cell in cells]) for name in cells[0].column_names}
+    masks = [_inside(area, cell) for cell in cells]
+    return {
+        name: np.concatenate([cell[name][mask] for cell, mask in zip(cells, masks, strict=True)])
+        for name in cells[0].column_names
+    }
+
+
+def _inside(area: Area, cell: Cell) -> NDArray[np.bool_]:
+    """Which points of a cell lie in an area, (N,): each is judged as a box without extent."""
+    import numpy as np
+
+    x, y, z = (cell.xyz[:, axis].astype(np.float64) + cell.origin[axis] for axis in range(3))
+    inside = area.overlaps(np.column_stack((x, y, x, y)))
+    if area.z is not None:
+        inside &= (z >= area.z.min) & (z <= area.z.max)
+    return inside
 
 
 def _write_npz(file: IO[bytes], columns: dict[str, NDArray[Any]]) -> None:
@@ -164,4 +216,4 @@ def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argpar
 
 
 def _exists(path: Path) -> BadRequest:
-    return BadRequest(f"{path} exists", hint="give another name, or --force to overwrite it")
+    return BadRequest(f"{path} is there already", hint="give another name, or --force to overwrite it")

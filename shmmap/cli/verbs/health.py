@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import format_duration, print_json
+from shmmap.cli.screens.output import format_duration, print_json, print_line
 from shmmap.errors import DaemonUnreachable
 
 __all__ = ["add_parser", "run"]
@@ -23,7 +23,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "health",
         run,
         help="is the daemon well? (exit code 0: yes)",
-        description="Say whether the daemon is healthy, stopped, hung or dead.  Asks nobody.",
+        description="Say whether the daemon is healthy, stopped (by a debugger or SIGSTOP), hung or "
+        "dead.  Reads its "
+        "statistics in shared memory, so it answers whatever the daemon does.",
         json=_JSON,
     )
     add_statistics_options(parser)
@@ -44,5 +46,6 @@ def run(args: argparse.Namespace) -> int:
             }
         )
     else:
-        print(f"{found.state}: pid {identity.pid}, last sign of life {format_duration(found.beat_age_s)} ago")
+        age = format_duration(found.beat_age_s)
+        print_line(f"{found.state}: pid {identity.pid}, last heartbeat {age} ago")
     return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(found.state, 1)

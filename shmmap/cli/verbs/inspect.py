@@ -1,14 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap inspect FILE``: what a point-cloud file holds."""
+"""``shmmap inspect PATH``: what a point-cloud file holds, or every cloud of a directory."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING
+import os
+import sys
+from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
-from shmmap.cli.screens.output import Column, format_bytes, print_json, print_pairs, print_table
+from shmmap.cli.program import add_allow_empty, complain, nothing_found
+from shmmap.cli.screens.output import (
+    Column,
+    counted,
+    format_bytes,
+    format_metres,
+    print_json,
+    print_line,
+    print_pairs,
+    print_table,
+)
 from shmmap.errors import MapDataError, MapMissing
 
 if TYPE_CHECKING:
@@ -22,7 +34,23 @@ _JSON = """\
    "fields": [{"name", "dtype": as numpy writes it, "count": values per point, "unit"}],
    "bounds": {"min": [x, y, z], "max": [x, y, z]} of the finite points, null when there are none,
    "viewpoint": [x, y, z, qw, qx, qy, qz], "warnings": [text]}
-Exit code: 0, 65 bad data (the message has path, byte offset and cause), 66 no such file."""
+Of a directory:
+  {"path", "files": [the same of each file], "failed": [{"path", "message"}], "points", "dropped",
+   "file_bytes", "bounds": sums and bounds of all files}
+Exit code: 0; 1 when there is no finite point, 65 bad data (the message has path, byte offset and cause),
+66 no such file, or no cloud in the directory."""
+
+_FILES = (
+    Column("FILE"),
+    Column("FORMAT", spare=4),
+    Column("SIZE", "right", spare=3),
+    Column("POINTS", "right"),
+    Column("NOT FINITE", "right", spare=6),
+    Column("X", "right", spare=1),
+    Column("Y", "right", spare=1),
+    Column("Z", "right", spare=2),
+    Column("FIELDS", spare=5),
+)
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -31,34 +59,147 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "inspect",
         run,
-        help="what a point-cloud file holds",
-        description="Read a point-cloud file to its end and show its fields, points, bounds and oddities.",
+        help="what point-cloud files hold",
+        description="Read a point-cloud file to its end and show its fields, points, bounds and "
+        "whatever is odd "
+        "about it.  Of a directory (a map, or a folder of clouds): one line for each file, and totals.",
         json=_JSON,
     )
-    parser.add_argument("file", metavar="FILE", help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb")
+    parser.add_argument(
+        "path",
+        metavar="PATH",
+        help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb, or a directory of such files",
+    )
+    add_allow_empty(parser)
     add_json_option(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what the file holds."""
+    """Print what is there."""
+    if os.path.isdir(args.path):
+        return _directory(args)
+    found = _described(args.path)
+    if args.json:
+        print_json(_as_json(found))
+    else:
+        print_pairs(_lines(found))
+        print_line()
+        print_table(
+            (Column("FIELD"), Column("DTYPE"), Column("COUNT", "right"), Column("UNIT")),
+            [[spec.name, spec.dtype.str, str(spec.components), spec.unit] for spec in found.columns],
+        )
+    if _bounds(found) is None:
+        what = f"none of its {found.points:,} points is finite" if found.points else "it has no points"
+        return nothing_found(args, f"{args.path}: {what}")
+    return 0
+
+
+def _described(path: str) -> CloudDescription:
     from shmmap.formats.cloud import describe
 
     try:
-        found = describe(args.file)
+        return describe(path)
     except MapDataError as error:
         if error.cause == "missing":
             raise MapMissing(error.message, hint=error.hint) from error
         raise
+
+
+# --- a directory --------------------------------------------------------------------------------------
+
+
+def _directory(args: argparse.Namespace) -> int:
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.dividing.inputs import find_inputs
+
+    files = [file.path for file in find_inputs([args.path])]
+    found: list[CloudDescription] = []
+    failed: list[tuple[str, str]] = []
+    progress = StageProgress(quiet=not sys.stderr.isatty(), unit="files", scale=1.0)
+    progress.stage("inspect", len(files))
+    for path in files:
+        try:
+            found.append(_described(path))
+        except (MapDataError, MapMissing) as error:
+            failed.append((path, error.message))
+        progress.advance(1)
+    progress.done(len(files))
+    points, dropped = sum(one.points for one in found), sum(one.dropped for one in found)
+    nbytes = sum(one.file_bytes for one in found)
+    bounds = _all_bounds(found)
     if args.json:
-        print_json(_as_json(found))
-        return 0
-    print_pairs(_lines(found))
-    print()
-    print_table(
-        (Column("FIELD"), Column("DTYPE"), Column("COUNT", "right"), Column("UNIT")),
-        [[spec.name, spec.dtype.str, str(spec.components), spec.unit] for spec in found.columns],
-    )
+        print_json(
+            {
+                "path": args.path,
+                "files": [_as_json(one) for one in found],
+                "failed": [{"path": path, "message": message} for path, message in failed],
+                "points": points,
+                "dropped": dropped,
+                "file_bytes": nbytes,
+                "bounds": bounds,
+            }
+        )
+    else:
+        print_table(_FILES, [_row(one, os.path.abspath(args.path)) for one in found])
+        print_line()
+        print_pairs(
+            [
+                ("files", f"{len(found):,}" + (f", {len(failed):,} that cannot be read" if failed else "")),
+                ("points", f"{points:,}" + (f", {dropped:,} not finite" if dropped else "")),
+                ("size", format_bytes(nbytes)),
+                *_bounds_lines(bounds),
+                *_grouped_warnings(found),
+            ]
+        )
+    for _, message in failed:
+        complain("shmmap", message)
+    if failed:
+        return MapDataError.exit_code
+    if bounds is None:
+        return nothing_found(args, f"{args.path}: no finite point in {counted(len(found), 'file')}")
     return 0
+
+
+def _row(found: CloudDescription, directory: str) -> list[str]:
+    bounds = _bounds(found)
+    spans = ["-"] * 3
+    if bounds is not None:
+        low, high = ([format_metres(round(v, 1)) for v in bounds[name]] for name in ("min", "max"))
+        spans = [f"{a} .. {b}" for a, b in zip(low, high, strict=True)]
+    return [
+        os.path.relpath(found.path, directory),
+        " ".join(part for part in (found.format, found.encoding or found.version) if part),
+        format_bytes(found.file_bytes),
+        f"{found.points:,}",
+        f"{found.dropped:,}",
+        *spans,
+        " ".join("x y z" if spec.name == "xyz" else spec.name for spec in found.columns),
+    ]
+
+
+def _all_bounds(found: list[CloudDescription]) -> dict[str, list[float]] | None:
+    each = [bounds for one in found if (bounds := _bounds(one)) is not None]
+    if not each:
+        return None
+    return {
+        "min": [min(values) for values in zip(*(one["min"] for one in each), strict=True)],
+        "max": [max(values) for values in zip(*(one["max"] for one in each), strict=True)],
+    }
+
+
+def _grouped_warnings(found: list[CloudDescription]) -> list[tuple[str, str]]:
+    """Warnings, each once, with the file it is about or how many there are of it."""
+    files: dict[str, list[str]] = {}
+    for one in found:
+        for warning in one.warnings:
+            files.setdefault(warning, []).append(os.path.basename(one.path))
+    return [
+        ("warning", f"{names[0] if len(names) == 1 else f'{len(names):,} files'}: {warning}")
+        for warning, names in files.items()
+    ]
+
+
+# --- one file -----------------------------------------------------------------------------------------
 
 
 def _bounds(found: CloudDescription) -> dict[str, list[float]] | None:
@@ -66,7 +207,7 @@ def _bounds(found: CloudDescription) -> dict[str, list[float]] | None:
     return {"min": lowest, "max": highest} if all(map(math.isfinite, lowest)) else None
 
 
-def _as_json(found: CloudDescription) -> dict[str, object]:
+def _as_json(found: CloudDescription) -> dict[str, Any]:
     return {
         "path": found.path,
         "format": found.format,
@@ -87,8 +228,16 @@ def _as_json(found: CloudDescription) -> dict[str, object]:
     }
 
 
+def _bounds_lines(bounds: dict[str, list[float]] | None) -> list[tuple[str, str]]:
+    if bounds is None:
+        return [("bounds", "none: no finite point")]
+    return [
+        (axis, f"{low:.3f} .. {high:.3f} m ({high - low:.3f} m)")
+        for axis, low, high in zip("xyz", bounds["min"], bounds["max"], strict=True)
+    ]
+
+
 def _lines(found: CloudDescription) -> list[tuple[str, str]]:
-    bounds = _bounds(found)
     kind = " ".join(part for part in (found.format.upper(), found.version, found.encoding) if part)
     lines = [
         ("file", f"{found.path} ({format_bytes(found.file_bytes)}, {kind})"),
@@ -96,11 +245,7 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))
-    if bounds is None:
-        lines.append(("bounds", "none: no finite point"))
-    else:
-        for axis, low, high in zip("xyz", bounds["min"], bounds["max"], strict=True):
-            lines.append((axis, f"{low:.3f} .. {high:.3f} m ({high - low:.3f} m)"))
+    lines += _bounds_lines(_bounds(found))
     if tuple(found.viewpoint) != (0, 0, 0, 1, 0, 0, 0):
         lines.append(("viewpoint", " ".join(f"{value:g}" for value in found.viewpoint)))
     lines += [("warning", warning) for warning in found.warnings]

@@ -6,8 +6,18 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_json, print_table
+from shmmap.cli.program import add_allow_empty, nothing_found
+from shmmap.cli.screens.output import (
+    Column,
+    format_bytes,
+    format_duration,
+    format_metres,
+    print_json,
+    print_line,
+    print_table,
+)
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -19,8 +29,10 @@ _JSON = """\
   {"state": as in `shmmap status`, "epoch": hex, "not_listed": segments the table has no room for,
    "cells": [{"id", "version": hex, "layer", "state": "resident" | "stale" | "zombie", "segment",
               "bytes", "points", "box": [minx, miny, maxx, maxy] in metres, "hits", "idle_s", "load_s"}]}
+A zombie is a retired segment: no client gets it any more, its memory is freed when nobody maps it.
 An id of more than 104 bytes is cut at its start, and begins with an ellipsis then.
-Exit code: 0, or 69 when the daemon is dead or was never started."""
+Exit code: 0, also when nothing is in memory; 1 when an area touches no cell in memory, 69 when the daemon
+is dead or was never started."""
 
 _COLUMNS = (
     Column("CELL"),
@@ -37,6 +49,10 @@ _COLUMNS = (
 )
 
 
+_STATES = {"resident": "resident", "stale": "stale", "retired": "zombie"}
+"""States as they are shown, and as the statistics and JSON name them."""
+
+
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -44,17 +60,25 @@ def add_parser(subparsers: Subparsers) -> None:
         "ls",
         run,
         help="the cells in shared memory",
-        description="List the segments the daemon keeps: lower corner and size in metres, time since the "
-        "last use, time the load took.  Asks nobody: works while the daemon is stopped.",
+        description="List the cells in shared memory, one line for each layer of a cell.  Reads the daemon's "
+        "statistics: works while the daemon is stopped or hangs.\n"
+        "X, Y, SIZE: lower corner and side, metres, map frame.\n"
+        "STATE: resident; stale when a newer version exists that is not loaded yet; retired when it "
+        "left service, "
+        "to be freed when no process maps it.\n"
+        "HITS, USED: how often it was given to clients, and how long ago the last time.\n"
+        "LOAD: how long loading took.",
         json=_JSON,
     )
     parser.add_argument(
         "--sort",
         choices=("id", "bytes", "points", "hits", "used", "load"),
         default="id",
-        help="largest first",
+        help="largest first, but for id (default: id)",
     )
-    parser.add_argument("--state", choices=("resident", "stale", "zombie"), help="only these")
+    parser.add_argument("--state", choices=tuple(_STATES), help="only these")
+    add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
+    add_allow_empty(parser)
     add_statistics_options(parser)
 
 
@@ -74,8 +98,14 @@ def _list(args: argparse.Namespace) -> int:
 
     from shmmap.cli.daemon_address import snapshot
 
+    area = area_from(args)
     found, identity = snapshot(args)
-    rows = [row for row in found.cells if args.state in (None, row.state)]
+    rows = found.cells
+    there = around(row.box for row in rows)
+    if area is not None:
+        rows = [rows[index] for index in those_in(area, [row.box for row in rows])]
+    nothing_there = there is not None and not rows
+    rows = [row for row in rows if args.state is None or row.state == _STATES[args.state]]
     if args.sort != "id":
         name = {"used": "last_use_monotonic_ns", "load": "load_ns"}.get(args.sort, args.sort)
         rows.sort(key=lambda row: int(getattr(row, name)), reverse=True)
@@ -92,8 +122,13 @@ def _list(args: argparse.Namespace) -> int:
     else:
         print_table(_COLUMNS, [_as_text(row, now_ns) for row in rows])
         if found.rows_missing:
-            print(f"and {found.rows_missing:,} more that the statistics have no room for")
-    return DaemonUnreachable.exit_code if found.state == "dead" else 0
+            print_line(f"and {found.rows_missing:,} more that the statistics have no room for")
+    if found.state == "dead":
+        return DaemonUnreachable.exit_code
+    if nothing_there and area is not None and there is not None:
+        spans = f"those in memory span {extent_text(there)}"
+        return nothing_found(args, f"no cell in memory {area_text(area)}; {spans}")
+    return 0
 
 
 def _idle_s(row: CellRow, now_ns: int) -> float | None:
@@ -124,10 +159,10 @@ def _as_text(row: CellRow, now_ns: int) -> list[str]:
     idle_s = _idle_s(row, now_ns)
     return [
         f"…{row.id}" if row.id_cut else row.id,
-        f"{row.box[0]:g}",
-        f"{row.box[1]:g}",
-        f"{max(row.box[2] - row.box[0], row.box[3] - row.box[1]):g} m",
-        row.state,
+        format_metres(row.box[0]),
+        format_metres(row.box[1]),
+        f"{format_metres(max(row.box[2] - row.box[0], row.box[3] - row.box[1]))} m",
+        "retired" if row.state == "zombie" else row.state,
         row.layer,
         f"{row.points:,}",
         format_bytes(row.bytes),

@@ -10,8 +10,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.options import Subparsers, add_area_options, add_daemon_options, add_verb, area_from
-from shmmap.cli.screens.output import format_bytes, wants_style
+from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
+from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.program import add_allow_empty, nothing_found
+from shmmap.cli.screens.output import counted, format_bytes, print_hanging, print_line, wants_style
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -32,14 +34,18 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "map",
         run,
-        help="the map from above: what is in memory, who is where",
-        description="Draw the map's cells by state, clients and the areas they follow: on the terminal, or "
-        "into a file with tooltips.  While the daemon does not answer, only what is in memory is drawn.",
-        epilog="Exit code: 0, 69 when the daemon is dead or was never started, 73 a file cannot be written.",
+        help="the map from above: which cells are in memory, where the clients are",
+        description="Draw the map from above, north up: its cells by state, the clients, and the areas they "
+        "follow.  On the terminal, or into a file with a tooltip for each cell.  While the daemon does not "
+        "answer, only cells in memory are drawn.",
+        epilog="Exit code: 0; 1 when an area touches no cell, 69 when the daemon is dead or was "
+        "never started,\n"
+        "73 a file cannot be written.",
     )
-    parser.add_argument("--svg", metavar="FILE", type=Path, help="write a picture")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write a page that needs nothing else")
-    add_area_options(parser, parser.add_mutually_exclusive_group())
+    parser.add_argument("--svg", metavar="FILE", type=Path, help="write an SVG picture")
+    parser.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page, complete in one file")
+    add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
+    add_allow_empty(parser)
     add_daemon_options(parser, json=False)
 
 
@@ -49,29 +55,44 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.files import write_text
     from shmmap.cli.screens.map_scene import html_page, svg
 
+    area = area_from(args)
     found, identity = snapshot(args)
-    scene = _scene(args, found, f"{identity.map_path} ({identity.instance})", identity.id_prefix)
+    disk, silent = _on_disk(args, found, identity.id_prefix)
+    everywhere = around([box for _, box in disk] + [row.box for row in found.cells])
+    scene = _scene(area, found, disk, everywhere, f"{identity.map_path} ({identity.instance})", silent=silent)
     for path, make in ((args.svg, svg), (args.html, html_page)):
         if path is not None:
             write_text(path, make(scene))
-            print(f"wrote {path}")
+            print_line(f"wrote {path}")
     if args.svg is None and args.html is None:
         _print(scene)
-    return DaemonUnreachable.exit_code if found.state == "dead" else 0
+    if found.state == "dead":
+        return DaemonUnreachable.exit_code
+    if area is not None and scene.empty and everywhere is not None:
+        spans = f"the {'cells in memory span' if silent else 'map spans'} {extent_text(everywhere)}"
+        return nothing_found(args, f"no cell {area_text(area)}; {spans}")
+    return 0
 
 
-def _scene(args: argparse.Namespace, found: Snapshot, title: str, id_prefix: str) -> Scene:
+def _scene(
+    area: Area | None,
+    found: Snapshot,
+    disk: list[tuple[str, BoxTuple]],
+    everywhere: BoxTuple | None,
+    title: str,
+    *,
+    silent: bool,
+) -> Scene:
     from shmmap.cli.screens.map_scene import Scene
+    from shmmap.geometry import Box
 
-    area = area_from(args)
     rows = found.cells
-    disk, silent = _on_disk(args, found, id_prefix)
+    bounds = everywhere or (0.0, 0.0, 1.0, 1.0)
     if area is not None:
-        bounds = _bounds(area)
-        rows = [row for row in rows if _touches(row.box, bounds)]
-        disk = [(name, box) for name, box in disk if _touches(box, bounds)]
-    else:
-        bounds = _around([box for _, box in disk] + [row.box for row in rows])
+        bounds = area.bounds
+        shown = Box(*bounds)  # all of what is drawn
+        rows = [rows[index] for index in those_in(shown, [row.box for row in rows])]
+        disk = [disk[index] for index in those_in(shown, [box for _, box in disk])]
     left_out = len(disk) > MOST_ON_DISK
     return Scene(
         bounds=bounds,
@@ -81,6 +102,7 @@ def _scene(args: argparse.Namespace, found: Snapshot, title: str, id_prefix: str
         now_ns=time.monotonic_ns(),
         title=title,
         note=_note(found, rows, len(disk), left_out=left_out, silent=silent),
+        empty=not disk and not rows,
     )
 
 
@@ -101,32 +123,12 @@ def _on_disk(
 
 def _note(found: Snapshot, rows: list[CellRow], cells: int, *, left_out: bool, silent: bool) -> str:
     memory = sum(row.bytes for row in rows)
-    note = f"{len(rows):,} segments in memory, {format_bytes(memory)}, {len(found.clients):,} clients"
+    segments, clients = counted(len(rows), "segment"), counted(len(found.clients), "client")
+    note = f"{segments} in memory, {format_bytes(memory)}, {clients}"
     if silent:
         return f"{note}; the daemon is {found.state}: cells on disk are not shown"
-    return f"{note}, {cells:,} cells in the map" + (" (too many to show those on disk)" if left_out else "")
-
-
-def _bounds(area: Area) -> BoxTuple:
-    from shmmap.geometry import Box
-
-    if isinstance(area, Box):
-        return (area.min_x, area.min_y, area.max_x, area.max_y)
-    return (area.x - area.radius, area.y - area.radius, area.x + area.radius, area.y + area.radius)
-
-
-def _touches(box: BoxTuple, bounds: BoxTuple) -> bool:
-    return box[0] <= bounds[2] and box[2] >= bounds[0] and box[1] <= bounds[3] and box[3] >= bounds[1]
-
-
-def _around(boxes: list[BoxTuple]) -> BoxTuple:
-    if not boxes:
-        return (0.0, 0.0, 1.0, 1.0)
-    return (
-        min(box[0] for box in boxes),
-        min(box[1] for box in boxes),
-        max(box[2] for box in boxes),
-        max(box[3] for box in boxes),
+    return f"{note}, {counted(cells, 'cell')} in the map" + (
+        " (too many to show those on disk)" if left_out else ""
     )
 
 
@@ -138,15 +140,15 @@ def _print(scene: Scene) -> None:
     legend = {
         "resident": "in memory",
         "stale": "stale",
-        "zombie": "zombie",
+        "zombie": "retired",
         "disk": "on disk",
         "client": "client",
         "window": "its area",
     }
     if not wants_style():
         for row in grid:
-            print("".join(GLYPHS[state][0] for state in row).rstrip())
-        print("  ".join(f"{GLYPHS[state][0]} {text}" for state, text in legend.items()))
+            print_line("".join(GLYPHS[state][0] for state in row).rstrip())
+        print_line("  ".join(f"{GLYPHS[state][0]} {text}" for state, text in legend.items()))
     else:
         from rich.console import Console
         from rich.text import Text
@@ -156,6 +158,5 @@ def _print(scene: Scene) -> None:
         for row in grid:
             console.print(Text.assemble(*((solid.get(state, " "), GLYPHS[state][1]) for state in row)))
         console.print(Text.assemble(*((f"{solid[s]} {text}  ", GLYPHS[s][1]) for s, text in legend.items())))
-    min_x, min_y, max_x, max_y = scene.bounds
-    print(f"x {min_x:g} to {max_x:g} m, y {min_y:g} to {max_y:g} m; {scene.note}")
+    print_hanging("", f"{extent_text(scene.bounds)}; {scene.note}")
     sys.stdout.flush()

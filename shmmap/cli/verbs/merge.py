@@ -17,11 +17,12 @@ __all__ = ["add_parser", "run"]
 
 _EPILOG = """\
 IN is a divided map, a directory of clouds or a cloud of any format that is read.  Points that `divide`
-moved go back to where they were, in float64.  Files come in the order of their paths.
+moved go back to where they were, in float64.  Files are merged in the order of their paths.
 JSON (fields may be added, none is removed):
   {"path", "points", "bytes", "files": how many were merged, "fields": [[name, dtype]],
    "origin": {map: [x, y, z] that was added}, "seconds", "peak_memory_bytes"}
-Exit code: 0, 2 wrong usage or OUT exists, 65 bad data, 66 no such input, 73 OUT cannot be written."""
+Exit code: 0, 2 wrong usage or OUT is there already, 65 bad data or no point in the inputs, 66 no such input,
+73 OUT cannot be written."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -37,9 +38,16 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("inputs", metavar="IN", nargs="+", help="divided maps, directories, clouds")
     parser.add_argument("out", metavar="OUT", help="the PCD file to make")
     parser.add_argument(
-        "--encoding", choices=("binary", "ascii"), default="binary", help="of the PCD file (default: binary)"
+        "--encoding",
+        choices=("binary", "ascii"),
+        default="binary",
+        help="encoding of the PCD file (default: binary)",
     )
-    parser.add_argument("--keep-frame", action="store_true", help="leave points where the map has them")
+    parser.add_argument(
+        "--keep-frame",
+        action="store_true",
+        help="keep points where the map has them, also where `divide` moved them",
+    )
     parser.add_argument(
         "--common-fields", action="store_true", help="keep only the fields that all inputs have"
     )

@@ -24,9 +24,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "metrics",
         run,
-        help="the statistics for Prometheus",
-        description="Print counters, gauges and latency histograms in Prometheus' text format.  Asks nobody: "
-        "works while the daemon is stopped.",
+        help="counters and latencies in Prometheus' format",
+        description="Print counters, gauges and latency histograms in Prometheus' text format.  "
+        "Reads the daemon's "
+        "statistics: works while the daemon is stopped or hangs.",
         epilog=_EPILOG,
     )
     add_statistics_options(parser, json=False)

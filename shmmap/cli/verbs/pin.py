@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap pin [CELL...]``: keep cells resident, or list those that are kept."""
+"""``shmmap pin [CELL...]``: keep cells in memory, or list those that are kept."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_cells_argument, add_daemon_options, add_verb
-from shmmap.cli.screens.output import Column, format_bytes, print_json, print_table
+from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
+from shmmap.cli.options import Subparsers, add_daemon_options, add_layer_option, add_verb, layers_from
+from shmmap.cli.program import add_allow_empty
+from shmmap.cli.screens.output import Column, format_bytes, print_json, print_line, print_table
 
 if TYPE_CHECKING:
     from shmmap.protocol.messages import Pinned
@@ -18,7 +20,7 @@ PINS_JSON = """\
   {"cells": [{"id", "layer", "state": "resident" | "stale" | "loading" | "absent" | code of its failure,
               "bytes"}],
    "unknown": [ids the map does not have]}
-Exit code: 0, or 1 when an id is unknown or this user may not do it."""
+Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 _COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("MEMORY", "right"))
 
@@ -30,23 +32,29 @@ def add_parser(subparsers: Subparsers) -> None:
         "pin",
         run,
         help="keep cells in memory",
-        description="Load cells and keep them in shared memory, until `shmmap unpin` or the daemon's end.  "
-        "Without cells: list what is pinned.",
+        description="Load cells and keep them in shared memory until `shmmap unpin` or until the "
+        "daemon ends, "
+        "whoever else needs memory.  Without cells: list what is pinned.",
         json=PINS_JSON,
     )
     add_cells_argument(parser)
-    parser.add_argument(
-        "--layer", metavar="SPEC", nargs="+", default=["points"], help="layers to keep (default: points)"
-    )
+    add_layer_option(parser, "layers to keep (default: points)")
+    add_allow_empty(parser)
     add_daemon_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the pins."""
+    """Pin, and print the pinned cells."""
     from shmmap.cli.daemon_address import connect
 
+    area = check_cells_argument(args, "pin", optional=True)
     with connect(args) as client:
-        answer = client.pin(args.cells, args.layer)
+        cells = cells_meant(args, client, area)
+        if area is not None and not cells:
+            if args.json:
+                print_json({"cells": [], "unknown": []})
+            return no_cell_there(args, client, area)
+        answer = client.pin(cells, layers_from(args))
     return print_pins(answer, as_json=args.json)
 
 
@@ -63,7 +71,7 @@ def print_pins(answer: Pinned, *, as_json: bool) -> int:
             table = [[cell.id, cell.layer, cell.state, format_bytes(cell.bytes)] for cell in answer.cells]
             print_table(_COLUMNS, table)
         elif not answer.unknown:
-            print("nothing is pinned")
+            print_line("nothing is pinned")
         for name in answer.unknown:
-            print(f"unknown cell: {name}")
+            print_line(f"unknown cell: {name}")
     return 1 if answer.unknown else 0

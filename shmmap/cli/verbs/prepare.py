@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon computes nothing."""
+"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon only reads them."""
 
 from __future__ import annotations
 
 import argparse
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least, size_bytes
-from shmmap.cli.screens.output import format_bytes, format_duration, print_json, print_pairs
+from shmmap.cli.options import Subparsers, add_json_option, add_layer_option, add_verb, at_least, size_bytes
+from shmmap.cli.screens.output import format_bytes, format_duration, print_json, print_line, print_pairs
 
 __all__ = ["add_parser", "run"]
 
 _SHOWN_FAILURES = 20
 
 _EPILOG = """\
-What was there before is kept; a stopped run goes on where it was.  After a map was copied or touched,
-its layers are recognised by the files' contents.  Give `serve` the same --cache-dir.
+Layers computed before are kept; a stopped run, started again, goes on where it was.  After a map was copied
+or its files touched, its layers are recognised by the files' contents.  Give `serve` the same --cache-dir.
 JSON (fields may be added, none is removed):
   {"map", "cells", "layers": [spec], "kept", "recognised", "built": layers of cells, "bytes",
    "cache_dir", "cache_bytes": disk space of the whole cache, "seconds",
    "failed": [{"id", "layer", "message"}]}
-Exit code: 0, 1 if a layer of some cell could not be prepared, 2 wrong usage, 65 bad map, 66 no map,
+Exit code: 0, 1 if a layer of some cell could not be computed, 2 wrong usage, 65 bad map, 66 no map,
 73 nothing can be kept in the cache directory."""
 
 
@@ -29,21 +29,22 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "prepare",
         run,
-        help="compute layers of a map into the disk cache",
-        description="Compute layers of every cell of a map into the disk cache, on all cores.",
+        help="compute layers of a map ahead of time",
+        description="Compute layers of every cell of a map and keep them in the disk cache, using all cores.",
         epilog=_EPILOG,
     )
     parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
-    parser.add_argument(
-        "--layer", metavar="SPEC", nargs="+", action="extend", default=[], dest="layers",
-        help="layers, such as 'ndt(leaf=2.0)' or points",
-    )  # fmt: skip
+    add_layer_option(parser, "layers, such as 'ndt(leaf=2.0)' or points")
     parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, where it is not with the map")
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
     )
     parser.add_argument(
-        "--workers", metavar="N", type=at_least(0), default=0, help="processes (default: all cores)"
+        "--workers",
+        metavar="N",
+        type=at_least(0),
+        default=0,
+        help="number of processes (default: one for each core)",
     )
     parser.add_argument("--cache-dir", metavar="DIR", default="", help="where layers are kept")
     parser.add_argument(
@@ -68,12 +69,12 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.origin.sidecar import default_cache_directory
     from shmmap.prepare.run import prepare_map
 
-    if not args.layers:
+    if not args.layer:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
     origin = find_origin(args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir)
-    layers = canonical_layers(args.layers)
+    layers = canonical_layers(args.layer)
     catalogue = origin.load(fresh=True)
     done = prepare_map(
         catalogue,
@@ -104,11 +105,11 @@ def run(args: argparse.Namespace) -> int:
         )
         return 1 if done.failures else 0
     for failure in done.failures[:_SHOWN_FAILURES]:
-        print(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
+        print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
     if len(done.failures) > _SHOWN_FAILURES:
-        print(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
+        print_line(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
     if done.bytes > args.cache_size:
-        print("note: the layers are larger than --cache-size: some had to leave the cache again")
+        print_line("note: the layers are larger than --cache-size: some were removed from the cache again")
     print_pairs(
         [
             ("map", f"{origin.path}, {done.cells:,} cells"),

@@ -7,19 +7,33 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
+from shmmap.cli.areas import add_area_options, area_from, no_cell_there
 from shmmap.cli.options import (
     Subparsers,
-    add_area_options,
     add_daemon_options,
+    add_layer_option,
     add_verb,
-    area_from,
+    layers_from,
     seconds,
 )
-from shmmap.cli.screens.output import Column, format_bytes, print_json, print_table
+from shmmap.cli.program import add_allow_empty, nothing_found
+from shmmap.cli.screens.output import (
+    Column,
+    counted,
+    format_bytes,
+    format_metres,
+    print_hanging,
+    print_json,
+    print_line,
+    print_table,
+)
+from shmmap.cli.screens.refusals import failure_lines, holder_rows
 from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
+    from shmmap.client.client import Client
+    from shmmap.geometry import Area
 
 __all__ = ["add_parser", "held_cell", "run"]
 
@@ -28,9 +42,12 @@ _JSON = """\
    "cells": [{"id", "version": hex, "layer", "segment", "offset", "bytes", "points", "stale": bool,
               "box": [minx, miny, maxx, maxy] in metres}],
    "removed": [id], "pending": [{"id", "layer"}],
-   "failed": [{"id", "layer", "code", "message", "holders": [text]}]}
+   "failed": [{"id", "layer", "code", "message", "holders": [text],
+               "holder_rows": [{"session": hex, "pid", "uid", "client", "command", "cells", "bytes"}]}]}
 Codes: unknown_cell, load_failed, load_timeout, over_budget, no_space.
-Exit code: 0 when complete, 1 when anything asked for is pending, failed or unknown."""
+A holder maps memory of the full budget; session 0 and pid 0: a process that did not use the client library.
+Exit code: 0; 1 when a cell is pending, failed or unknown, when the area touches no cell, or when a layer has
+nothing in all of them.  With --held, 0 when nothing is new."""
 
 
 _COLUMNS = (
@@ -52,28 +69,37 @@ def add_parser(subparsers: Subparsers) -> None:
         "query",
         run,
         help="what a client would get for an area or for ids",
-        description="Ask the daemon for cells, as a client does, and print the handles; this loads them.",
+        description="Ask the daemon for cells, as a client does: it loads those that are not in "
+        "memory.  Prints "
+        "where each of them lies in shared memory.",
         json=_JSON,
     )
     what = parser.add_mutually_exclusive_group(required=True)
     add_area_options(parser, what)
-    what.add_argument("--id", metavar="ID", nargs="+", help="cells by id, or by file name where unique")
-    parser.add_argument(
-        "--layer", metavar="SPEC", nargs="+", default=["points"], help="layers (default: points)"
+    what.add_argument(
+        "--id",
+        metavar="ID",
+        nargs="+",
+        action="extend",
+        help="cells by id, or by file name where it is unique",
     )
+    add_layer_option(parser, "what to have of each cell (default: points)")
     parser.add_argument(
         "--held",
         metavar="ID[@VERSION]",
         nargs="+",
-        help="answer only the difference to these cells; without @VERSION, the current one is held",
+        action="extend",
+        help="print only what changes for a client that has these cells; without @VERSION: in their current "
+        "version",
     )
     parser.add_argument(
         "--wait",
         metavar="SECONDS|none",
         type=lambda text: None if text == "none" else seconds(text),
         default=10.0,
-        help="how long the answer may wait for loads; none: answer at once (default: 10)",
+        help="how long to wait for cells that have to be loaded; none: print what is in memory (default: 10)",
     )
+    add_allow_empty(parser)
     add_daemon_options(parser)
 
 
@@ -85,19 +111,38 @@ def run(args: argparse.Namespace) -> int:
     held = [held_cell(text) for text in args.held or ()]
     if held and area is None:
         raise BadRequest("--held needs an area", hint="add --circle, --square or --box")
+    layers = layers_from(args)
     with connect(args) as client:
         if area is None:
-            found = client.selected(args.id, args.layer, wait=args.wait)
+            found = client.selected(args.id, layers, wait=args.wait)
         elif args.held is not None:
-            found = client.differential(area, held, args.layer, wait=args.wait)
+            found = client.differential(area, held, layers, wait=args.wait)
         else:
-            found = client.area(area, args.layer, wait=args.wait)
+            found = client.area(area, layers, wait=args.wait)
         welcome = client.welcome
         if args.json:
             print_json(_as_json(found, welcome.frame_id))
         else:
             _print_text(found, welcome.id_prefix)
-    return 0 if found.complete else 1
+        if not found.complete:
+            return 1
+        return _judge_empty(args, client, area, found)
+
+
+def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, found: CellSet) -> int:
+    """Return the exit code of a complete answer; where there is nothing in it, say so."""
+    if found.cells:
+        held = args.held is not None
+        rows: dict[str, int] = {}
+        for cell in found.cells:
+            rows[cell.layer] = rows.get(cell.layer, 0) + cell.points
+        empty = [layer for layer, points in rows.items() if not points]
+        if empty and not held:
+            cells = len({cell.id for cell in found.cells})
+            return nothing_found(args, f"{', '.join(empty)}: no points in {counted(cells, 'cell')}")
+    elif area is not None and (args.held is None or not len(client.metadata(area))):
+        return no_cell_there(args, client, area)
+    return 0
 
 
 def held_cell(text: str) -> str | tuple[str, int]:
@@ -141,6 +186,7 @@ def _as_json(found: CellSet, frame_id: str) -> dict[str, object]:
                 "code": error.code,
                 "message": error.message,
                 "holders": [str(holder) for holder in error.holders],
+                "holder_rows": holder_rows(error),
             }
             for error in found.failed
         ],
@@ -154,8 +200,8 @@ def _print_text(found: CellSet, id_prefix: str) -> None:
             [
                 [
                     cell.id.removeprefix(id_prefix),
-                    f"{cell.box[0]:g}",
-                    f"{cell.box[1]:g}",
+                    format_metres(cell.box[0]),
+                    format_metres(cell.box[1]),
                     cell.layer,
                     f"{cell.points:,}",
                     format_bytes(cell.nbytes),
@@ -166,12 +212,11 @@ def _print_text(found: CellSet, id_prefix: str) -> None:
             ],
         )
     for cell_id in found.removed:
-        print(f"removed: {cell_id}")
+        print_line(f"removed: {cell_id}")
     for pending in found.pending:
-        print(f"pending: {pending.id} ({pending.layer})")
-    for error in found.failed:
-        print(f"failed: {error.message} [{error.code}]")
-        for holder in error.holders:
-            print(f"  {holder}")
+        print_line(f"pending: {pending.id} ({pending.layer})")
+    for line in failure_lines(found.failed):
+        indent = len(line) - len(line.lstrip())
+        print_hanging(line[:indent], line[indent:])
     points, nbytes = (sum(getattr(cell, name) for cell in found.cells) for name in ("points", "nbytes"))
-    print(f"{len(found.cells):,} cells, {points:,} points, {format_bytes(nbytes)}")
+    print_line(f"{counted(len(found.cells), 'cell')}, {counted(points, 'point')}, {format_bytes(nbytes)}")

@@ -6,12 +6,12 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.screens.output import print_json, print_line
 
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"map_version": hex, "changed": cells whose file is another now, "added", "removed",
+  {"map_version": hex, "changed": cells whose file changed, "added", "removed",
    "problems": [text]}"""
 
 
@@ -22,8 +22,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "reload",
         run,
         help="read the map again: changed, new and deleted files",
-        description="Let the daemon read the map's catalogue again, as SIGHUP does.  Clients learn at "
-        "their next request what changed; what they hold stays valid.",
+        description="Let the daemon read the map's list of cells again, as SIGHUP does.  Clients "
+        "get what changed "
+        "with their next request; cells they have mapped stay readable.",
         json=_JSON,
     )
     add_daemon_options(parser)
@@ -46,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
             }
         )
         return 0
-    print(
+    print_line(
         f"{answer.changed:,} cells changed, {answer.added:,} added, {answer.removed:,} removed;"
         f" map version {answer.map_version:016x}"
     )
     for problem in answer.problems:
-        print(f"note: {problem}")
+        print_line(f"note: {problem}")
     return 0

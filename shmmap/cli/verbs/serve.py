@@ -13,10 +13,13 @@ _EPILOG = """\
 Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.
 MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
 or inside the folder of the files), or one cloud of any format that is read: a PCD file of up to 256 MiB
-is one cell, any other is divided into the cache directory first.
-Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and leaves the memory to its
-next start, which goes on warm, as after a crash (a restart sends it first, then SIGTERM as usual; in
-a container: --stop-signal USR1); SIGHUP reads the map again.
+is one cell as it is; any other is first divided into the cache directory, just as `shmmap divide` does it:
+points of a LAS file, or of any with float64 coordinates, far from the origin move near it, and the log and
+`shmmap status` say by how much.  To keep their frame: `shmmap divide --translate none`, and serve that map.
+Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
+Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
+its next start (a restart sends it first, then SIGTERM as usual; in a container: --stop-signal USR1);
+SIGHUP reads the map again.
 Exit code: 0 after a signal, 65 bad map, 66 no map there, 75 the instance runs already, 78 bad setting."""
 
 
@@ -26,7 +29,7 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "serve",
         run,
-        help="run the daemon",
+        help="run the daemon: serve a map",
         description="Load map cells into shared memory and answer clients until told to stop.",
         epilog=_EPILOG,
     )
@@ -39,38 +42,51 @@ def add_parser(subparsers: Subparsers) -> None:
         "--watch",
         action="store_true",
         default=None,
-        help="reload when the map's files change (not on NFS)",
+        help="read the map again when its files change (not on NFS)",
     )
     parser.add_argument("--config", metavar="FILE", default="", help="TOML file of settings")
-    place = parser.add_argument_group("where it is found")
-    place.add_argument("--instance", metavar="NAME", help="instance name (default: default)")
+    place = parser.add_argument_group("how clients find it")
+    place.add_argument(
+        "--instance", metavar="NAME", help="name of this daemon among several (default: default)"
+    )
     place.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
     place.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
-    place.add_argument("--group", metavar="GROUP", help="group whose members may connect and read")
+    place.add_argument("--group", metavar="GROUP", help="group whose members may connect and read the map")
     place.add_argument(
         "--admin-group", metavar="GROUP", help="group whose members may reload, evict, pin and stop it"
     )
     limits = parser.add_argument_group("limits")
     limits.add_argument("--budget", metavar="BYTES", help="most memory for cells, such as 512M or 2G")
     limits.add_argument(
-        "--session-quota", metavar="PART", help="part of the budget one client may fill (default: 0.9)"
+        "--session-quota", metavar="PART", help="part of the budget that one client may fill (default: 0.9)"
     )
     limits.add_argument(
-        "--workers", metavar="N", help="most loader processes (default: processors less one, at most 4)"
+        "--workers", metavar="N", help="most loader processes (default: one less than processors, at most 4)"
     )
     limits.add_argument(
-        "--load-timeout", metavar="SECONDS", dest="load_timeout_s", help="deadline of one load (default: 60)"
+        "--load-timeout",
+        metavar="SECONDS",
+        dest="load_timeout_s",
+        help="most time for loading one cell (default: 60)",
     )
-    limits.add_argument("--eviction", metavar="POLICY", help="distance or lru (default: distance)")
+    limits.add_argument(
+        "--eviction",
+        metavar="POLICY",
+        help="which cells go first when memory is needed: distance (farthest from all clients; the "
+        "default) or "
+        "lru (longest unused)",
+    )
     parser.add_argument(
-        "--cache-dir", metavar="DIR", help="where the map's index and computed layers are kept between starts"
+        "--cache-dir",
+        metavar="DIR",
+        help="where the map's index, divided clouds and computed layers are kept between starts",
     )
     parser.add_argument(
         "--cache-size",
         metavar="SIZE",
         dest="cache_bytes",
-        help="most disk space of kept layers, 0: keep none (default: 8G)",
+        help="most disk space for computed layers, 0: keep none (default: 8G)",
     )
 
 

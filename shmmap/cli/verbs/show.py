@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap show CELL``: everything about one cell, and who holds it."""
+"""``shmmap show CELL``: everything about one cell, and which processes use it."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
+from shmmap.cli.areas import extent_text
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.accounts import user_name
 from shmmap.cli.screens.output import format_bytes, print_json, print_pairs
+from shmmap.cli.screens.refusals import holder_row
 
 if TYPE_CHECKING:
     from shmmap.protocol.messages import Holder, ShownCell, ShownSegment
@@ -22,7 +24,8 @@ _JSON = """\
    "segments": [{"layer", "version": hex, "segment", "state": "resident" | "stale" | "zombie", "bytes",
                  "points",
                  "holders": [{"session": hex, "pid", "uid", "user", "client", "command", "bytes"}]}]}
-A holder of session 0 is unknown: it did not open the segment through the library.
+A zombie is a retired segment.  Session 0: a process that did not open the segment through the client
+library.
 Exit code: 0, or 1 when the map has no such cell."""
 
 
@@ -32,8 +35,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "show",
         run,
-        help="one cell: versions, memory, who holds it",
-        description="Show everything the daemon knows about one cell.",
+        help="one cell: versions, memory, which processes use it",
+        description="Show everything the daemon knows about one cell: its box, its segments in "
+        "shared memory, which "
+        "processes map them, its last failure.",
         json=_JSON,
     )
     parser.add_argument("cell", metavar="CELL", help="its id, or the file's name where that is unique")
@@ -83,15 +88,7 @@ def _as_json(cell: ShownCell) -> dict[str, object]:
 
 
 def _holder_as_json(holder: Holder) -> dict[str, object]:
-    return {
-        "session": f"{holder.session:016x}",
-        "pid": holder.pid,
-        "uid": holder.uid,
-        "user": user_name(holder.uid),
-        "client": holder.client,
-        "command": holder.command,
-        "bytes": holder.bytes,
-    }
+    return {**holder_row(holder), "user": user_name(holder.uid)}
 
 
 def _lines(cell: ShownCell) -> list[tuple[str, str]]:
@@ -99,32 +96,33 @@ def _lines(cell: ShownCell) -> list[tuple[str, str]]:
     lines = [
         ("cell", cell.id),
         ("version", f"{cell.version:016x}"),
-        ("box", f"x {cell.min_x:g} .. {cell.max_x:g} m, y {cell.min_y:g} .. {cell.max_y:g} m"),
-        ("heights", "not known before the first load" if z is None else f"{z[0]:.2f} .. {z[1]:.2f} m"),
-        ("source", format_bytes(cell.source_bytes)),
+        ("box", extent_text((cell.min_x, cell.min_y, cell.max_x, cell.max_y))),
+        ("heights", "known after the first load" if z is None else f"{z[0]:.2f} .. {z[1]:.2f} m"),
+        ("file", format_bytes(cell.source_bytes)),
     ]
     lines += [("loading", layer) for layer in cell.loading]
-    lines += [("pinned", layer) for layer in cell.pinned]
+    lines += [("pinned", f"{layer}, by an operator (see `shmmap unpin`)") for layer in cell.pinned]
     if cell.failure:
         lines.append(("failure", cell.failure))
     if not cell.segments:
         lines.append(("segments", "none: not in memory"))
     for segment in cell.segments:
         lines.append(("segment", _segment_line(segment)))
-        lines += [("  held by", _holder_line(holder)) for holder in segment.holders]
+        lines += [("  in use by", _holder_line(holder)) for holder in segment.holders]
     return lines
 
 
 def _segment_line(segment: ShownSegment) -> str:
+    state = "retired" if segment.state == "zombie" else segment.state
     return (
-        f"{segment.segment} ({segment.layer}, {segment.state}, version {segment.version:016x},"
-        f" {segment.points:,} points, {format_bytes(segment.bytes)})"
+        f"{segment.layer}, {state}, {segment.points:,} points, {format_bytes(segment.bytes)},"
+        f" version {segment.version:016x}, {segment.segment}"
     )
 
 
 def _holder_line(holder: Holder) -> str:
     if not holder.session:
-        return "unknown: mapped, but not through the library"
+        return "an unidentified process (not through the client library)"
     command = f" ({holder.command})" if holder.command not in ("", holder.client) else ""
     who = f"{holder.client or 'client'}{command}, pid {holder.pid}, user {user_name(holder.uid)}"
     return f"{who}, {format_bytes(holder.bytes)}"

@@ -6,9 +6,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from shmmap.cli.areas import moved_by
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.cache_verdict import cache_verdict
-from shmmap.cli.screens.output import format_bytes, format_duration, print_json, print_pairs
+from shmmap.cli.screens.output import format_bytes, format_duration, format_metres, print_json, print_pairs
+from shmmap.doctor.cache_size import cache_verdict
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped" | "hung" | "dead", "beat_age_s": seconds since its last sign of life,
+  {"state": "healthy" | "stopped" | "hung" | "dead", "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so}}
 Exit code: 0, or 69 when the daemon is dead or was never started."""
@@ -30,8 +31,10 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "status",
         run,
-        help="one screen about the daemon",
-        description="Show how the daemon is and what it holds.  Asks nobody: works while it is stopped.",
+        help="state of the daemon: memory, clients, requests, cache size",
+        description="Show the state of the daemon: memory, clients, requests, loads, and whether "
+        "the cache is large "
+        "enough.  Reads its statistics in shared memory: works while the daemon is stopped or hangs.",
         json=_JSON,
     )
     add_statistics_options(parser)
@@ -76,8 +79,9 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     state = {
         "healthy": f"healthy, pid {identity.pid}, up {format_duration(uptime_s)}",
         "stopped": f"STOPPED, pid {identity.pid}: continue it with `kill -CONT {identity.pid}`",
-        "hung": f"HUNG, pid {identity.pid}: no sign of life for {format_duration(found.beat_age_s)}",
-        "dead": f"DEAD: pid {identity.pid} ended without cleaning up; `shmmap serve` takes over",
+        "hung": f"HUNG, pid {identity.pid}: no heartbeat for {format_duration(found.beat_age_s)}",
+        "dead": f"DEAD: pid {identity.pid} crashed or was killed; start it again, it keeps the "
+        f"cells in memory",
     }[found.state]
     asked = count["hits"] + count["misses"]
     hit_rate = f", {100 * count['hits'] / asked:.0f} % from memory" if asked else ""
@@ -88,18 +92,24 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
         ("memory", f"{format_bytes(used)} of {format_bytes(budget)}{share} in {identity.shm_dir}"),
         ("resident", f"{count['cells_resident']:,} segments, {format_bytes(count['bytes_resident'])}"),
-        ("pinned", f"{format_bytes(count['bytes_pinned'])} mapped by clients"),
+        ("in use", f"{format_bytes(count['bytes_pinned'])} mapped by clients"),
     ]
+    if (origin := moved_by(identity.id_prefix)) is not None:
+        x, y, z = map(format_metres, origin)
+        lines.insert(
+            4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
+        )
     if count["stale_cells"]:
-        lines.append(("stale", f"{count['stale_cells']:,} segments wait for their successor"))
+        lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
     if count["zombies"]:
-        lines.append(("zombies", f"{count['zombies']:,} segments, {format_bytes(count['bytes_zombie'])}"))
+        retired = f"{count['zombies']:,} segments, {format_bytes(count['bytes_zombie'])}"
+        lines.append(("retired", f"{retired}: freed when no client maps them"))
     if count["adopted"]:
         failed = f", {count['adoptions_failed']:,} of them damaged" if count["adoptions_failed"] else ""
-        lines.append(("warm start", f"{count['adopted']:,} segments of an earlier daemon taken over{failed}"))
+        lines.append(("warm start", f"{count['adopted']:,} segments kept from the previous daemon{failed}"))
     if count["pin_source"]:
-        source = "the locks of clients" if count["pin_source"] == 1 else "what clients say"
-        lines.append(("pins", f"this system grants no leases: known from {source} only"))
+        source = "the clients' locks" if count["pin_source"] == 1 else "what clients report"
+        lines.append(("use", f"this system grants no leases: memory in use is known from {source} only"))
     lines += [
         ("clients", f"{count['sessions']:,} now, {count['sessions_opened']:,} so far"),
         ("requests", f"{count['requests']:,}, {format_bytes(count['bytes_sent'])} sent{hit_rate}"),
@@ -108,18 +118,17 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
             (
                 f"{count['loads_finished']:,} done, {count['load_queue']:,} queued,"
                 f" {count['loads_failed']:,} failed, {count['loads_timed_out']:,} timed out,"
-                f" {count['worker_crashes']:,} crashed workers"
+                f" {count['worker_crashes']:,} crashed loaders"
             ),
         ),
     ]
-    evicted, over_budget, quota = (
-        f"{count[name]:,}" for name in ("evictions", "refused_over_budget", "refused_quota")
-    )
     verdict = cache_verdict(count)
-    lines.append(("cache", f"{'TOO SMALL' if verdict.too_small else 'large enough'}: {verdict.why}"))
+    lines.append(("cache", verdict.text))
     if verdict.hint:
         lines.append(("", verdict.hint))
-    if {evicted, over_budget, quota} != {"0"}:
-        text = f"{evicted} evicted, {over_budget} refused for the budget, {quota} for a quota"
-        lines.append(("pressure", text))
+    if count["refused_quota"]:
+        over = (
+            f"{count['refused_quota']:,} cells refused since the start: a client asked for more than its part"
+        )
+        lines.append(("quota", f"{over} (--session-quota)"))
     return lines

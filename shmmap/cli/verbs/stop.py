@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.screens.output import print_json, print_line
 
 __all__ = ["add_parser", "run"]
 
@@ -22,7 +22,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "stop",
         run,
         help="end the daemon and free its memory",
-        description="End the daemon, as SIGTERM does: memory is freed as soon as nobody maps it.  For "
+        description="End the daemon, as SIGTERM does: a cell's memory is freed as soon as no "
+        "process maps it.  For "
         "members of the daemon's --admin-group, who cannot send it a signal.",
         json=_JSON,
     )
@@ -39,5 +40,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"stopping": pid})
     else:
-        print(f"daemon {pid} is stopping")
+        print_line(f"daemon {pid} is stopping")
     return 0

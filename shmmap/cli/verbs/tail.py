@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap tail``: what happened in the daemon, and what happens."""
+"""``shmmap tail``: the daemon's events as they happen."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -12,7 +11,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
-from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.program import complain
+from shmmap.cli.screens.output import (
+    counted,
+    format_bytes,
+    format_duration,
+    json_text,
+    print_hanging,
+    print_line,
+)
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Happening
@@ -23,8 +30,8 @@ _JSON = """\
   one object a line: {"event": "epoch" | "loaded" | "changed" | "evicted" | "failed" | "retried" |
   "pressure" | "reload" | "joined" | "left", "seq", "epoch": hex, "time": Unix seconds, and what the
   protocol's table of events says of that kind; versions and sessions as hex}, or
-  {"event": "missed", "epoch": hex, "first", "last"} for numbers the daemon does not remember any more.
-Live on a terminal or with --follow; else it ends after what the daemon remembers."""
+  {"event": "missed", "epoch": hex, "first", "last"} for events that the daemon does not keep any more.
+Live on a terminal or with --follow; else it ends after the events the daemon has kept."""
 
 DEFAULT_SINCE_S: Final = 60.0
 SILENT_S: Final = 5.0
@@ -36,10 +43,11 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "tail",
         run,
-        help="what happened, and what happens",
-        description="Tell what happened in the last minute, and go on telling: cells loaded, changed, "
-        "evicted, failed, retried; memory pressure; reloads; clients that come and go; the daemon's start "
-        "and end.",
+        help="events: loads, evictions, failures, clients",
+        description="Print the events of the last minute, and go on with new ones: cells loaded, "
+        "changed, evicted, "
+        "failed, retried; cells refused for want of memory; reloads; clients that connect and leave; the "
+        "daemon's start and end.",
         json=_JSON,
     )
     parser.add_argument(
@@ -47,11 +55,13 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SECONDS",
         type=seconds,
         default=DEFAULT_SINCE_S,
-        help="begin so long ago (default: 60; the daemon remembers its last 4096 events)",
+        help="start with events of the last SECONDS (default: 60; the daemon keeps its last 4096)",
     )
     group = parser.add_mutually_exclusive_group()
-    group.add_argument("--follow", action="store_true", default=None, help="go on; the default on a terminal")
-    group.add_argument("--no-follow", action="store_false", dest="follow", help="end after what was")
+    group.add_argument(
+        "--follow", action="store_true", default=None, help="go on with new events; the default on a terminal"
+    )
+    group.add_argument("--no-follow", action="store_false", dest="follow", help="end after past events")
     add_daemon_options(parser)
 
 
@@ -73,13 +83,13 @@ def run(args: argparse.Namespace) -> int:
                 show(happening)
                 sys.stdout.flush()
             elif time.monotonic() - stream.heard_s > SILENT_S:
-                _wait_for_sign_of_life(stream, show)
+                _wait_for_heartbeat(stream, show)
     return 0
 
 
-def _wait_for_sign_of_life(stream: EventStream, show: Callable[[Happening | None], None]) -> None:
-    """Say once that the daemon is silent: it beats every second otherwise."""
-    print("shmmap: no sign of life from the daemon: see `shmmap health`", file=sys.stderr, flush=True)
+def _wait_for_heartbeat(stream: EventStream, show: Callable[[Happening | None], None]) -> None:
+    """Say once that the daemon is silent: it sends a heartbeat every second otherwise."""
+    complain("shmmap", "no heartbeat from the daemon", "shmmap health")
     show(stream.next(None))
     sys.stdout.flush()
 
@@ -110,7 +120,7 @@ def _print_json(happening: Happening | None) -> None:
             fields[name] = f"{fields[name]:016x}"
     if "unix_ns" in fields:
         fields["time"] = fields.pop("unix_ns") / 1e9
-    print(json.dumps(fields, ensure_ascii=False, allow_nan=False))
+    print_line(json_text(fields))
 
 
 def _print_text(happening: Happening | None) -> None:
@@ -120,12 +130,12 @@ def _print_text(happening: Happening | None) -> None:
     kind = fields["event"]
     at = time.strftime("%H:%M:%S", time.localtime(fields["unix_ns"] // 10**9)) if "unix_ns" in fields else ""
     millis = f".{fields['unix_ns'] // 10**6 % 1000:03d}" if at else " " * 12
-    print(f"{at}{millis}  {kind:8}  {_SENTENCES[kind](fields)}")
+    print_hanging(f"{at}{millis}  {kind:8}  ", _SENTENCES[kind](fields))
 
 
 def _loaded(f: dict[str, Any]) -> str:
-    took = f"in {format_duration(f['load_ns'] * 1e-9)}" if f["load_ns"] else "from its retirement"
-    why = ", had been evicted to make room" if f["again"] else ""
+    took = f"in {format_duration(f['load_ns'] * 1e-9)}" if f["load_ns"] else "retired before, back in service"
+    why = ", was evicted to make room before" if f["again"] else ""
     why += ", replaces an older version" if f["replaces"] else ""
     return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {f['points']:,} points, {took}{why}"
 
@@ -136,23 +146,24 @@ def _evicted(f: dict[str, Any]) -> str:
 
 
 def _pressure(f: dict[str, Any]) -> str:
-    full = {"over_budget": "the budget is in use", "no_space": "the file system is full"}
+    full = {"over_budget": "the budget is full", "no_space": "the file system is full"}
     cause = full.get(f["code"], "a client's quota is used up")
     return (
-        f"{f['refused']:,} cells refused, {f['id']} among them: {cause}; {format_bytes(f['used_bytes'])} of"
-        f" {format_bytes(f['budget_bytes'])} used, {format_bytes(f['pinned_bytes'])} mapped by clients"
+        f"{counted(f['refused'], 'cell')} refused, such as {f['id']}: {cause}; "
+        f"{format_bytes(f['used_bytes'])} of"
+        f" {format_bytes(f['budget_bytes'])} used, {format_bytes(f['pinned_bytes'])} in use by clients"
     )
 
 
 def _reload(f: dict[str, Any]) -> str:
     if f["error"]:
-        return f"the map could not be read again, the old state stays: {f['error']}"
+        return f"the map could not be read again, the one served before stays: {f['error']}"
     counts = ", ".join(f"{f[how]:,} {how}" for how in ("changed", "added", "removed"))
-    return f"the map was read again: cells {counts}"
+    return f"the map was read again; cells: {counts}"
 
 
 def _epoch(f: dict[str, Any]) -> str:
-    adopted = f", {f['adopted']:,} segments taken over" if f["adopted"] else ""
+    adopted = f", {f['adopted']:,} segments of the previous daemon kept" if f["adopted"] else ""
     return f"the daemon is {f['what']}: {f['cells']:,} cells in the map{adopted}"
 
 
@@ -162,10 +173,10 @@ _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "changed": lambda f: f"{f['id']}  {f['how']}",
     "evicted": _evicted,
     "failed": lambda f: f"{f['id']} {f['layer']}  {f['code']}: {f['message']}",
-    "retried": lambda f: f"{f['id']} {f['layer']}  failed before with {f['code']}",
+    "retried": lambda f: f"{f['id']} {f['layer']}  again after {f['code']}",
     "pressure": _pressure,
     "reload": _reload,
     "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",
-    "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, held {format_bytes(f['bytes'])}",
-    "missed": lambda f: f"events {f['first']:,} to {f['last']:,}: the daemon does not remember them any more",
+    "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, had {format_bytes(f['bytes'])}",
+    "missed": lambda f: f"events {f['first']:,} to {f['last']:,}: the daemon does not keep them any more",
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap top``: how the daemon fares, live; read from its statistics, so that watching costs it nothing."""
+"""``shmmap top``: live view of memory, latency and clients; it only reads the daemon's statistics."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb, seconds
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.screens.output import print_json, print_line, printable
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"state": as in `shmmap status`, "beat_age_s",
-   "budget": {"pinned", "idle", "zombie", "reserved", "free"} in bytes,
+   "budget": {"pinned": mapped by clients, "idle", "zombie": retired, "reserved", "free"} in bytes,
    "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
    "latency_s": {"request", "wait", "load": {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
    "evictions", "refused_over_budget", "refused_quota",
@@ -54,9 +54,13 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "top",
         run,
-        help="how it fares, live",
-        description="Show the budget (mapped by clients, idle, zombie, free), hit ratios, latencies, loads, "
-        "evictions, refusals and clients.  Live on a terminal, once in a pipe.  Asks nobody.",
+        help="live view: memory, latency, clients",
+        description="Show how the memory budget is used, how many of the cells asked for were in memory, "
+        "latencies, loads, evictions, refusals and clients.  Live on a terminal, once in a pipe.\n"
+        "Budget: in use (mapped by clients), idle (in memory, mapped by no client), retired (out of "
+        "service, freed "
+        "when no process maps it), reserved (for loads under way), free.\n"
+        "GIVEN: memory of the cells a client was given and has not returned.",
         json=_JSON,
     )
     parser.add_argument(
@@ -64,9 +68,9 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SECONDS",
         type=seconds,
         default=DEFAULT_INTERVAL_S,
-        help="between looks (1)",
+        help="time between updates (default: 1)",
     )
-    parser.add_argument("--once", action="store_true", help="once, also on a terminal")
+    parser.add_argument("--once", action="store_true", help="print once and end, also on a terminal")
     add_statistics_options(parser)
 
 
@@ -82,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     elif args.once or not sys.stdout.isatty():
         width = shutil.get_terminal_size((PIPE_WIDTH, 40)).columns
         for line in screen(found, identity, width=width, max_clients=256):
-            print("".join(text for text, _style in line).rstrip())
+            print_line("".join(text for text, _style in line).rstrip())
     else:
         with StatisticsReader(instance(args), shm_dir(args)) as reader:
             return _live(reader, max(args.interval, SHORTEST_S))
@@ -159,12 +163,13 @@ def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
 def _styled(line: Line) -> Any:
     from rich.text import Text
 
-    return Text.assemble(*line, no_wrap=True, overflow="ellipsis")
+    pieces = [(printable(text), style) for text, style in line]
+    return Text.assemble(*pieces, no_wrap=True, overflow="ellipsis")
 
 
 def _as_json(found: Snapshot) -> dict[str, object]:
-    from shmmap.cli.screens.cache_verdict import cache_verdict
     from shmmap.cli.screens.top_screen import budget_parts
+    from shmmap.doctor.cache_size import cache_verdict
     from shmmap.statistics.counters import SPANS
 
     count = found.counters
@@ -185,16 +190,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
             name: {"p50": h.quantile_s(0.5), "p99": h.quantile_s(0.99), "count": h.total}
             for name, h in found.histograms.items()
         },
-        **{
-            name: count[name]
-            for name in (
-                "load_queue",
-                "waiting_requests",
-                "evictions",
-                "refused_over_budget",
-                "refused_quota",
-            )
-        },
+        **{name: count[name] for name in _TOLD_AS_THEY_ARE},
         "clients": [
             {
                 "client": client.client,

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_verb
+from shmmap.cli.screens.output import print_line
 from shmmap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,8 +20,13 @@ __all__ = ["add_parser", "run_install", "run_print"]
 
 _INSTALL = """\
 Writes units, the account `shmmap`, directories and /etc/shmmap/shmmap.toml, and starts nothing.  Units
-are replaced (changes belong in drop-ins: `systemctl edit shmmapd`), a configuration that exists is kept.
-Exit code: 0, 66 no map there, 73 a file cannot be written."""
+are replaced (changes belong in drop-ins: `systemctl edit shmmapd`), a configuration that is there is kept.
+The units start the very installation that wrote them.  To install the program where the service can read
+it, as root in shmmap's checkout:
+  python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install .
+  /opt/shmmap/bin/shmmap unit install --map DIR
+With --root the units name the program as the image will see it, if it lies below that directory.
+Exit code: 0, 66 no map there, 73 a file cannot be written, 78 the service could not read this program."""
 
 _PRINT = """\
 FILE is a unit as it would be installed, or another file that comes with this package, such as
@@ -32,7 +39,7 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "unit",
         run_print,
-        help="install or show the systemd units",
+        help="install or print the systemd units",
         description="Run the daemon as a systemd service, of the machine or of a user.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
@@ -46,19 +53,21 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     install.add_argument("--map", metavar="DIR", default="", help="the map to serve")
     install.add_argument("--dry-run", action="store_true", help="only say what would be written")
-    install.add_argument("--root", metavar="DIR", default="/", help="install below DIR, for an image")
+    install.add_argument(
+        "--root", metavar="DIR", default="/", help="install into the file system of an image, below DIR"
+    )
     show = add_verb(
         actions,
         "print",
         run_print,
-        help="show a unit",
+        help="print a unit",
         description="Print a unit, or another file that belongs to the service.",
         epilog=_PRINT,
     )
     show.add_argument("name", metavar="FILE", nargs="?", default="", help="default: shmmapd.service")
     show.add_argument("--list", action="store_true", help="list what there is to print")
     for one in (install, show):
-        one.add_argument("--user", action="store_true", help="the units of a user's own daemon")
+        one.add_argument("--user", action="store_true", help="for this user alone, without root")
 
 
 def run_print(args: argparse.Namespace) -> int:
@@ -67,12 +76,13 @@ def run_print(args: argparse.Namespace) -> int:
     from shmmap.service.shipped_files import shipped_names
 
     if args.list:
-        print("\n".join(shipped_names()))
+        for shipped in shipped_names():
+            print_line(shipped)
         return 0
     name = args.name or "shmmapd.service"
     if "/" not in name and name not in shipped_names():
         name = f"{'user' if args.user else 'system'}/{name}"
-    print(unit_text(name), end="")
+    sys.stdout.write(unit_text(name))
     return 0
 
 
@@ -83,18 +93,24 @@ def run_install(args: argparse.Namespace) -> int:
     planned = plan_user(args.map) if args.user else plan_system(args.map, args.root)
     width = max(len(one.action) for one in planned)
     for one in planned:
-        print(f"{one.action.ljust(width)}  {one.path}")
+        print_line(f"{one.action.ljust(width)}  {one.path}")
     if args.map and planned[-1].action == "kept":
-        print(f"note: {planned[-1].path} is kept: set map_path there")
+        print_line(f"note: {planned[-1].path} is kept: set map_path there")
     if args.dry_run:
         return 0
     write(planned)
     if (args.user or args.root == "/") and os.path.isdir("/run/systemd/system"):
         _let_systemd_know(args.user, planned)
     if args.user:
-        print("next: systemctl --user enable --now shmmapd && loginctl enable-linger")
+        print_line("next: systemctl --user enable --now shmmapd && loginctl enable-linger")
+    elif args.root == "/":
+        print_line(
+            "next: systemctl enable --now shmmapd; usermod -aG shmmap USER for each user who may connect"
+        )
     else:
-        print("next: systemctl enable --now shmmapd; usermod -aG shmmap USER for who may connect")
+        print_line(
+            f"next: systemctl --root={args.root} enable shmmapd; account and directories are made at boot"
+        )
     return 0
 
 

@@ -12,6 +12,7 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.worker_messages import Grant, Need, Refuse
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load
+from shmmap.quantities import format_bytes
 
 __all__ = ["Room"]
 
@@ -35,10 +36,11 @@ class Room:
         """Make room for a load; why there is none, or nothing where it is on its way."""
         ledger = self.cache.ledger
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
-            return f"the cell needs {load.estimate} bytes, the whole budget is {ledger.budget_bytes}"
+            needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
+            return f"the cell needs {needed}, the whole budget is {budget}"
         if self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back():
             return ""
-        return f"{load.estimate} bytes do not fit: the budget of {ledger.budget_bytes} bytes is in use"
+        return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
     def ask(self, worker: Worker, message: Need) -> None:
         """A worker needs more than was reserved, and waits for `feed`."""

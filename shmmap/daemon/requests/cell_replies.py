@@ -119,7 +119,7 @@ class CellReplies:
             answer.residents.append(resident)
         if refusal is not None:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,)))
+            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,) if mine.bytes else ()))
         elif not current and failure is not None and not promised:
             holders: tuple[Holder, ...] = ()
             if failure.code in SPACE_CODES:

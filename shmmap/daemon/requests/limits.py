@@ -22,6 +22,7 @@ from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layers
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
+from shmmap.quantities import format_bytes
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = [
@@ -186,7 +187,8 @@ class SessionQuota:
                 continue  # somebody keeps it anyway, perhaps this session itself
             left -= sizes[position] - replaced.get(key, 0)
             if left < 0:
-                message = f"this client would keep more than {self.nbytes} bytes (its quota) for itself alone"
+                quota = format_bytes(self.nbytes)
+                message = f"this client would keep more than its quota of {quota} for itself alone"
                 wanted.refused[key] = ("over_budget", message)
                 self.statistics.add("refused_quota")
                 cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self.clock())

@@ -7,8 +7,9 @@ import argparse
 
 import pytest
 
+from shmmap.cli.areas import area_from
 from shmmap.cli.entry import main
-from shmmap.cli.options import area_from, numbers, seconds
+from shmmap.cli.options import numbers, seconds
 from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
 from shmmap.cli.program import join_negative_values
 from shmmap.errors import BadRequest
@@ -129,7 +130,7 @@ def test_descriptions_are_filled_and_tables_in_them_are_not(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
-    for verb in ("top", "ls"):
+    for verb in ("top", "clients"):
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         text = capsys.readouterr().out

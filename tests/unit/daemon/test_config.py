@@ -37,8 +37,35 @@ def test_later_origins_win(tmp_path: Path) -> None:
 
 
 def test_variables_that_are_no_settings() -> None:
-    environ = {"SHMMAP_TEST_DATA": "/x", "SHMMAP_ENDPOINT": "/run/other.sock", "SHMMAPX": "1"}
+    environ = {"SHMMAP_TEST_DATA": "/x", "SHMMAPX": "1"}
     assert load(environ=environ) == DaemonConfig()
+
+
+@pytest.mark.parametrize(
+    ("flags", "environ", "endpoint", "instance"),
+    [
+        ({}, {}, "/run/city.sock", "city"),
+        ({}, {"SHMMAP_INSTANCE": "town"}, "/run/city.sock", "town"),
+        ({"endpoint": "ipc:///run/b.sock"}, {}, "ipc:///run/b.sock", "b"),
+        ({"instance": "town"}, {}, "", "town"),
+        ({"runtime_dir": "/run/mine"}, {}, "", "default"),
+        ({"endpoint": "/run/no name.sock"}, {}, "/run/no name.sock", "default"),
+    ],
+)
+def test_the_endpoint_of_clients_is_the_daemon_s(
+    flags: dict[str, str], environ: dict[str, str], endpoint: str, instance: str
+) -> None:
+    """And whoever knows the socket alone finds the statistics, as they are named after the instance."""
+    config = load(flags, environ={"SHMMAP_ENDPOINT": "/run/city.sock", **environ})
+    assert (config.endpoint, config.instance) == (endpoint, instance)
+
+
+def test_sizes_have_one_name_in_files_variables_and_options() -> None:
+    assert load({"cache_size": "1G"}).cache_bytes == 1 << 30
+    assert load(environ={"SHMMAP_CACHE_SIZE": "2G", "SHMMAP_BUDGET": "1M"}).cache_bytes == 2 << 30
+    with pytest.raises(ConfigError, match="unknown") as caught:
+        load({"cache_sise": 1})
+    assert caught.value.hint == "did you mean 'cache_size'?"
 
 
 @pytest.mark.parametrize(

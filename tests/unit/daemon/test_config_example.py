@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.config import DaemonConfig, load_config
+from shmmap.daemon.config import FILE_NAMES, DaemonConfig, load_config
 from tests.support.daemon_process import ROOT
 
 EXAMPLE = ROOT / "systemd" / "shmmap.toml"
 ASSIGNMENT = re.compile(r"#?([a-z_]+) = (.+)")
 SET_FOR_THE_SERVICE = {"map_path", "group"}
+ATTRIBUTES = {called: name for name, called in FILE_NAMES.items()}
 
 
 def assignments() -> dict[str, str]:
@@ -22,7 +23,7 @@ def assignments() -> dict[str, str]:
     found = {}
     for line in EXAMPLE.read_text(encoding="utf-8").splitlines():
         if match := ASSIGNMENT.fullmatch(line):
-            found["budget_bytes" if match[1] == "budget" else match[1]] = line
+            found[ATTRIBUTES.get(match[1], match[1])] = line
     return found
 
 

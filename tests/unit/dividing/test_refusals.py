@@ -150,7 +150,7 @@ def test_a_map_is_replaced_only_by_force_and_only_a_map(tmp_path: Path) -> None:
     divide_quickly(files[1:], out, force=True)
     assert map_rows(out) == expected_rows(rows_of(second))
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(BadRequest, match="no divided map"):
+    with pytest.raises(BadRequest, match="not a divided map"):
         divide_quickly(files[:1], out, force=True)
     link = tmp_path / "link"
     link.symlink_to(out)

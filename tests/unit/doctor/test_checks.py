@@ -14,6 +14,7 @@ import pytest
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor import access, kernel, lifetime, memory
+from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
@@ -134,8 +135,18 @@ def test_limits_of_the_control_group(
     assert ("lower the budget" in found.advice) == (state == "fail")
 
 
+def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
+    assert memory.check_cache(ward.patient()).state == "ok"
+    seen = told(refused_over_budget_10min=3, budget_bytes=1 << 20)
+    found = memory.check_cache(ward.patient(seen))
+    verdict = cache_verdict(seen.counters)
+    assert (found.state, found.fact, found.advice) == ("warn", verdict.text, verdict.hint)
+    assert found.fact.startswith("TOO SMALL")
+    assert memory.check_cache(ward.patient(told(evictions=3))).state == "ok"
+
+
 def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert memory.check_container(ward.patient()).fact == "this is no container"
+    assert memory.check_container(ward.patient()).fact == "not in a container"
     ward.file("/run/systemd/container", "podman\n")
     assert memory.check_container(ward.patient()).state == "ok"
     monkeypatch.setattr(memory, "CONTAINER_DEFAULT_BYTES", 1 << 60)
@@ -290,7 +301,7 @@ def test_leftovers(ward: Ward) -> None:
     ward.file("/dev/shm/shmmap.default.statistics", "x")
     ward.file("/dev/shm/shmmap.default.lock", "x")
     found = lifetime.check_leftovers(ward.patient())
-    assert (found.state, "default: 1 segments, 8 KiB" in found.fact) == ("warn", True)
+    assert (found.state, "default: 1 segment, 8.0 KiB" in found.fact) == ("warn", True)
     assert lifetime.check_leftovers(ward.patient(told())).state == "ok"
     ward.file("/dev/shm/shmmap.no-such-instance.0123456789abcdef.zombie", "x")
     found = lifetime.check_leftovers(ward.patient(told()))
@@ -335,6 +346,6 @@ def test_logind_without_systemd(ward: Ward) -> None:
 
 def test_reloads(ward: Ward) -> None:
     assert lifetime.check_reload(ward.patient()).state == "ok"
-    assert lifetime.check_reload(ward.patient(told(reloads=3))).fact == "read again 3 times"
+    assert lifetime.check_reload(ward.patient(told(reloads=3))).fact == "the map was read again 3 times"
     found = lifetime.check_reload(ward.patient(told(last_reload_failed=1, last_reload_unix_ns=1)))
     assert (found.state, "shmmap reload" in found.advice) == ("fail", True)

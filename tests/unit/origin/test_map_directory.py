@@ -172,7 +172,7 @@ def test_entries_without_a_file_and_files_without_an_entry(tmp_path: Path) -> No
     catalogue = open_map(root).load()
     assert [Path(catalogue.id(i)).name for i in range(len(catalogue))] == ["t_-20_40.pcd", "t_0_0.pcd"]
     lacking, stray = catalogue.problems
-    assert lacking.endswith("entries without a file, not served: t_20_0.pcd")
+    assert lacking.endswith("entries whose file is missing, not served: t_20_0.pcd")
     assert stray.endswith("files without an entry, not served: stray.PCD")
     with pytest.raises(
         MapDataError, match=r"metadata\.yaml: these entries have no file in .*: t_20_0\.pcd"
@@ -262,9 +262,9 @@ def test_names_that_no_client_could_say(tmp_path: Path) -> None:
     assert len(catalogue) == 2
     odd, lacking = catalogue.problems
     assert odd == (
-        f"the name is no UTF-8: {root}/pointcloud_map.pcd/Stra\\xdfe.pcd, {root}/pointcloud_map.pcd/\\xff"
+        f"the name is not UTF-8: {root}/pointcloud_map.pcd/Stra\\xdfe.pcd, {root}/pointcloud_map.pcd/\\xff"
     )
-    assert lacking.endswith("entries without a file, not served: t_0_0.pcd")
+    assert lacking.endswith("entries whose file is missing, not served: t_0_0.pcd")
 
 
 def test_why_there_is_no_map(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_why_there_is_no_map(tmp_path: Path) -> None:
 def test_path_that_no_client_could_name(tmp_path: Path) -> None:
     odd = os.fsencode(tmp_path) + b"/\xff"
     os.mkdir(odd)
-    with pytest.raises(MapDataError, match="no UTF-8"):
+    with pytest.raises(MapDataError, match="not UTF-8"):
         open_map(os.fsdecode(odd))
 
 

@@ -120,7 +120,7 @@ def test_float_corners_are_read_and_reported() -> None:
     metadata = read(HEAD + "a.pcd: [12.5, -7.25]\nb.pcd: [1200.0, 1e2]\nc.pcd: [1, 2]\n")
     assert contents(metadata) == {"a.pcd": (12.5, -7.25), "b.pcd": (1200.0, 100.0), "c.pcd": (1.0, 2.0)}
     (problem,) = metadata.problems
-    assert "no integer" in problem
+    assert "not an integer" in problem
     assert "a.pcd, b.pcd" in problem
     assert "c.pcd" not in problem
 
@@ -143,7 +143,7 @@ def test_unknown_keys_are_reported_and_in_strict_mode_refused() -> None:
     assert contents(metadata) == {"a.pcd": (1.0, 2.0)}
     (problem,) = metadata.problems
     assert problem == "unknown key ignored: z_resolution, author, nested, ... (4 in all)"
-    with pytest.raises(MapDataError, match=r"line 3: z_resolution is no \[x, y\] corner") as caught:
+    with pytest.raises(MapDataError, match=r"line 3: z_resolution is not an \[x, y\] corner") as caught:
         parse_metadata(text.encode(), path="m.yaml", strict=True)
     assert caught.value.cause == "unknown_key"
 
@@ -182,8 +182,8 @@ def test_the_last_of_repeated_entries_counts() -> None:
         (HEAD + "a.pcd: [1, 2]]\n", "no YAML", "bad_yaml"),
         (HEAD + "a.pcd: *b\n", "line 3: aliases", "bad_yaml"),
         (HEAD + "[a, b]: [1, 2]\n", "line 3: a key must be a name", "bad_yaml"),
-        ("- a\n- b\n", "no mapping", "bad_yaml"),
-        ("just text\n", "no mapping", "bad_yaml"),
+        ("- a\n- b\n", "not a YAML mapping", "bad_yaml"),
+        ("just text\n", "not a YAML mapping", "bad_yaml"),
         (HEAD + "a.pcd: [1, 2]\n\x00", "no YAML", "bad_yaml"),
         (HEAD + "a.pcd: " + "[" * 100_000, "line 3: nested too deeply", "bad_yaml"),
     ],

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from shmmap.cli.entry import main
-from shmmap.errors import BadRequest, MapMissing
-from shmmap.service import program
+from shmmap.errors import BadRequest, ConfigError, MapMissing
+from shmmap.service import installation, program
 from shmmap.service.installation import PlannedFile, configuration, plan_system, plan_user, unit_text, write
 from shmmap.service.program import daemon_command, hidden_directories, outermost, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
@@ -61,6 +61,7 @@ def test_a_map_and_what_would_hide_it(tmp_path: Path, monkeypatch: pytest.Monkey
     drop_in = tmp_path / "etc/systemd/system/shmmapd.service.d/20-map.conf"
     the_map = tmp_path / "a map"
     the_map.mkdir()
+    monkeypatch.setattr(installation, "check_readable", lambda: None)  # this Python may lie anywhere
     for hidden in (True, False):
         monkeypatch.setattr(program, "_HIDDEN", (str(tmp_path),) if hidden else ())
         planned = plan_system(str(the_map), str(tmp_path))
@@ -104,6 +105,64 @@ def test_what_hides_this_python(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program, "_HIDDEN", (str(ROOT), "/no"))
     found = hidden_directories([str(ROOT / "shmmap"), str(ROOT), "", "/no/such/directory"])
     assert found == [str(ROOT)]
+
+
+def test_a_program_that_the_service_cannot_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "venv"
+    place.mkdir()
+    monkeypatch.setattr(sys, "prefix", str(place))
+    tmp_path.chmod(0o755)
+    place.chmod(0o700)
+    words = ["unit", "install", "--root", str(tmp_path / "image")]
+    assert main(words) == 78
+    said = capsys.readouterr().err
+    assert f"only its owner may read {place}\n" in said
+    assert "python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install ." in said
+    assert not (tmp_path / "image").exists()
+    place.chmod(0o755)
+    assert main(words) == 0
+    # a user's own service runs as that user
+    place.chmod(0o700)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    assert main(["unit", "install", "--user", "--dry-run"]) == 0
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_what_lies_above_does_not_matter_where_the_units_show_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: bool
+) -> None:
+    home = tmp_path / "home"
+    (home / "venv").mkdir(parents=True)
+    home.chmod(0o700)
+    monkeypatch.setattr(sys, "prefix", str(home / "venv"))
+    others = [place for place in hidden_directories() if not place.startswith(str(tmp_path))]
+    monkeypatch.setattr(program, "hidden_directories", lambda: others + [str(home / "venv")] * shown)
+    for above in (tmp_path, *tmp_path.parents[:2]):
+        above.chmod(0o755)
+    if shown:
+        program.check_readable()
+    else:
+        with pytest.raises(ConfigError, match=str(home)):
+            program.check_readable()
+
+
+def test_in_an_image_the_program_is_where_the_image_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = tmp_path / "image" / "opt" / "shmmap" / "bin" / "shmmapd"
+    script.parent.mkdir(parents=True)
+    script.write_text("#!/bin/sh\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "prefix", str(script.parent.parent))
+    monkeypatch.setattr(installation, "check_readable", lambda: None)
+    write(plan_system(root=str(tmp_path / "image")))
+    units = tmp_path / "image" / "etc" / "systemd" / "system"
+    for name in ("shmmapd.service", "shmmapd@.service"):
+        assert "\nExecStart=/opt/shmmap/bin/shmmapd " in (units / name).read_text()
+    assert daemon_command() == str(script)
+    assert daemon_command(str(tmp_path / "ima")) == str(script)
 
 
 def test_the_daemon_s_command_starts_the_daemon() -> None:

@@ -21,6 +21,7 @@ from shmmap.errors import OverBudget
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
 from shmmap.protocol.messages import PinnedCell
+from shmmap.quantities import format_bytes
 
 __all__ = ["OperatorPins", "cells_named"]
 
@@ -68,7 +69,8 @@ class OperatorPins:
         total = sum(map(self._size, self._keys.keys() | wanted))
         if wanted and total + ledger.overhead_bytes > ledger.budget_bytes:
             raise OverBudget(
-                f"with these cells {total} bytes would be pinned; the budget is {ledger.budget_bytes} bytes",
+                f"with these cells {format_bytes(total)} would be pinned; the budget is"
+                f" {format_bytes(ledger.budget_bytes)}",
                 hint="unpin others, or serve with a larger --budget",
             )
         for key in wanted - self._keys.keys():

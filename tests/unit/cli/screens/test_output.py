@@ -71,7 +71,7 @@ def test_a_narrow_terminal_is_told_what_is_missing(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("sys.stdout", terminal := Terminal())
     print_table(WIDE, WIDE_ROWS)
     assert "town_0_0.pcd" in terminal.getvalue()
-    assert "no room for X, Y, ID" in terminal.getvalue()
+    assert "hidden (narrow terminal): X, Y, ID" in terminal.getvalue()
     assert "100" not in terminal.getvalue()
 
 

@@ -26,7 +26,7 @@ def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert main(["config", "check", "--json", str(file)]) == 0
     assert json.loads(capsys.readouterr().out) == {"file": str(file), "good": True}
     assert main(["config", "init", str(file)]) == 2
-    assert "exists" in capsys.readouterr().err
+    assert "is there already" in capsys.readouterr().err
     assert main(["config", "init", str(tmp_path / "none" / "x.toml")]) == 73
 
 
@@ -62,7 +62,7 @@ def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert main(["config", "show", "--origin", str(file)]) == 0
     origins = dict(line.split("  # ") for line in capsys.readouterr().out.splitlines())
     traced = {name.split(" = ")[0]: origin for name, origin in origins.items()}
-    assert (traced["map_path"], traced["budget_bytes"], traced["strict"]) == (
+    assert (traced["map_path"], traced["budget"], traced["strict"]) == (
         f"{file}:2",
         "SHMMAP_BUDGET",
         "default",
@@ -70,4 +70,5 @@ def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert main(["config", "show", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["file"] == str(file)
-    assert found["settings"]["budget_bytes"] == {"value": 1 << 20, "origin": "SHMMAP_BUDGET"}
+    for name in ("budget", "budget_bytes"):
+        assert found["settings"][name] == {"value": 1 << 20, "origin": "SHMMAP_BUDGET"}

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Areas and cells on the command line: how they are named, and what is said where there is none."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import numbers
+from shmmap.cli.program import nothing_found
+from shmmap.errors import BadRequest
+from shmmap.quantities import format_metres
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from shmmap.client.client import Client
+    from shmmap.client.map_listing import CellInfo
+    from shmmap.geometry import Area
+
+__all__ = [
+    "add_area_options",
+    "add_cells_argument",
+    "area_from",
+    "area_text",
+    "around",
+    "cells_meant",
+    "check_cells_argument",
+    "extent_text",
+    "moved_by",
+    "no_cell_there",
+    "those_in",
+]
+
+BoxTuple = tuple[float, float, float, float]
+
+
+def add_area_options(
+    parser: argparse.ArgumentParser, group: argparse._MutuallyExclusiveGroup, *, heights: bool = True
+) -> None:
+    """Add ``--circle``, ``--square``, ``--box`` to ``group``, and ``--z`` unless heights mean nothing."""
+    parser.set_defaults(z=None)
+    group.add_argument(
+        "--circle",
+        metavar="X,Y,R",
+        type=lambda t: numbers(t, "X,Y,R"),
+        help="cells within R metres of (X, Y) in the map frame",
+    )
+    group.add_argument(
+        "--square",
+        metavar="X,Y,R",
+        type=lambda t: numbers(t, "X,Y,R"),
+        help="cells that touch a square of half-side R about (X, Y), as Autoware's map loader selects them",
+    )
+    group.add_argument(
+        "--box",
+        metavar="X0,Y0,X1,Y1",
+        type=lambda t: numbers(t, "X0,Y0,X1,Y1"),
+        help="cells that touch a rectangle",
+    )
+    if heights:
+        parser.add_argument(
+            "--z",
+            metavar="MIN,MAX",
+            type=lambda t: numbers(t, "MIN,MAX"),
+            help="only cells with points between these heights",
+        )
+
+
+def area_from(args: argparse.Namespace) -> Area | None:
+    """Return the area the options describe, or None where they name none."""
+    if all(getattr(args, name) is None for name in ("circle", "square", "box", "z")):
+        return None
+    from shmmap import geometry
+
+    z = geometry.ZRange(*args.z) if args.z is not None else None
+    if args.circle is not None:
+        x, y, radius = args.circle
+        return geometry.Circle(x, y, radius, z)
+    if args.square is not None:
+        x, y, radius = args.square
+        return geometry.AutowareSquare(x, y, radius, z)
+    if args.box is not None:
+        min_x, min_y, max_x, max_y = args.box
+        return geometry.Box(min_x, min_y, max_x, max_y, z)
+    raise BadRequest("--z needs an area", hint="add --circle, --square or --box")
+
+
+def those_in(area: Area, boxes: Sequence[BoxTuple]) -> list[int]:
+    """Return which of these boxes touch an area, by index; heights do not count."""
+    import numpy as np
+
+    if not boxes:
+        return []
+    return [int(index) for index in np.flatnonzero(area.overlaps(np.array(boxes, np.float64)))]
+
+
+# --- cells, named or in an area -----------------------------------------------------------------------
+
+
+def add_cells_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``CELL...``, and the areas that may stand for them."""
+    parser.add_argument("cells", metavar="CELL", nargs="*", help="cell ids; a file's name where it is unique")
+    add_area_options(parser, parser.add_mutually_exclusive_group())
+
+
+def check_cells_argument(args: argparse.Namespace, verb: str, *, optional: bool = False) -> Area | None:
+    """Return the area that stands for the cells, None for ids or ``--all``; refuse none or several of them.
+
+    Raises
+    ------
+    BadRequest
+        Cells and an area, or neither where something has to be said.
+    """
+    area = area_from(args)
+    given = [bool(args.cells), area is not None, getattr(args, "all", False)]
+    if sum(given) > 1 or (not any(given) and not optional):
+        choices = "which cells, or an area" + (", or --all" if "all" in args else "")
+        raise BadRequest(f"{verb}: say {choices}", hint=f"shmmap {verb} --help")
+    return area
+
+
+def cells_meant(args: argparse.Namespace, client: Client, area: Area | None) -> list[str]:
+    """Return the ids of the cells that are named or that touch the area."""
+    if area is None:
+        return list(args.cells)
+    return [cell.id for cell in client.metadata(area) if _at_height(area, cell)]
+
+
+def _at_height(area: Area, cell: CellInfo) -> bool:
+    """Whether a cell may have points in the area's heights; those of a cell never loaded are not known."""
+    return area.z is None or cell.z_bounds is None or area.z.overlaps(*cell.z_bounds)
+
+
+# --- where there is nothing ---------------------------------------------------------------------------
+
+
+def area_text(area: Area) -> str:
+    """Return an area as a sentence goes on with it: ``"within 40 m of (10, 20)"``."""
+    from shmmap.geometry import Box, Circle
+
+    if isinstance(area, Box):
+        text = f"in {extent_text(area.bounds)}"
+    elif isinstance(area, Circle):
+        text = f"within {format_metres(area.radius)} m of ({format_metres(area.x)}, {format_metres(area.y)})"
+    else:
+        centre = f"({format_metres(area.x)}, {format_metres(area.y)})"
+        text = f"in the square of half-side {format_metres(area.radius)} m about {centre}"
+    if area.z is not None:
+        text += f" with points between z = {format_metres(area.z.min)} and {format_metres(area.z.max)} m"
+    return text
+
+
+def extent_text(box: BoxTuple) -> str:
+    """Return a rectangle: ``"x -60 .. 60 m, y -60 .. 60 m"``."""
+    min_x, min_y, max_x, max_y = map(format_metres, box)
+    return f"x {min_x} .. {max_x} m, y {min_y} .. {max_y} m"
+
+
+def around(boxes: Iterable[BoxTuple]) -> BoxTuple | None:
+    """Return the rectangle around rectangles; None where there is none."""
+    found = list(boxes)
+    if not found:
+        return None
+    low_x, low_y, high_x, high_y = zip(*found, strict=True)
+    return min(low_x), min(low_y), max(high_x), max(high_y)
+
+
+def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
+    """Return what has to be added to a map's coordinates to get those of the clouds it was divided from.
+
+    None where nothing was moved, where somebody else made the map, and where its files are not here.
+    """
+    map_dir = os.path.dirname(os.path.dirname(id_prefix + "_"))
+    if not os.path.exists(os.path.join(map_dir, "shmmap_divide.json")):
+        return None
+    from shmmap.dividing.report import read_report
+    from shmmap.errors import MapDataError
+
+    try:
+        report = read_report(map_dir)
+        x, y, z = map(float, report["origin"]) if report else (0.0, 0.0, 0.0)
+    except (MapDataError, KeyError, TypeError, ValueError):
+        return None  # not ours after all
+    return (x, y, z) if (x, y, z) != (0.0, 0.0, 0.0) else None
+
+
+def no_cell_there(args: argparse.Namespace, client: Client, area: Area) -> int:
+    """Say that no cell of the map touches an area, and where the map is; returns the exit code."""
+    welcome = client.welcome
+    spans = f"the map spans {extent_text(welcome.bounds)}" if welcome.bounds else "the map has no cells"
+    hint = ""
+    if (origin := moved_by(welcome.id_prefix)) is not None:
+        x, y, z = map(format_metres, origin)
+        hint = (
+            "the points were moved near the map's origin when they were divided: subtract"
+            f" ({x}, {y}, {z}) from coordinates of the cloud"
+        )
+    return nothing_found(args, f"no cell {area_text(area)}; {spans}", hint)
