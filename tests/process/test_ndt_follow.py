@@ -67,6 +67,7 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     words += ["--steady", "--odometry", str(drive.truth), "--tum", str(tmp_path / "out.tum")]
     address = f"ipc://{tmp_path}/poses"
     words += ["--plot", str(tmp_path / "out.svg"), "--publish", address, "--listener-wait", "60", "--json"]
+    words += ["--json-lines", str(tmp_path / "out.jsonl")]
     listener = subprocess.Popen(
         [sys.executable, "-m", "tests.support.pose_listener", address, "36"],
         stdout=subprocess.PIPE,
@@ -83,8 +84,17 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     assert summary["frames"] == summary["trustworthy"] == 36
     assert summary["errors"]["ate_m"]["max"] < 0.2
     assert summary["errors"]["rte"]["10.0"] < 2.0
+    lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [line["name"] for line in lines] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]
+    assert max(line["error_m"] for line in lines) == pytest.approx(summary["errors"]["ate_m"]["max"])
+    squares = np.array([line["error_m"] for line in lines]) ** 2
+    assert np.sqrt(squares.mean()) == pytest.approx(summary["errors"]["ate_rmse_m"])
+    assert max(line["error_deg"] for line in lines) == pytest.approx(summary["errors"]["ate_deg"]["max"])
     written = read_trajectory(tmp_path / "out.tum")
     assert len(written) == 36
+    np.testing.assert_allclose(
+        [line["pose"][:3] for line in lines], written.T_map_sensor[:, :3, 3], atol=1e-8
+    )
     ElementTree.parse(tmp_path / "out.svg")
     # the listener has every pose, in order
     assert [pose["name"] for pose in heard] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, TextIO
 
 from shmmap_clients.command_line import (
     add_daemon_options,
@@ -30,6 +32,23 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 
+_JSON = """\
+--json prints one document at the end:
+  {"frames", "converged", "trustworthy", "waited", "too_slow", "cut_frames",
+   "errors": null without a truth, else
+     {"ate_rmse_m", "ate_m": spread, "ate_deg": spread, "rte": {metres: m per 100 m}},
+   "transform_probability", "nvtl", "iterations", "latency_ms", "align_ms",
+   "thin_ms", "map_ms", "map_request_ms", "map_build_ms": spread each,
+   "map_updates", "cells_added", "cells_removed", "map_private_bytes"}
+  a spread is {"mean", "variance", "p50", "p99", "max"}; ate is the distance of each
+  pose to the true one in metres, or degrees.
+--json-lines writes a line for each scan, as soon as it is localized:
+  {"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged", "trustworthy",
+   "iterations", "transform_probability", "nvtl", "waited", "latency_ms",
+   "error_m", "error_deg": distance to the true pose, null without a truth}
+Exit code: 0; 1 where a scan could not be trusted, or the map did not keep up."""
+
+
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
@@ -38,11 +57,8 @@ def add_parser(subparsers: Any) -> None:
         description="Localize scan after scan in the map that a daemon serves.  Scans come from a directory"
         " (PCD, NPZ, KITTI .bin; by name) or a ZeroMQ endpoint; the map around the vehicle is kept by"
         " Autoware's rules in a thread of its own.",
-        epilog="JSON: frames, converged, trustworthy, waited, too_slow, cut_frames, errors (null, or ate_m,"
-        " ate_deg, ate_rmse_m, rte by metres), transform_probability, nvtl, iterations, latency_ms, align_ms,"
-        " thin_ms, map_ms, map_updates, cells_added, cells_removed, map_request_ms, map_build_ms,"
-        " map_private_bytes; a spread is mean, variance, p50, p99, max.  Exit code 1: a scan could not be"
-        " trusted, or the map did not keep up.",
+        epilog=_JSON,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--scans", required=True, metavar="DIR|ENDPOINT")
     parser.add_argument(
@@ -86,6 +102,9 @@ def add_parser(subparsers: Any) -> None:
     out.add_argument(
         "--plot", type=output_file, metavar="FILE", help="write an SVG of way, errors and latency"
     )
+    out.add_argument(
+        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: standard output)"
+    )
     add_json_option(out)
     add_daemon_options(parser)
     parser.set_defaults(run=run)
@@ -99,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.drive.drive_plot import drive_svg
     from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
     from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
+    from shmmap_clients.ndt_scan_matcher.drive.frame_json import frame_document
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, Prediction
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
@@ -148,6 +168,7 @@ def run(args: argparse.Namespace) -> int:
         if args.tum:
             stack.enter_context(writing_errors(str(args.tum)))
             tum = stack.enter_context(open(args.tum, "w", encoding="utf-8"))
+        lines = stack.enter_context(_line_writer(args.json_lines))
         told = 0
         scan = first
         while scan is not None and (args.frames is None or len(frames) < args.frames):
@@ -159,6 +180,9 @@ def run(args: argparse.Namespace) -> int:
                 publisher.send(frame)
             if tum is not None:
                 tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
+            if lines is not None:
+                lines.write(json.dumps(frame_document(frame), allow_nan=False) + "\n")
+                lines.flush()
             if maps.too_slow > told:
                 told = maps.too_slow
                 _say(f"shmmap-ndt: error: the map is not keeping up at {frame.name}; the scan waited for it")
@@ -174,6 +198,16 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print(summary)
     return 0 if summary.trustworthy == summary.frames and not summary.too_slow else 1
+
+
+@contextlib.contextmanager
+def _line_writer(name: str | None) -> Iterator[TextIO | None]:
+    """Open the file of ``--json-lines``; its name ``-`` is standard output."""
+    if name is None or name == "-":
+        yield sys.stdout if name else None
+        return
+    with writing_errors(name), open(name, "w", encoding="utf-8") as file:
+        yield file
 
 
 def _paced(scans: Any, rate: float) -> Any:
