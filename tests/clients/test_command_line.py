@@ -7,10 +7,11 @@ import argparse
 from pathlib import Path
 
 import pytest
-from shmmap_clients.command_line import at_least, output_file, positive, write_text
+from shmmap_clients.command_line import at_least, output_file, write_text
 from shmmap_clients.elevation_map.cli import main as elevation
 from shmmap_clients.ndt_scan_matcher.cli import main as ndt
 from shmmap_clients.pose_initializer.cli import main as pose_init
+from shmmap_clients.shared_options import positive
 
 from shmmap import CannotWrite
 
@@ -58,7 +59,7 @@ def test_programs_tell_it_without_a_traceback(tmp_path: Path, capsys: pytest.Cap
         (ndt, ["follow", "--scans", ".", "--odometry-wait", "nan"]),
         (elevation, ["build", "--wait", "-1"]),
         (elevation, ["build", "--epsg", "-3"]),
-        (pose_init, ["--scan", "s.pcd", "--pose", "0,0,0", "--seed", "-1"]),
+        (pose_init, ["--scan", "s.pcd", "--pose", "0,0,0,0,0,0", "--seed", "-1"]),
     ],
 )
 def test_impossible_numbers_exit_2(

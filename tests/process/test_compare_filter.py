@@ -150,7 +150,7 @@ def test_files_to_files(daemon: Factory, divided_map: DividedMap, drive: list[Sc
     one = daemon(divided_map.root)
     words = [
         "follow", "--scans", f"{tmp_path}/scans", "--poses", f"{tmp_path}/poses.txt", "--mode", "distance",
-        "--radius", "100", "--endpoint", one.endpoint, "--out", f"{tmp_path}/out", "--json",
+        "--map-radius", "100", "--endpoint", one.endpoint, "--out", f"{tmp_path}/out", "--json",
         "--picture", f"{tmp_path}/drive.svg",
     ]  # fmt: skip
     done = run(*words)
@@ -184,7 +184,18 @@ def test_sockets_to_sockets(
 ) -> None:
     one = daemon(divided_map.root)
     source, sink = f"ipc://{tmp_path}/in", f"ipc://{tmp_path}/out"
-    command = [*PROGRAM, "follow", "--scans", source, "--out", sink, "--mode", "distance", "--radius", "100"]
+    command = [
+        *PROGRAM,
+        "follow",
+        "--scans",
+        source,
+        "--out",
+        sink,
+        "--mode",
+        "distance",
+        "--map-radius",
+        "100",
+    ]
     with ScanPublisher(source) as publisher, ScanSubscriber(sink) as subscriber:
         process = subprocess.Popen(
             [*command, "--endpoint", one.endpoint, "--wait", str(LONG_S), "--quiet"],
@@ -212,7 +223,7 @@ def test_without_a_daemon(drive: list[Scan], divided_map: DividedMap, tmp_path: 
     pose = tum_line(0.0, scan.T_map_sensor if scan.T_map_sensor is not None else np.eye(4)).split()[1:]
     done = run(
         "apply", "--map", divided_map.id(name), "--scan", f"{tmp_path}/scans/{scan.name}.npz",
-        "--pose", ",".join(pose), "--mode", "distance", "--json",
+        "--pose", ",".join(pose), "--pose-format", "tum", "--mode", "distance", "--json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["points"] == 600

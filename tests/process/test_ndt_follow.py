@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
-from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
+from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
@@ -36,17 +36,17 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
 def test_a_drive_whose_window_moves(drive: TownDrive, daemon: DaemonFactory) -> None:
     one = daemon(drive.map_dir)
     rules = MapRules(update_distance=10.0, map_radius=60.0, lidar_radius=40.0)
-    frames: list[Frame] = []
+    statistics = DriveStatistics()
     with (
         NdtMatcher(Settings(mode="coarse_fine")) as matcher,
         MapUpdater(one.endpoint, rules, prepare=matcher.prepare) as maps,
     ):
         follower = Follower(matcher, maps, ConstantVelocity(matrix_from_pose(drive.poses[0])), thin=0.5)
         for scan in ScanSequence(drive.scans, read_trajectory(drive.truth)):
-            frames.append(follower.follow(scan))
+            statistics.add(follower.follow(scan))
             assert maps.wait_until_current(60.0)  # a drive at full speed would outrun the map
         assert maps.error is None
-        summary = summarize(frames, maps.updates, maps.too_slow)
+    summary = statistics.summary(maps.statistics, maps.too_slow, matcher.trust)
     assert summary.frames == summary.converged == summary.trustworthy == 36
     assert summary.too_slow == 0
     assert summary.waited == 1  # the first: there was no map before

@@ -34,7 +34,7 @@ from shmmap_clients.elevation_map.seams import ColumnBox, Seams, column_boxes
 
 __all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map"]
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 _EVERY: Final = 64  # cells between checkpoints
 
 
@@ -68,6 +68,8 @@ class BuiltElevation:
         Cells of the map.
     loaded
         Of those, how many this call had to load: 0 where the cache had it all.
+    occupied
+        Columns with a point; in the ``surface`` rule not all of them have a height.
     stray
         Points left out because they lie outside the box of their cell.
     failed
@@ -78,6 +80,7 @@ class BuiltElevation:
     map_version: int
     cells: int
     loaded: int
+    occupied: int
     stray: int
     failed: tuple[CellError, ...]
 
@@ -185,7 +188,9 @@ def _build(
         complete = seams.add(number, rows)
         del rows, cell
         if complete is not None:
-            grid.put(*heights_of(complete, rule))
+            i, j, heights = heights_of(complete, rule)
+            state.occupied += len(i)
+            grid.put(i, j, heights)
         state.done = number + 1
         if not failed and (state.done % _EVERY == 0 or state.done == len(order)):
             journal.write(state, seams)
@@ -193,7 +198,9 @@ def _build(
             progress(BuildProgress(state.done, len(order), state.rows))
     client.release()
     loaded = len(order) - begun
-    return BuiltElevation(grid, listing.map_version, len(order), loaded, state.stray, tuple(failed))
+    return BuiltElevation(
+        grid, listing.map_version, len(order), loaded, state.occupied, state.stray, tuple(failed)
+    )
 
 
 def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:

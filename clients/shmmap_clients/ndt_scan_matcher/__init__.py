@@ -9,29 +9,32 @@
     matcher.set_map(VoxelMap({"map": voxel_cell(points, leaf=2.0)}))
     result = matcher.align(scan, T_guess)
 
-The same result as Autoware's, ndt_omp's or PCL's program, by the chosen convention; see `Settings`.
+The same result as Autoware's, ndt_omp's or PCL's program, by the chosen variant; see `Settings`.
 """
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import BACKENDS, Backend
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
+from shmmap_clients.ndt_scan_matcher.backends.registry import BACKENDS
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
-from shmmap_clients.ndt_scan_matcher.matching.limits import Caps, Cut
+from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
 from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
 from shmmap_clients.ndt_scan_matcher.matching.result import Result
+from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 
 __all__ = [
     "BACKENDS",
     "Backend",
-    "Caps",
     "Cut",
     "Evaluation",
+    "Limits",
     "NdtMatcher",
     "Regularization",
     "Result",
     "Settings",
+    "TrustLimits",
     "VoxelCell",
     "VoxelMap",
     "cell_from_layer",

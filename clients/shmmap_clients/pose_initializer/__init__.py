@@ -11,6 +11,7 @@
 
 from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
 from shmmap_clients.pose_initializer.initializer import InitializerRules, PoseInitializer
+from shmmap_clients.pose_initializer.relocalizer import Relocalizer
 from shmmap_clients.pose_initializer.rough_pose import RoughPose
 
-__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "RoughPose"]
+__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "Relocalizer", "RoughPose"]

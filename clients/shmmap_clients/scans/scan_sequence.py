@@ -36,12 +36,15 @@ class Scan:
         ``xyz`` (N, 3) float32 or float64, sensor frame, metres; other columns of as many rows.
     T_map_sensor
         (4, 4) float64; None where it is not known.
+    no_map
+        Its points were filtered with a map, but there was none around it.
     """
 
     name: str
     stamp_s: float
     columns: dict[str, NDArray[Any]] = field(repr=False)
     T_map_sensor: NDArray[np.float64] | None = None
+    no_map: bool = False
 
     @property
     def xyz(self) -> NDArray[Any]:

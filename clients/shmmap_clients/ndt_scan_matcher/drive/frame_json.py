@@ -19,9 +19,11 @@ def frame_document(frame: Frame) -> dict[str, Any]:
     -------
     dict
         ``name``; ``stamp_s``; ``pose``: x, y, z (metres, map frame) and the quaternion qx, qy, qz, qw;
-        ``converged``, ``trustworthy``; ``iterations``, ``transform_probability``, ``nvtl``; ``waited``: for
-        the map; ``latency_ms``: from having the scan to having the pose; ``error_m`` and ``error_deg``:
-        distance and angle to the true pose, null where the scan has none.
+        ``converged``, ``trustworthy``, and ``failed_limits``: why not, see `TrustLimits.failed`;
+        ``no_map``; ``state``: ``tracking``, ``uncertain`` or ``lost``; ``relocalized``; ``iterations``,
+        ``transform_probability``, ``nvtl``; ``waited``: for the map; ``latency_ms``: from having the scan to
+        having the pose; ``error_m`` and ``error_deg``: distance and angle to the true pose, null where the
+        scan has none.
     """
     result = frame.result
     T = result.T_map_base
@@ -35,6 +37,10 @@ def frame_document(frame: Frame) -> dict[str, Any]:
         "pose": [*T[:3, 3].tolist(), *quaternion_of(T[:3, :3])],
         "converged": result.converged,
         "trustworthy": result.trustworthy,
+        "failed_limits": list(result.failed_limits),
+        "no_map": result.no_map,
+        "state": frame.state,
+        "relocalized": frame.relocalized,
         "iterations": result.iterations,
         "transform_probability": result.transform_probability,
         "nvtl": result.nvtl,

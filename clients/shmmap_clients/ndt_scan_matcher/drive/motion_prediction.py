@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shmmap_clients.scans.trajectory import Trajectory
 
-__all__ = ["ConstantVelocity", "Odometry", "Prediction", "interpolate"]
+__all__ = ["ConstantVelocity", "MotionPrediction", "Odometry", "interpolate"]
 
 Matrix = NDArray[np.float64]
 
@@ -40,6 +40,11 @@ class ConstantVelocity:
         """Learn where it was."""
         if self._stamp_s is not None and stamp_s > self._stamp_s:
             self._twist = _motion(np.linalg.inv(self._last) @ T_map_base) / (stamp_s - self._stamp_s)
+        self._last, self._stamp_s = T_map_base, stamp_s
+
+    def restart(self, stamp_s: float, T_map_base: Matrix) -> None:
+        """Begin again at a pose that was found without the ones before: it stands still until the next."""
+        self._twist = np.zeros(6)
         self._last, self._stamp_s = T_map_base, stamp_s
 
     @property
@@ -75,7 +80,7 @@ class Odometry(ConstantVelocity):
         return np.asarray(self._last @ np.linalg.inv(before) @ now, np.float64)
 
 
-Prediction = ConstantVelocity
+MotionPrediction = ConstantVelocity
 
 
 def interpolate(trajectory: Trajectory, stamp_s: float) -> Matrix | None:
