@@ -193,7 +193,9 @@ def test_without_a_daemon_the_program_says_so(drive: TownDrive, tmp_path: Path) 
     done = subprocess.run([*PROGRAM, *words, "--truth", str(drive.truth)], capture_output=True, text=True)
     assert done.returncode == 69
     assert "shmmap-ndt:" in done.stderr
-    assert subprocess.run([*PROGRAM, *words], capture_output=True).returncode == 2  # and where to start?
+    nowhere = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+    assert nowhere.returncode == 2
+    assert nowhere.stderr.startswith("shmmap-ndt: no start pose: give --init, --rough or --truth")
 
 
 def test_many_clients_share_one_map(daemon: DaemonFactory, tmp_path: Path) -> None:

@@ -156,7 +156,7 @@ class PoseInitializer:
         rough
             Where it was probably taken.
         effort
-            So many times the rules' candidates and starts.
+            So many times as many candidates are drawn from the rough pose as by the rules.
 
         Raises
         ------
@@ -171,7 +171,6 @@ class PoseInitializer:
         height = self.rules.height
         # the rough z is a guess of GNSS; the ground of the map is known to centimetres
         heights = [z + height for z in grounds] if height is not None and grounds else [rough.z]
-        candidates, starts_wanted = self.rules.candidates * effort, self.rules.starts * effort
 
         def pose_of(candidate: NDArray[np.float64], z: float) -> NDArray[np.float64]:
             x, y, yaw = candidate
@@ -182,9 +181,9 @@ class PoseInitializer:
             return np.array([at.score for at in found])
 
         estimator = ParzenEstimator(rough, self.rules.seed)
-        half = max(1, candidates // 2)
-        batches = [half, *(_split(candidates - half, 4))]
-        first = estimator.first(half)
+        half = max(1, self.rules.candidates // 2)
+        batches = [half * effort, *(_split(self.rules.candidates - half, 4))]
+        first = estimator.first(batches[0])
         by_height = [scores(first, z) for z in heights]
         best_height = int(np.argmax([one.max() for one in by_height]))
         z = heights[best_height]
@@ -192,7 +191,7 @@ class PoseInitializer:
         for size in batches[1:]:
             batch = estimator.next(size)
             estimator.learn(batch, scores(batch, z))
-        starts = estimator.best(starts_wanted, _SEED_APART_M, _SEED_APART_YAW)
+        starts = estimator.best(self.rules.starts, _SEED_APART_M, _SEED_APART_YAW)
         near = [self._coarse.align(points, matrix_from_pose(pose_of(start, z))) for start in starts]
         near.sort(key=lambda result: -result.transform_probability)
         finals = [self._fine.align(points, one.T_map_base) for one in _apart(near)[: self.rules.finals]]

@@ -20,10 +20,10 @@ _DOUBLINGS: Final = 3
 
 
 class Relocalizer:
-    """Searches around the last trusted pose; after each failure twice as far, up to eight times.
+    """Searches around a probable pose; after each failure twice as far, up to eight times.
 
-    Twice as far takes twice as many candidates.  The search begins at ``sigma_m`` again when it has found the
-    vehicle.  It is a `shmmap_clients.ndt_scan_matcher.drive.follower.Relocalize`.
+    Twice as far takes twice as many candidates to begin with.  The search begins at ``sigma_m`` again when it
+    has found the vehicle.  It is a `shmmap_clients.ndt_scan_matcher.drive.follower.Relocalize`.
 
     Parameters
     ----------
@@ -49,18 +49,18 @@ class Relocalizer:
         self._failures = 0
         self.error: ShmmapError | None = None
 
-    def __call__(self, points: NDArray[np.floating], T_last: NDArray[np.float64]) -> Result | None:
+    def __call__(self, points: NDArray[np.floating], T_guess: NDArray[np.float64]) -> Result | None:
         """Return a trusted result, or None.
 
         Parameters
         ----------
         points : (N, 3)
             The scan, base frame, metres.
-        T_last : (4, 4)
-            Where the vehicle was last.
+        T_guess : (4, 4)
+            Where it was probably taken.
         """
         wider = 2 ** min(self._failures, _DOUBLINGS)
-        x, y, z, roll, pitch, yaw = pose_from_matrix(T_last).tolist()
+        x, y, z, roll, pitch, yaw = pose_from_matrix(T_guess).tolist()
         rough = RoughPose(
             x, y, z, roll, pitch, yaw, sigma_m=self._sigma_m * wider, sigma_yaw=self._sigma_yaw * wider
         )

@@ -11,8 +11,9 @@ from shmmap_clients.shared_options import add_backend_option, add_threads_option
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
+    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 
-__all__ = ["add_alignment_options", "matcher_from"]
+__all__ = ["add_alignment_options", "matcher_from", "trust_from"]
 
 
 def add_alignment_options(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +91,6 @@ def matcher_from(args: argparse.Namespace) -> NdtMatcher:
     """Return the matcher that the options ask for."""
     from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
-    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 
     settings = Settings(
         variant=args.variant,
@@ -108,5 +108,13 @@ def matcher_from(args: argparse.Namespace) -> NdtMatcher:
         "voxels": args.max_voxels,
     }
     limits = Limits(**{name: value for name, value in given.items() if value is not None})
-    trust = TrustLimits(args.trust_nvtl, args.trust_tp, args.trust_oscillations)
-    return NdtMatcher(settings, limits=limits, trust=trust, backend=args.backend, threads=args.threads)
+    return NdtMatcher(
+        settings, limits=limits, trust=trust_from(args), backend=args.backend, threads=args.threads
+    )
+
+
+def trust_from(args: argparse.Namespace) -> TrustLimits:
+    """Return the limits of trust that the options ask for."""
+    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+
+    return TrustLimits(args.trust_nvtl, args.trust_tp, args.trust_oscillations)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from shmmap_clients.command_line import connect, print_json, write_text
-from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from
+from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, trust_from
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.pose_option import pose_from
@@ -144,7 +144,9 @@ def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Reloc
 
     def initializer() -> PoseInitializer:
         client = stack.enter_context(connect(args, "shmmap-ndt (relocalization)"))
-        made = PoseInitializer(client, rules, backend=args.backend, threads=args.threads)
+        made = PoseInitializer(
+            client, rules, trust=trust_from(args), backend=args.backend, threads=args.threads
+        )
         return stack.enter_context(made)
 
     return Relocalizer(initializer, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)

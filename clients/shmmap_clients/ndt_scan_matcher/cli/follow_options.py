@@ -35,8 +35,8 @@ A scan's result is trusted when it is within all limits of trust.  The vehicle i
   tracking   since a result was trusted,
   uncertain  at the beginning, and when a result is not trusted,
   lost       after --lost-after results in a row that are not, or where there is no map.
-A pose that is not trusted is printed and published as such; the next scan is then
-predicted from odometry or constant velocity alone.
+A pose that is not trusted is marked so; the next scan is then predicted from odometry
+or constant velocity alone, and without odometry a lost vehicle stands.
 
 JSON (fields may be added, none is removed); --json prints one document at the end:
   {"frames", "converged", "trustworthy", "no_map", "lost": scans after which it was so,
@@ -123,14 +123,14 @@ def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--relocalize",
         action="store_true",
-        help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose: with each"
-        " scan until it is found, each time twice as far, up to eight times --sigma",
+        help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose and what odometry"
+        " has added: with each scan until it is found, each time twice as far, up to eight times --sigma",
     )
     add_pose_option(
         group, "--rough", "start pose that is metres and degrees off: search around it; implies --relocalize"
     )
     add_sigma_options(group)
-    add_height_option(group, default=None, shown="as at the last trusted pose")
+    add_height_option(group, default=None, shown="what the pose searched around says")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:

@@ -79,8 +79,8 @@ class Follower:
     tracking
         Says when the vehicle is lost.
     relocalize
-        Called with each scan of a lost vehicle, (N, 3), metres, and the last pose that was trusted (at first
-        the pose where the drive begins), (4, 4): returns a result that is trusted, or None.
+        Called with each scan of a lost vehicle, (N, 3), metres, and the pose where it probably is, (4, 4):
+        returns a result that is trusted, or None.
     """
 
     def __init__(
@@ -99,7 +99,6 @@ class Follower:
         self._thin = thin
         self._tracking = tracking if tracking is not None else Tracking()
         self._relocalize = relocalize
-        self._T_trusted: NDArray[np.float64] | None = None
         self._jumped = False
         self._map: VoxelMap | None = None
 
@@ -114,8 +113,6 @@ class Follower:
         begin = time.perf_counter()
         points = thinned(scan.xyz, self._thin)
         T_guess = self._prediction.predict(scan.stamp_s)
-        if self._T_trusted is None:
-            self._T_trusted = T_guess
         thinned_at = time.perf_counter()
         vx, vy = self._prediction.velocity
         voxel_map, waited = self._maps.map_at(
@@ -131,17 +128,14 @@ class Follower:
         state = self._tracking.update(result)
         relocalized = False
         if state == "lost" and self._relocalize is not None:
-            found = self._relocalize(points, self._T_trusted)
+            found = self._relocalize(points, T_guess)
             if found is not None:
                 result, relocalized, self._jumped = found, True, True
                 state = self._tracking.update(result)
-        if result.trustworthy:
-            self._T_trusted = result.T_map_base
-        if relocalized:
-            self._prediction.restart(scan.stamp_s, result.T_map_base)
-        else:
-            # a pose that is not trusted teaches the prediction nothing but to go on
-            self._prediction.correct(scan.stamp_s, result.T_map_base if result.trustworthy else T_guess)
+        # a pose that is not trusted teaches the prediction nothing but to go on
+        self._prediction.correct(scan.stamp_s, result.T_map_base if result.trustworthy else T_guess)
+        if relocalized or state == "lost":
+            self._prediction.hold()
         return Frame(
             name=scan.name,
             stamp_s=scan.stamp_s,

@@ -42,10 +42,9 @@ class ConstantVelocity:
             self._twist = _motion(np.linalg.inv(self._last) @ T_map_base) / (stamp_s - self._stamp_s)
         self._last, self._stamp_s = T_map_base, stamp_s
 
-    def restart(self, stamp_s: float, T_map_base: Matrix) -> None:
-        """Begin again at a pose that was found without the ones before: it stands still until the next."""
+    def hold(self) -> None:
+        """Forget the velocity: the last two poses do not tell it, or it was long ago."""
         self._twist = np.zeros(6)
-        self._last, self._stamp_s = T_map_base, stamp_s
 
     @property
     def velocity(self) -> tuple[float, float]:
