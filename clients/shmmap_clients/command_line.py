@@ -9,7 +9,9 @@ cannot be written; 75 busy; 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Protocol
 
@@ -18,6 +20,7 @@ from shmmap.cli.programs import (
     Parser,
     add_daemon_options,
     add_json_option,
+    add_verb,
     at_least,
     connect,
     exit_code_of,
@@ -30,11 +33,12 @@ from shmmap.cli.programs import (
 )
 
 __all__ = [
-    "MissingPackage",
+    "PackageMissing",
     "Verb",
     "add_allow_empty_option",
     "add_daemon_options",
     "add_json_option",
+    "add_verb",
     "at_least",
     "connect",
     "nothing_found",
@@ -48,10 +52,10 @@ __all__ = [
 ]
 
 
-class MissingPackage(ShmmapError):
+class PackageMissing(ShmmapError):
     """A package that the program needs is not installed, as in a client-only install."""
 
-    code = "missing_package"
+    code = "package_missing"
     exit_code: ClassVar[int] = 69  # EX_UNAVAILABLE of sysexits.h: a support program does not exist
 
 
@@ -103,8 +107,12 @@ def run_command(
     argv
         Words after the program's name; those of this process by default.
     """
-    formatter = argparse.RawDescriptionHelpFormatter
-    parser = Parser(prog=name, description=description, epilog=epilog, formatter_class=formatter)
+    parser = Parser(
+        prog=name,
+        description=textwrap.fill(description, shutil.get_terminal_size().columns - 2),
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     add_options(parser)
     parser.set_defaults(run=run)
     return _guarded(name, parser, argv)
@@ -119,9 +127,9 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
             package = (error.name or "").partition(".")[0]
             if package in ("", "shmmap", "shmmap_clients"):
                 raise  # a defect, not an install without it
-            raise MissingPackage(
-                f"the package {package} is not installed",
-                hint="install shmmap with all its dependencies: the client-only install has no programs",
+            raise PackageMissing(
+                f"this needs the package {package}, which is not installed",
+                hint="install shmmap with all its dependencies: a client-only install has no programs",
             ) from None
         return code
 

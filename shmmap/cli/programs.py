@@ -5,6 +5,7 @@ The rest of `shmmap.cli` may change at any time; these names, their parameters a
 
 ================== ====================================================================================
 Parser             an `argparse.ArgumentParser` that complains as ``shmmap`` does, and knows no abbreviations
+add_verb           a verb's parser; texts of several lines are shown as they are written
 join_negative_values  words in which ``--pose -5,3`` is one option
 exit_code_of       runs a program; errors go to stderr, with a hint, and become exit codes
 add_daemon_options ``--instance --endpoint --runtime-dir --shm-dir --timeout``: which daemon
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 from shmmap.cli.daemon_address import connect
 from shmmap.cli.files import output_file, write_text, writing_errors
-from shmmap.cli.options import add_daemon_options, add_json_option, at_least, seconds
+from shmmap.cli.options import add_daemon_options, add_json_option, add_verb, at_least, seconds
 from shmmap.cli.program import Parser, exit_code_of, join_negative_values
 from shmmap.cli.screens.output import print_json
 
@@ -29,6 +30,7 @@ __all__ = [
     "Parser",
     "add_daemon_options",
     "add_json_option",
+    "add_verb",
     "at_least",
     "connect",
     "exit_code_of",

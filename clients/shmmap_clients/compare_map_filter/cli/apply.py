@@ -9,6 +9,7 @@ from typing import Any, Final
 from shmmap_clients.command_line import (
     add_allow_empty_option,
     add_json_option,
+    add_verb,
     nothing_found,
     output_file,
     print_json,
@@ -24,19 +25,20 @@ __all__ = ["add_parser", "run"]
 _EPILOG: Final = """\
 JSON (fields may be added, none is removed):
   {"points", "kept", "no_map": bool, "compare_ms"}
-The file written has the kept points with all fields, and a column index, their rows in
-the scan; with --mask all points, and a column kept.
+The file written has the kept points with all fields, and a column index: their
+rows in the scan; with --mask all points, and a column kept.
 Exit code: 0; 1 when there is no map around the scan, or no point is kept."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "apply",
+        run,
         help="filter one scan with one map file; no daemon",
         description="Filter one scan with one map file; no daemon is needed.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--map", required=True, metavar="FILE", help="map: PCD, NPZ or any other cloud file")
     add_scan_option(parser)
@@ -51,7 +53,6 @@ def add_parser(subparsers: Any) -> None:
     )
     add_allow_empty_option(out)
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from shmmap_clients.command_line import (
     add_allow_empty_option,
     add_daemon_options,
     add_json_option,
+    add_verb,
     connect,
     nothing_found,
     output_file,
@@ -35,28 +36,31 @@ __all__ = ["add_parser", "run"]
 
 _NAME: Final = "shmmap-compare"
 _EPILOG: Final = """\
-JSON (fields may be added, none is removed); --json prints one document at the end:
+JSON (fields may be added, none is removed).
+--json prints one document at the end:
   {"scans", "points", "kept", "no_map_scans": without a map around them,
    "incomplete_scans": compared while cells around them were missing,
    "first_missing": the first of these and what it lacked, or null,
    "updates": how often the cells around the vehicle changed,
    "compare_ms", "update_ms": {"p50", "p99", "max"}, or null}
 --json-lines writes a line for each scan:
-  {"name", "stamp_s", "points", "kept", "cells", "no_map", "missing": text or null,
-   "compare_ms", "update_ms"}
-Exit code: 0; 1 when a scan had no map around it, cells were missing, there was no scan,
-or no point was kept."""
+  {"name", "stamp_s", "points", "kept", "cells", "no_map",
+   "missing": text or null, "compare_ms", "update_ms"}
+
+Exit code: 0; 1 when a scan had no map around it, cells were missing, there was
+no scan, or no point was kept."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "follow",
+        run,
         help="filter scan after scan around the moving vehicle",
         description="Filter scan after scan with the daemon's map around their poses: what the map explains"
         " is removed.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_scans_option(parser)
     parser.add_argument(
@@ -97,7 +101,6 @@ def add_parser(subparsers: Any) -> None:
     add_allow_empty_option(out)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

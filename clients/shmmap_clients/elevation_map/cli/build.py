@@ -14,6 +14,7 @@ from shmmap_clients.command_line import (
     add_allow_empty_option,
     add_daemon_options,
     add_json_option,
+    add_verb,
     at_least,
     connect,
     nothing_found,
@@ -39,7 +40,7 @@ _FEW: Final = 0.5
 _EPILOG: Final = """\
 JSON (fields may be added, none is removed):
   {"map_version": hex, "cells", "loaded": cells that this run loaded,
-   "rows", "columns": of the grid, "resolution", "origin": its south-west corner,
+   "rows", "columns": of the grid, "resolution", "origin": south-west corner,
    "occupied": columns with a point, "measured": columns with a height,
    "measured_share": of the occupied ones, or null, "filled": columns,
    "stray": points outside their cell, "failed": [{"id", "code", "message"}],
@@ -49,13 +50,14 @@ Exit code: 0; 1 when cells could not be loaded, or no column has a height."""
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "build",
+        run,
         help="make an elevation map of the whole map",
         description="Make an elevation map of the daemon's whole map, one cell at a time, and write it.  What"
         " was made before is cached for each version of the map, and an interrupted run goes on.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--out",
@@ -125,7 +127,6 @@ def add_parser(subparsers: Any) -> None:
     add_allow_empty_option(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

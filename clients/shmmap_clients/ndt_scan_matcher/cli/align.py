@@ -9,6 +9,7 @@ from typing import Any
 from shmmap_clients.command_line import (
     add_allow_empty_option,
     add_json_option,
+    add_verb,
     nothing_found,
     print_json,
 )
@@ -20,25 +21,28 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
 JSON (fields may be added, none is removed):
-  {"T_map_base": 4x4 in metres, "iterations", "converged", "transform_probability",
-   "nvtl", "oscillations", "evaluations", "trustworthy": bool, "no_map": bool,
-   "failed_limits": [name] of no_map, converged, nvtl, transform_probability, oscillations,
+  {"T_map_base": 4x4 in metres, "iterations", "converged",
+   "transform_probability", "nvtl", "oscillations", "evaluations",
+   "trustworthy": bool, "no_map": bool, "failed_limits": [name],
    "covariance": 6x6 of x y z roll pitch yaw, or null,
-   "cut": {"points", "neighbor_points", "neighbors", "voxels"} that limits left out,
-   "worst_case_ms": bound by the limits on this machine, "align_ms": measured,
-   "points", "voxels", "variant", "convention": the same, "neighbors", "backend"}
-Exit code: 0; 1 when the alignment did not converge, or no point of the scan has a
-voxel of the map near."""
+   "cut": {"points", "neighbor_points", "neighbors", "voxels"}: left out by
+     limits, "worst_case_ms": bound by the limits, on this machine,
+   "align_ms": measured, "points", "voxels", "variant", "convention": the same,
+   "neighbors", "backend"}
+  Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
+Exit code: 0; 1 when the alignment did not converge, or no point of the scan has
+a voxel of the map near."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "align",
+        run,
         help="align one scan with one map file; no daemon",
         description="Align one scan with one map file and print the pose of the scan; no daemon is needed.",
         epilog=_JSON,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--map", required=True, metavar="FILE", help="map: PCD, NPZ or any other cloud file")
     add_scan_option(parser)
@@ -49,7 +53,6 @@ def add_parser(subparsers: Any) -> None:
     add_alignment_options(parser)
     add_allow_empty_option(parser)
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

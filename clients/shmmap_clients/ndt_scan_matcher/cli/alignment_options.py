@@ -72,7 +72,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         "--trust-nvtl",
         type=not_negative,
         metavar="N",
-        help="lowest nearest-voxel transformation likelihood (default by --leaf: 1.21 at 1 m, 2.30 at 2 m,"
+        help="lowest nearest-voxel transformation likelihood (default by --leaf: 1.22 at 1 m, 2.30 at 2 m,"
         " 2.96 at 3 m; with --fine 0.91 at 1 m)",
     )
     trust.add_argument(

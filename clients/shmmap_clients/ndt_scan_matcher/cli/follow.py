@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import connect, print_json, write_text
+from shmmap_clients.command_line import add_verb, connect, print_json, write_text
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, trust_from
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
@@ -28,16 +28,16 @@ __all__ = ["add_parser", "run"]
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "follow",
+        run,
         help="localize scan after scan in the daemon's map",
         description="Localize scan after scan in the map that a daemon serves.  The map around the vehicle is"
         " kept by Autoware's rules, in a thread of its own.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -31,32 +31,37 @@ from shmmap_clients.shared_options import (
 __all__ = ["EPILOG", "add_options"]
 
 EPILOG: Final = """\
-A scan's result is trusted when it is within all limits of trust.  The vehicle is
+A scan's result is trusted when it is within all limits of trust.  A vehicle is
   tracking   since a result was trusted,
   uncertain  at the beginning, and when a result is not trusted,
-  lost       after --lost-after results in a row that are not, or where there is no map.
-A pose that is not trusted is marked so; the next scan is then predicted from odometry
-or constant velocity alone, and without odometry a lost vehicle stands.
+  lost       after --lost-after such results in a row, or where there is no map.
+A pose that is not trusted is marked so; the next scan is then predicted from
+odometry or constant velocity alone, and without odometry a lost vehicle stands.
 
-JSON (fields may be added, none is removed); --json prints one document at the end:
-  {"frames", "converged", "trustworthy", "no_map", "lost": scans after which it was so,
-   "relocalized", "failed_limits": {name: scans}, "trust": {"nvtl",
-   "transform_probability", "oscillations"} in force, "waited", "too_slow", "cut_frames",
-   "errors": null without a truth, else
-     {"ate_rmse_m", "ate_m": spread, "ate_deg": spread, "rte": {metres: m per 100 m}},
+JSON (fields may be added, none is removed).
+--json prints one document at the end:
+  {"frames", "converged", "trustworthy", "no_map": scans, "lost": scans,
+   "relocalized": times, "failed_limits": {name: scans},
+   "trust": {"nvtl", "transform_probability", "oscillations"}: limits in force,
+   "waited": for the map, "too_slow": times that the map did not keep up,
+   "cut_frames": cut by limits,
+   "errors": null without a truth, else {"ate_rmse_m", "ate_m": spread,
+     "ate_deg": spread, "rte": {metres: metres per 100 m}},
    "transform_probability", "nvtl", "iterations", "latency_ms", "align_ms",
    "thin_ms", "map_ms", "map_request_ms", "map_build_ms": spread each,
    "map_updates", "cells_added", "cells_removed", "map_private_bytes"}
-  A spread is {"mean", "variance", "p50", "p99", "max"}; ate is the distance of the
-  poses to the true ones in metres, or degrees.
---json-lines writes a line for each scan as soon as it is localized:
-  {"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged", "trustworthy",
-   "failed_limits": [name], "no_map", "state": tracking, uncertain or lost,
-   "relocalized", "iterations", "transform_probability", "nvtl", "waited",
-   "latency_ms", "error_m", "error_deg": to the true pose, null without a truth}
-  Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
-Exit code: 0; 1 when a scan was not trusted (with --allow-empty: but for want of a
-map), the map did not keep up with the vehicle, or there was no scan."""
+  A spread is {"mean", "variance", "p50", "p99", "max"}; ate is the distance
+  of the poses to the true ones in metres, or degrees.
+--json-lines writes a line for each scan, as soon as it is localized:
+  {"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged",
+   "trustworthy", "failed_limits": [name], "no_map",
+   "state": tracking, uncertain or lost, "relocalized", "iterations",
+   "transform_probability", "nvtl", "waited", "latency_ms",
+   "error_m", "error_deg": to the true pose, null without a truth}
+Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
+
+Exit code: 0; 1 when a scan was not trusted (with --allow-empty: other than for
+want of a map), the map did not keep up, or there was no scan."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -123,8 +128,9 @@ def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--relocalize",
         action="store_true",
-        help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose and what odometry"
-        " has added: with each scan until it is found, each time twice as far, up to eight times --sigma",
+        help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose and what"
+        " odometry has added: with each scan until it is found, each time twice as far, up to eight times"
+        " --sigma",
     )
     add_pose_option(
         group, "--rough", "start pose that is metres and degrees off: search around it; implies --relocalize"

@@ -37,14 +37,15 @@ __all__ = ["main"]
 _NAME: Final = "shmmap-pose-init"
 _JSON: Final = """\
 JSON (fields may be added, none is removed):
-  {"T_map_base": 4x4 in metres, "score": transform probability, "nvtl", "reliable",
-   "converged", "no_map": bool, "failed_limits": [name] why it is not reliable,
+  {"T_map_base": 4x4 in metres, "score": transform probability, "nvtl",
+   "reliable", "converged", "no_map": bool, "failed_limits": [name],
    "ground_z": height of the map's ground there, or null,
    "covariance": 6x6 of x y z roll pitch yaw, or null,
    "alternatives": [{"T_map_base", "score", "nvtl"}] other poses, best first,
    "candidates", "map_ms", "search_ms"}
-  Where there is no map, "no_map" is true and the others are null, false or empty.
-Exit code: 0; 1 when the pose is not reliable, or there is no map at the rough pose."""
+  Where there is no map, "no_map" is true and the others are null, false, 0 or
+  empty.  failed_limits says why a pose is not reliable.
+Exit code: 0; 1 when the pose is not reliable, or there is no map around it."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
