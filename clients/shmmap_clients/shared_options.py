@@ -81,7 +81,7 @@ def add_thin_option(parser: Parser, *, default: float) -> None:
         default=default,
         metavar="M",
         help="replace the scan's points in each cube of M metres by their mean: with all points NDT takes 20"
-        f" times as long as with 1 m, and is no more accurate (default: {shown})",
+        f" times as long as with 1 m, and is less accurate (default: {shown})",
     )
 
 
