@@ -74,7 +74,7 @@ def add_leaf_option(parser: Parser) -> None:
 
 def add_thin_option(parser: Parser, *, default: float) -> None:
     """Add ``--thin``."""
-    shown = f"{default:g}; 0: all points" if default else "0: all points, as the programs it equals"
+    shown = f"{default:g}; 0: all points" if default else "0, all points, as the original programs do"
     parser.add_argument(
         "--thin",
         type=not_negative,
@@ -109,7 +109,11 @@ def add_backend_option(parser: Parser) -> None:
 def add_threads_option(parser: Parser) -> None:
     """Add ``--threads``."""
     parser.add_argument(
-        "--threads", type=int, default=1, metavar="N", help="results do not depend on it (default: 1)"
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="threads to compute with; results do not depend on it (default: 1)",
     )
 
 
@@ -143,5 +147,5 @@ def add_height_option(parser: Parser, *, default: float | None, shown: str) -> N
         type=float,
         default=default,
         metavar="M",
-        help=f"of the scan's frame above the map's ground (default: {shown})",
+        help=f"height of the scan's frame above the map's ground (default: {shown})",
     )

@@ -82,7 +82,7 @@ def test_a_kidnapped_vehicle_is_lost_and_found(
     assert all(frame["state"] == "tracking" for frame in frames[found[0] :])
     assert max(frame["error_m"] for frame in frames[found[0] :]) < 0.2
     assert summary["too_slow"] == 0, "a jump is no map that does not keep up"
-    assert f"shmmap-ndt: found at scan {frames[found[0]]['name']} by a new search" in said
+    assert f"shmmap-ndt: relocalized at scan {frames[found[0]]['name']}: (" in said
 
 
 def test_a_rough_start_pose_is_enough(drive: TownDrive, daemon: DaemonFactory) -> None:

@@ -141,7 +141,7 @@ class CompareMapFilter:
         leaves = {cell.leaf for cell in cells.values()} - {self.rule.distance}
         if leaves:  # its columns would not hold the neighbours
             raise BadRequest(
-                f"columns of {leaves.pop():g} m do not answer a distance of {self.rule.distance:g} m",
+                f"a search layer of {leaves.pop():g} m cannot answer a distance of {self.rule.distance:g} m",
                 hint=f"this rule needs {self._layer}",
             )
         self._table = SearchTable.of_cells(list(cells.values()))

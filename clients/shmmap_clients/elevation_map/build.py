@@ -73,7 +73,7 @@ class BuiltElevation:
     stray
         Points left out because they lie outside the box of their cell.
     failed
-        Cells that could not be had; what they hold is missing.
+        Cells that could not be loaded; what they hold is missing.
     """
 
     grid: ElevationGrid
@@ -204,7 +204,7 @@ def _build(
 
 
 def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:
-    """The cell at the version that was listed; None if it cannot be had, which is remembered."""
+    """The cell at the version that was listed; None if it cannot be loaded, which is remembered."""
     answer = client.selected((info.id,), layer, wait=wait_s)
     if answer.failed:
         failed += answer.failed

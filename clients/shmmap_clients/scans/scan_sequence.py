@@ -114,7 +114,7 @@ def _row(path: Path, poses: int, scans: int) -> int:
     numbers = re.findall(r"\d+", path.stem)
     if not numbers or int(numbers[-1]) >= poses:
         raise BadRequest(
-            f"{poses} poses do not fit {scans} scans: which is that of {path.name}?",
+            f"{poses} poses do not fit {scans} scans: {path.name} has no number of one of them in its name",
             hint="give a pose for each scan, or number the scans by the poses' lines, from 0",
         )
     return int(numbers[-1])

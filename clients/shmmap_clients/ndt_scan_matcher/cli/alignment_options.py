@@ -23,7 +23,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         "--variant",
         choices=("autoware", "pclomp", "pcl"),
         default="autoware",
-        help="align as this program does: covariances, stop rule, neighbours (default: autoware)",
+        help="behave as this NDT program: its covariances, stop rule and neighbours (default: autoware)",
     )
     group.add_argument(
         "--neighbors",
@@ -49,7 +49,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--fine",
         action="store_true",
-        help="then align again with the voxels' true covariances: several times more accurate",
+        help="after that, align again with the voxels' true covariances: several times more accurate",
     )
     group.add_argument(
         "--steady",
@@ -59,7 +59,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
     )
     add_backend_option(group)
     add_threads_option(group)
-    limits = parser.add_argument_group("limits (what exceeds one is left out, and counted)")
+    limits = parser.add_argument_group("limits (what exceeds one is left out and counted)")
     limits.add_argument("--max-points", type=at_least(1), metavar="N", help="points of a scan")
     limits.add_argument(
         "--max-neighbors", type=at_least(1), metavar="N", help="voxels per point; the nearest are taken"
@@ -67,7 +67,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
     limits.add_argument(
         "--max-voxels", type=at_least(1), metavar="N", help="voxels of the map; whole cells are left out"
     )
-    trust = parser.add_argument_group("trust (a result that fails one is not trusted)")
+    trust = parser.add_argument_group("trust (a result beyond one of these limits is not trusted)")
     trust.add_argument(
         "--trust-nvtl",
         type=not_negative,

@@ -32,8 +32,8 @@ __all__ = ["EPILOG", "add_options"]
 
 EPILOG: Final = """\
 A scan's result is trusted when it is within all limits of trust.  A vehicle is
-  tracking   since a result was trusted,
-  uncertain  at the beginning, and when a result is not trusted,
+  tracking   when its last result was trusted,
+  uncertain  at the beginning, and when its last result was not trusted,
   lost       after --lost-after such results in a row, or where there is no map.
 A pose that is not trusted is marked so; the next scan is then predicted from
 odometry or constant velocity alone, and without odometry a lost vehicle stands.
@@ -108,7 +108,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=not_negative,
         default=100.0,
         metavar="M",
-        help="range of the scanner; a scan waits for a map that reaches less far (default: 100)",
+        help="range of the scanner: a scan waits where the map does not reach so far (default: 100)",
     )
     _add_relocalization_options(parser)
     add_alignment_options(parser)
@@ -136,7 +136,7 @@ def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
         group, "--rough", "start pose that is metres and degrees off: search around it; implies --relocalize"
     )
     add_sigma_options(group)
-    add_height_option(group, default=None, shown="what the pose searched around says")
+    add_height_option(group, default=None, shown="the z of the pose to search around is right")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:

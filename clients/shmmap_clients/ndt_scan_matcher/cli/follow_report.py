@@ -107,15 +107,15 @@ class FollowReport:
         where = f"at scan {frame.name}"
         if frame.relocalized:
             x, y = frame.result.T_map_base[:2, 3]
-            self._say(f"found {where} by a new search, at ({x:.2f}, {y:.2f})")
+            self._say(f"relocalized {where}: ({x:.2f}, {y:.2f})")
         elif frame.state == "lost" and before != "lost":
             failed = ", ".join(trust.describe(name) for name in frame.result.failed_limits)
             self._say(f"lost {where}: {failed}")
         elif frame.state == "tracking" and before == "lost":
-            self._say(f"found again {where}")
+            self._say(f"tracking again {where}")
         error = "" if relocalizer is None or relocalizer.error is None else str(relocalizer.error)
         if error and not self._error_told:
-            self._say(f"the search failed {where}: {error}")
+            self._say(f"relocalization failed {where}: {error}")
         self._error_told = error
 
     def _say(self, text: str) -> None:
@@ -142,7 +142,7 @@ def print_summary(summary: DriveSummary) -> None:
         why = (f"{s.trust.describe(name)} ({count})" for name, count in s.failed_limits.items())
         print(f"  not trusted   {', '.join(why)}")
     if s.lost or s.relocalized:
-        print(f"  lost          {s.lost} scans; found by a new search {s.relocalized} times")
+        print(f"  lost          {s.lost} scans; relocalized {s.relocalized} times")
     print(
         f"map             {s.map_updates} updates, +{s.cells_added} -{s.cells_removed} cells;"
         f" {s.waited} scans waited"

@@ -44,7 +44,7 @@ class MapRules:
     leaf
         Edge of a voxel, metres.
     max_voxels
-        Cap on the map, see `VoxelMap`.
+        Limit on the map, see `VoxelMap`.
     wait_s
         How long a map that has to be waited for may take.
     """
@@ -201,7 +201,7 @@ class MapUpdater:
         NoAnswer
             There is still no map that reaches far enough after ``wait_s``.
         ShmmapError
-            The first map could not be had.
+            The first map could not be loaded.
         """
         rules = self.rules
         with self._changed:
@@ -234,8 +234,8 @@ class MapUpdater:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 raise NoAnswer(
-                    f"no map around ({x:.1f}, {y:.1f}) within {rules.wait_s:.0f} s",
-                    hint="`shmmap status` tells whether the daemon still loads, or has no budget left",
+                    f"the map around ({x:.1f}, {y:.1f}) was not loaded within {rules.wait_s:.0f} s",
+                    hint="`shmmap status` tells whether the daemon still loads, or has no memory left",
                 )
             self._changed.wait(left_s)
 
@@ -283,7 +283,7 @@ class MapUpdater:
         self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
         cells = self._window.cells
         if not cells and not self._window.complete:
-            raise NoAnswer("none of the cells could be had", hint="`shmmap status` tells why")
+            raise NoAnswer("none of the cells could be loaded", hint="`shmmap status` tells why")
         request_s = time.perf_counter() - begin_s
         known = {cell.id: self._voxels(cell) for cell in cells}
         before = self._latest
