@@ -151,6 +151,11 @@ def test_a_map_that_cannot_keep_up_is_an_error(drive: TownDrive, daemon: DaemonF
         assert waited
         assert maps.too_slow == 1
         assert other.cells.keys() != first.cells.keys()
+        # where the pose itself was corrected the map is not to blame
+        back, waited = maps.map_at(x, y, jumped=True)
+        assert waited
+        assert maps.too_slow == 1
+        assert back.cells.keys() == first.cells.keys()
     assert first.voxels > 0  # what was taken stays readable
 
 
