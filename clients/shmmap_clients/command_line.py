@@ -13,9 +13,9 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
-from shmmap import ShmmapError
+from shmmap import needed_packages
 from shmmap.cli.programs import (
     Parser,
     add_daemon_options,
@@ -33,7 +33,6 @@ from shmmap.cli.programs import (
 )
 
 __all__ = [
-    "PackageMissing",
     "Verb",
     "add_allow_empty_option",
     "add_daemon_options",
@@ -50,13 +49,6 @@ __all__ = [
     "write_text",
     "writing_errors",
 ]
-
-
-class PackageMissing(ShmmapError):
-    """A package that the program needs is not installed, as in a client-only install."""
-
-    code = "package_missing"
-    exit_code: ClassVar[int] = 69  # EX_UNAVAILABLE of sysexits.h: a support program does not exist
 
 
 class Verb(Protocol):
@@ -121,16 +113,8 @@ def run_command(
 def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     def run() -> int:
         args = parser.parse_args(join_negative_values(sys.argv[1:] if argv is None else argv))
-        try:
+        with needed_packages(name):
             code: int = args.run(args)
-        except ModuleNotFoundError as error:
-            package = (error.name or "").partition(".")[0]
-            if package in ("", "shmmap", "shmmap_clients"):
-                raise  # a defect, not an install without it
-            raise PackageMissing(
-                f"this needs the package {package}, which is not installed",
-                hint="install shmmap with all its dependencies: a client-only install has no programs",
-            ) from None
         return code
 
     return exit_code_of(name, run)
