@@ -1,31 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the programs' command lines share: verbs, options, how errors are answered."""
+"""How the programs are run: verbs, errors, exit codes, and what is said where nothing was found.
+
+Exit codes are those of ``shmmap``: 0 done; 1 a negative answer, or nothing found; 2 wrong usage; 65 bad data;
+66 no file or no map there; 69 no daemon answers, or a package is missing; 70 internal error; 73 an output
+cannot be written; 75 busy; 130 interrupted.
+"""
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-from shmmap.cli.files import output_file, write_text, writing_errors
-from shmmap.cli.options import at_least, seconds
-from shmmap.cli.program import Parser, exit_code_of, join_negative_values
-from shmmap.cli.screens.output import print_json
-
-if TYPE_CHECKING:
-    from shmmap import Client
+from shmmap import needed_packages
+from shmmap.cli.programs import (
+    Parser,
+    add_daemon_options,
+    add_json_option,
+    add_verb,
+    at_least,
+    connect,
+    exit_code_of,
+    join_negative_values,
+    output_file,
+    print_json,
+    seconds,
+    write_text,
+    writing_errors,
+)
 
 __all__ = [
     "Verb",
+    "add_allow_empty_option",
     "add_daemon_options",
     "add_json_option",
-    "add_scan_option",
+    "add_verb",
     "at_least",
     "connect",
-    "numbers",
+    "nothing_found",
     "output_file",
-    "positive",
     "print_json",
     "run_command",
     "run_program",
@@ -40,60 +56,6 @@ class Verb(Protocol):
 
     def add_parser(self, subparsers: Any) -> None:
         """Add the verb's parser, with ``run`` as a default."""
-
-
-def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
-    """Return an argparse type: ``count`` finite numbers with commas between them."""
-
-    def parse(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(float(word) for word in text.split(","))
-        except ValueError:
-            values = ()
-        if len(values) != count or not all(abs(value) < float("inf") for value in values):
-            raise argparse.ArgumentTypeError(f"{count} numbers with commas between them, not {text!r}")
-        return values
-
-    return parse
-
-
-def positive(text: str) -> float:
-    """Read a positive and finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
-    return value
-
-
-def add_daemon_options(parser: argparse.ArgumentParser) -> None:
-    """Add what finds the daemon; see `connect`."""
-    group = parser.add_argument_group("which daemon")
-    group.add_argument(
-        "--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL (default: as for shmmap)"
-    )
-    group.add_argument(
-        "--shm-dir", metavar="DIR", help="directory of the segments (default: where the daemon says)"
-    )
-
-
-def connect(args: argparse.Namespace, name: str) -> Client:
-    """Open a session with the daemon that the options name."""
-    import shmmap
-
-    return shmmap.connect(args.endpoint, name=name, shm_dir=args.shm_dir)
-
-
-def add_scan_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--scan``, a file as `shmmap_clients.scans.scan_file` reads it."""
-    parser.add_argument("--scan", required=True, metavar="FILE", help="PCD, NPZ (xyz or xyz_4mm), KITTI .bin")
-
-
-def add_json_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
 
 
 def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequence[str] | None = None) -> int:
@@ -129,7 +91,7 @@ def run_command(
     Parameters
     ----------
     name, description, epilog
-        For the help.
+        For the help; the epilog is shown as it is written.
     add_options
         Adds the options to a parser.
     run
@@ -137,7 +99,12 @@ def run_command(
     argv
         Words after the program's name; those of this process by default.
     """
-    parser = Parser(prog=name, description=description, epilog=epilog)
+    parser = Parser(
+        prog=name,
+        description=textwrap.fill(description, shutil.get_terminal_size().columns - 2),
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     add_options(parser)
     parser.set_defaults(run=run)
     return _guarded(name, parser, argv)
@@ -146,7 +113,26 @@ def run_command(
 def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     def run() -> int:
         args = parser.parse_args(join_negative_values(sys.argv[1:] if argv is None else argv))
-        code: int = args.run(args)
+        with needed_packages(name):
+            code: int = args.run(args)
         return code
 
     return exit_code_of(name, run)
+
+
+# --- nothing found ----------------------------------------------------------------------------------------
+
+
+def add_allow_empty_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add ``--allow-empty``; see `nothing_found`."""
+    parser.add_argument("--allow-empty", action="store_true", help="exit with 0 also when nothing is found")
+
+
+def nothing_found(args: argparse.Namespace, name: str, message: str) -> int:
+    """Say on stderr that there is nothing of what was asked for; returns the exit code.
+
+    A script that goes on with nothing would take it for an answer: so it is 1, unless ``--allow-empty`` was
+    given.
+    """
+    sys.stderr.write(f"{name}: {message}\n")
+    return 0 if args.allow_empty else 1

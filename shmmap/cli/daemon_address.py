@@ -78,11 +78,17 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
     return found, found.identity
 
 
-def connect(args: argparse.Namespace) -> Client:
-    """Connect to the daemon; without ``--timeout`` the library's own deadlines hold."""
+def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
+    """Connect to the daemon; without ``--timeout`` the library's own deadlines hold.
+
+    Parameters
+    ----------
+    args
+        With what `shmmap.cli.options.add_daemon_options` added.
+    name
+        How the session appears in ``shmmap clients``.
+    """
     import shmmap
 
     deadlines = {} if args.timeout is None else {"timeout": args.timeout, "connect_timeout": args.timeout}
-    return shmmap.connect(
-        endpoint(args), **deadlines, name="shmmap", shm_dir=_setting(args, "shm_dir") or None
-    )
+    return shmmap.connect(endpoint(args), **deadlines, name=name, shm_dir=_setting(args, "shm_dir") or None)

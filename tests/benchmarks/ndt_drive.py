@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings
-from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
-from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import warmup_alignment
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
+from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import Odometry
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.scans.scan_file import read_scan
@@ -85,7 +85,7 @@ def main() -> None:
     folder = data_dir()
     scans, poses = one_tile(folder)
     frames = min(args.frames, len(poses) * (args.copies - 1))
-    align_smallest()
+    warmup_alignment()
     settings = Settings(mode="coarse_fine") if args.fine else Settings(steady=True)
 
     def truth(number: int) -> Matrix:
@@ -98,7 +98,7 @@ def main() -> None:
     drift = way.T_map_sensor.copy()
     drift[:, :3, 3] *= 1.01
     odometry = Trajectory(way.stamps_s, drift)
-    done: list[Frame] = []
+    statistics = DriveStatistics()
     memory: list[int] = []
     with tempfile.TemporaryDirectory() as scratch:
         street = folder / "kitti0005_map" / "map_static_v010.pcd"
@@ -119,13 +119,13 @@ def main() -> None:
                 if number:
                     time.sleep(max(0.0, begin + number / args.rate - time.monotonic()))
                 cpu = time.thread_time()
-                done.append(follower.follow(scan))
+                statistics.add(follower.follow(scan))
                 costs.append((time.thread_time() - cpu) * 1e3)
                 if number == 0:
                     begin = time.monotonic()  # the first waits for the map
                 if number % 50 == 49:
                     memory.append(process_memory(os.getpid()).private_bytes)
-            summary = summarize(done, list(maps.updates), maps.too_slow)
+        summary = statistics.summary(maps.statistics, maps.too_slow, matcher.trust)
     s, late = summary, summary.latency_ms
     print(
         f"map: {s.map_updates} updates, +{s.cells_added} -{s.cells_removed} cells; scans that waited after"
@@ -143,7 +143,7 @@ def main() -> None:
     )
     assert s.errors is not None
     print(
-        f"poses: {s.trustworthy} of {s.frames} to be trusted; ATE {s.errors.ate_rmse_m:.3f} m RMSE, max"
+        f"poses: {s.trustworthy} of {s.frames} trusted; ATE {s.errors.ate_rmse_m:.3f} m RMSE, max"
         f" {s.errors.ate_m.max:.3f} m, {s.errors.ate_deg.max:.2f} deg; NVTL {s.nvtl.mean:.2f}"
     )
     third = max(1, len(memory) // 3)

@@ -41,7 +41,7 @@ def align_ms(
 
 
 def evaluation_ms(pair: Pair, repeats: int) -> tuple[float, float]:
-    """Return the least CPU time of one evaluation in PCL's convention, and its score."""
+    """Return the least CPU time of one evaluation in PCL's variant, and its score."""
     costs = []
     with NdtMatcher(Settings("pcl", "radius")) as matcher:
         matcher.set_map(VoxelMap({"map": voxel_cell(pair.target, pair.leaf)}))
@@ -57,8 +57,8 @@ FIRST = """
 import time
 began = time.perf_counter()
 import sys, numpy as np
-from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
-align_smallest()
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import warmup_alignment
+warmup_alignment()
 print(time.perf_counter() - began)
 """
 

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import pose_from_matrix
-from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
-from shmmap_clients.ndt_scan_matcher.drive.follower import thinned
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import warmup_alignment
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
 from shmmap_clients.scans.scan_file import read_scan
+from shmmap_clients.scans.thinning import thinned
 from shmmap_clients.scans.trajectory import read_trajectory
 
 from shmmap import connect
@@ -59,7 +59,7 @@ def main() -> None:
     truth = read_trajectory(folder / "kitti0005_scans" / "poses_heldout_tum.txt").T_map_sensor
     scans = [thinned(read_scan(path), args.thin) for path in files]
     street = folder / "kitti0005_map" / "map_static_v010.pcd"
-    align_smallest()
+    warmup_alignment()
     sys.addaudithook(watch)
     with tempfile.TemporaryDirectory() as scratch:
         made = tile_map(

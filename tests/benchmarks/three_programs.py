@@ -107,7 +107,7 @@ def main() -> None:
             result = run_three_programs(
                 one.endpoint, one.shm_dir, one.instance, drive(), poses(len(corners) * 20), work,
                 ndt=["--map-radius", "100", "--lidar-radius", "70", "--update-distance", "10"],
-                compare=["--mode", "distance", "--radius", "100"],
+                compare=["--mode", "distance", "--map-radius", "100"],
                 elevation=["--resolution", "0.5", "--wait", "120"],
             )  # fmt: skip
             print("\n".join(table(result)))

@@ -4,13 +4,20 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import re
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from shmmap_clients.command_line import at_least, output_file, positive, write_text
+from shmmap_clients.command_line import at_least, output_file, write_text
+from shmmap_clients.compare_map_filter.cli import main as compare
 from shmmap_clients.elevation_map.cli import main as elevation
 from shmmap_clients.ndt_scan_matcher.cli import main as ndt
 from shmmap_clients.pose_initializer.cli import main as pose_init
+from shmmap_clients.shared_options import positive
 
 from shmmap import CannotWrite
 
@@ -58,7 +65,7 @@ def test_programs_tell_it_without_a_traceback(tmp_path: Path, capsys: pytest.Cap
         (ndt, ["follow", "--scans", ".", "--odometry-wait", "nan"]),
         (elevation, ["build", "--wait", "-1"]),
         (elevation, ["build", "--epsg", "-3"]),
-        (pose_init, ["--scan", "s.pcd", "--pose", "0,0,0", "--seed", "-1"]),
+        (pose_init, ["--scan", "s.pcd", "--pose", "0,0,0,0,0,0", "--seed", "-1"]),
     ],
 )
 def test_impossible_numbers_exit_2(
@@ -69,3 +76,85 @@ def test_impossible_numbers_exit_2(
         program(words)
     assert ended.value.code == 2
     assert f"argument {words[-2]}: expected " in capsys.readouterr().err
+
+
+PROGRAMS = {
+    "ndt_scan_matcher": (ndt, ["align"], ["follow"]),
+    "compare_map_filter": (compare, ["apply"], ["follow"]),
+    "elevation_map": (elevation, ["build"]),
+    "pose_initializer": (pose_init, []),
+}
+
+
+def help_of(program: object, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert callable(program)
+    with contextlib.suppress(SystemExit):
+        program([*words, "--help"])
+    return capsys.readouterr().out
+
+
+def options_of(text: str) -> dict[str, str]:
+    """Each option of a help text with its value's name, and what is said of it."""
+    found: dict[str, str] = {}
+    for line in text.split("options:", 1)[1].splitlines():
+        if line.startswith("  -"):
+            name = line.split()[0].rstrip(",")
+            found[name] = line.strip()
+        elif line.startswith("     ") and found:
+            found[name] += " " + line.strip()
+        else:
+            name = ""
+            found.setdefault(name, "")
+    return {name: " ".join(said.split()) for name, said in found.items() if name}
+
+
+def test_the_same_option_is_the_same_everywhere(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    seen: dict[str, set[str]] = {}
+    with_daemon = 0
+    for main, *verbs in PROGRAMS.values():
+        for words in verbs:
+            assert isinstance(words, list)
+            text = help_of(main, words, capsys)
+            assert max(map(len, text.splitlines())) <= 80
+            assert "Exit code: 0; 1 when" in text
+            options = options_of(text)
+            assert {"--json", "--allow-empty"} <= options.keys()
+            addresses = {"--instance", "--endpoint", "--runtime-dir", "--shm-dir", "--timeout"}
+            assert options.keys() & addresses in (set(), addresses)
+            with_daemon += "--instance" in options
+            for name, said in options.items():
+                seen.setdefault(name, set()).add(said)
+    assert with_daemon == 4
+    # these differ in their defaults, or in what they are of
+    own = {"--thin", "--height", "--update-distance", "--wait", "--out", "--mask", "--pose"}
+    assert {name: said for name, said in seen.items() if len(said) > 1 and name not in own} == {}
+
+
+@pytest.mark.parametrize("package", [*PROGRAMS])
+def test_a_missing_package_is_one_clear_line(package: str, tmp_path: Path) -> None:
+    """As in a client-only install."""
+    scan = str(tmp_path / "scan.npz")
+    np.savez(scan, xyz=np.zeros((9, 3), np.float32))
+    words = {
+        "ndt_scan_matcher": ["align", "--map", scan, "--scan", scan],
+        "compare_map_filter": ["apply", "--map", scan, "--scan", scan],
+        "elevation_map": ["build", "--cache", str(tmp_path)],
+        "pose_initializer": ["--scan", scan, "--pose", "0,0,0,0,0,0"],
+    }[package]
+    code = (
+        "import sys\nfor name in ('numba', 'xxhash', 'lzf', 'yaml', 'open3d', 'rich'):\n"
+        "    sys.modules[name] = None\n"
+        f"from shmmap_clients.{package}.cli import main\nsys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert done.returncode == 69, done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2, done.stderr
+    assert re.match(r"shmmap-\S+: .*package (numba|xxhash).* not installed", lines[0])
+    assert lines[1].startswith("hint: ")
+    asked = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
+    assert asked.returncode == 0, "the help needs no package"
+    assert asked.stdout.startswith("usage: ")

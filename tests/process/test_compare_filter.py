@@ -150,7 +150,7 @@ def test_files_to_files(daemon: Factory, divided_map: DividedMap, drive: list[Sc
     one = daemon(divided_map.root)
     words = [
         "follow", "--scans", f"{tmp_path}/scans", "--poses", f"{tmp_path}/poses.txt", "--mode", "distance",
-        "--radius", "100", "--endpoint", one.endpoint, "--out", f"{tmp_path}/out", "--json",
+        "--map-radius", "100", "--endpoint", one.endpoint, "--out", f"{tmp_path}/out", "--json",
         "--picture", f"{tmp_path}/drive.svg",
     ]  # fmt: skip
     done = run(*words)
@@ -179,12 +179,71 @@ def test_files_to_files(daemon: Factory, divided_map: DividedMap, drive: list[Sc
     assert written["kept"].dtype == np.uint8
 
 
+def test_a_map_elsewhere_is_no_answer(
+    daemon: Factory, divided_map: DividedMap, drive: list[Scan], tmp_path: Path
+) -> None:
+    one = daemon(divided_map.root)
+    lines = []
+    for scan in drive:
+        T = np.array(scan.T_map_sensor)
+        T[0, 3] += 3000.0
+        lines.append(tum_line(scan.stamp_s, T))
+    (tmp_path / "far.txt").write_text("\n".join(lines))
+    words = ["follow", "--scans", f"{tmp_path}/scans", "--poses", f"{tmp_path}/far.txt", "--quiet"]
+    words += ["--endpoint", one.endpoint, "--json-lines", "-", "--json"]
+    done = run(*words)
+    assert done.returncode == 1
+    *frames, summary = map(json.loads, done.stdout.splitlines())
+    assert [frame["no_map"] for frame in frames] == [True] * 3
+    assert summary["no_map_scans"] == 3
+    assert summary["kept"] == summary["points"]
+    told = done.stderr.splitlines()
+    assert len(told) == 1, "once"
+    assert told[0] == (
+        "shmmap-compare: no map around scan scan_0: the map spans x -60 .. 60 m, y -60 .. 60 m,"
+        " the pose is at (2994.000, 1.000)"
+    )
+    assert run(*words, "--allow-empty").returncode == 0
+    name = divided_map.in_circle(0.0, 0.0, 1.0)[0]
+    files = ["--map", divided_map.id(name), "--scan", f"{tmp_path}/scans/scan_0.npz"]
+    alone = run("apply", *files, "--pose", "3000,0,0,0,0,0", "--json")
+    assert alone.returncode == 1
+    assert json.loads(alone.stdout)["no_map"]
+    assert "no map around the scan: the map spans x " in alone.stderr
+    assert "the pose is at (3000.000, 0.000)" in alone.stderr
+
+
+def test_nothing_kept_is_no_answer(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:
+    """Points of the map itself: it explains every one of them."""
+    one = daemon(divided_map.root)
+    (tmp_path / "scans").mkdir()
+    np.savez(tmp_path / "scans" / "scan_0.npz", xyz=cloud_of(divided_map)[::50])
+    (tmp_path / "poses.txt").write_text(tum_line(0.0, np.eye(4)))
+    words = ["follow", "--scans", f"{tmp_path}/scans", "--poses", f"{tmp_path}/poses.txt", "--quiet"]
+    words += ["--mode", "distance", "--endpoint", one.endpoint]
+    done = run(*words)
+    assert done.returncode == 1
+    assert done.stderr == "shmmap-compare: no point was kept: the map explains all 360 points\n"
+    assert run(*words, "--allow-empty").returncode == 0
+
+
 def test_sockets_to_sockets(
     daemon: Factory, divided_map: DividedMap, drive: list[Scan], tmp_path: Path
 ) -> None:
     one = daemon(divided_map.root)
     source, sink = f"ipc://{tmp_path}/in", f"ipc://{tmp_path}/out"
-    command = [*PROGRAM, "follow", "--scans", source, "--out", sink, "--mode", "distance", "--radius", "100"]
+    command = [
+        *PROGRAM,
+        "follow",
+        "--scans",
+        source,
+        "--out",
+        sink,
+        "--mode",
+        "distance",
+        "--map-radius",
+        "100",
+    ]
     with ScanPublisher(source) as publisher, ScanSubscriber(sink) as subscriber:
         process = subprocess.Popen(
             [*command, "--endpoint", one.endpoint, "--wait", str(LONG_S), "--quiet"],
@@ -198,6 +257,7 @@ def test_sockets_to_sockets(
             for scan, got in zip(drive, subscriber, strict=True):
                 kept = kept_by_brute_force(scan, divided_map, 0.5)
                 assert got.name == scan.name
+                assert not got.no_map
                 assert np.array_equal(got.columns["index"], np.flatnonzero(kept))
                 assert np.array_equal(got.columns["ring"], scan.columns["ring"][kept])
             assert process.wait(LONG_S) == 0
@@ -212,7 +272,7 @@ def test_without_a_daemon(drive: list[Scan], divided_map: DividedMap, tmp_path: 
     pose = tum_line(0.0, scan.T_map_sensor if scan.T_map_sensor is not None else np.eye(4)).split()[1:]
     done = run(
         "apply", "--map", divided_map.id(name), "--scan", f"{tmp_path}/scans/{scan.name}.npz",
-        "--pose", ",".join(pose), "--mode", "distance", "--json",
+        "--pose", ",".join(pose), "--pose-format", "tum", "--mode", "distance", "--json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["points"] == 600

@@ -201,3 +201,40 @@ def test_the_program(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -
     assert (tmp_path / "h.png").read_bytes()[1:4] == b"PNG"
     wrong = subprocess.run([*command, "--out", "e.xyz"], capture_output=True, text=True, timeout=LONG_S)
     assert wrong.returncode == 2
+
+
+def elevation(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "shmmap_clients.elevation_map", "build", "--quiet", "--json", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=LONG_S)
+
+
+def test_a_sparse_map_is_warned_about(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:
+    one = daemon(divided_map.root)
+    words = ["--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint]
+    sparse = elevation(*words, "--resolution", "1.3", "--tolerance", "4")
+    document = json.loads(sparse.stdout)
+    assert sparse.returncode == 0
+    share = document["measured"] / document["occupied"]
+    assert document["measured_share"] == pytest.approx(share)
+    assert 0.0 < share < 0.5
+    assert sparse.stderr.startswith(
+        f"shmmap-elevation: warning: {document['measured']} of {document['occupied']} columns with points"
+        f" ({100 * share:.1f} %) have a height; a column of 1.3 m needs 3 points within 4 m of each other"
+    )
+    again = json.loads(elevation(*words, "--resolution", "1.3", "--tolerance", "4").stdout)
+    assert again == document | {"loaded": 0}, "from the cache"
+    dense = elevation(*words, "--resolution", "5", "--tolerance", "20")
+    assert (dense.returncode, dense.stderr) == (0, "")
+    assert json.loads(dense.stdout)["measured_share"] > 0.9
+
+
+def test_no_height_at_all_is_no_answer(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:
+    one = daemon(divided_map.root)
+    words = ["--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint, "--resolution", "0.5"]
+    words += ["--min-points", "400", "--out", f"{tmp_path}/e.npz"]
+    nothing = elevation(*words)
+    assert nothing.returncode == 1
+    assert nothing.stderr.startswith("shmmap-elevation: no column has a height: 0 of ")
+    assert nothing.stderr.endswith("the map spans x -60 .. 60 m, y -60 .. 60 m\n")
+    assert json.loads(nothing.stdout)["measured"] == 0
+    assert elevation(*words, "--allow-empty").returncode == 0

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
-from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
+from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
@@ -36,17 +36,17 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
 def test_a_drive_whose_window_moves(drive: TownDrive, daemon: DaemonFactory) -> None:
     one = daemon(drive.map_dir)
     rules = MapRules(update_distance=10.0, map_radius=60.0, lidar_radius=40.0)
-    frames: list[Frame] = []
+    statistics = DriveStatistics()
     with (
         NdtMatcher(Settings(mode="coarse_fine")) as matcher,
         MapUpdater(one.endpoint, rules, prepare=matcher.prepare) as maps,
     ):
         follower = Follower(matcher, maps, ConstantVelocity(matrix_from_pose(drive.poses[0])), thin=0.5)
         for scan in ScanSequence(drive.scans, read_trajectory(drive.truth)):
-            frames.append(follower.follow(scan))
+            statistics.add(follower.follow(scan))
             assert maps.wait_until_current(60.0)  # a drive at full speed would outrun the map
         assert maps.error is None
-        summary = summarize(frames, maps.updates, maps.too_slow)
+    summary = statistics.summary(maps.statistics, maps.too_slow, matcher.trust)
     assert summary.frames == summary.converged == summary.trustworthy == 36
     assert summary.too_slow == 0
     assert summary.waited == 1  # the first: there was no map before
@@ -67,6 +67,7 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     words += ["--steady", "--odometry", str(drive.truth), "--tum", str(tmp_path / "out.tum")]
     address = f"ipc://{tmp_path}/poses"
     words += ["--plot", str(tmp_path / "out.svg"), "--publish", address, "--listener-wait", "60", "--json"]
+    words += ["--json-lines", str(tmp_path / "out.jsonl")]
     listener = subprocess.Popen(
         [sys.executable, "-m", "tests.support.pose_listener", address, "36"],
         stdout=subprocess.PIPE,
@@ -83,8 +84,17 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     assert summary["frames"] == summary["trustworthy"] == 36
     assert summary["errors"]["ate_m"]["max"] < 0.2
     assert summary["errors"]["rte"]["10.0"] < 2.0
+    lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [line["name"] for line in lines] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]
+    assert max(line["error_m"] for line in lines) == pytest.approx(summary["errors"]["ate_m"]["max"])
+    squares = np.array([line["error_m"] for line in lines]) ** 2
+    assert np.sqrt(squares.mean()) == pytest.approx(summary["errors"]["ate_rmse_m"])
+    assert max(line["error_deg"] for line in lines) == pytest.approx(summary["errors"]["ate_deg"]["max"])
     written = read_trajectory(tmp_path / "out.tum")
     assert len(written) == 36
+    np.testing.assert_allclose(
+        [line["pose"][:3] for line in lines], written.T_map_sensor[:, :3, 3], atol=1e-8
+    )
     ElementTree.parse(tmp_path / "out.svg")
     # the listener has every pose, in order
     assert [pose["name"] for pose in heard] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]
@@ -141,6 +151,11 @@ def test_a_map_that_cannot_keep_up_is_an_error(drive: TownDrive, daemon: DaemonF
         assert waited
         assert maps.too_slow == 1
         assert other.cells.keys() != first.cells.keys()
+        # where the pose itself was corrected the map is not to blame
+        back, waited = maps.map_at(x, y, jumped=True)
+        assert waited
+        assert maps.too_slow == 1
+        assert back.cells.keys() == first.cells.keys()
     assert first.voxels > 0  # what was taken stays readable
 
 
@@ -183,7 +198,9 @@ def test_without_a_daemon_the_program_says_so(drive: TownDrive, tmp_path: Path) 
     done = subprocess.run([*PROGRAM, *words, "--truth", str(drive.truth)], capture_output=True, text=True)
     assert done.returncode == 69
     assert "shmmap-ndt:" in done.stderr
-    assert subprocess.run([*PROGRAM, *words], capture_output=True).returncode == 2  # and where to start?
+    nowhere = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+    assert nowhere.returncode == 2
+    assert nowhere.stderr.startswith("shmmap-ndt: no start pose: give --init, --rough or --truth")
 
 
 def test_many_clients_share_one_map(daemon: DaemonFactory, tmp_path: Path) -> None:

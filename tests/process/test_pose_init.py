@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shmmap_clients.map_extent import NoMapHere
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
 from shmmap_clients.scans.scan_file import read_scan
 
@@ -54,8 +56,27 @@ def test_a_place_without_map_is_no_answer(town: TownDrive, daemon: DaemonFactory
     with PoseInitializer(one.endpoint, InitializerRules(map_radius=60.0, wait_s=5.0)) as initializer:
         scan = read_scan(town.scans / "scan_0000.npz")
         for x in (5000.0, 9e7):
-            with pytest.raises(shmmap.NoAnswer, match="no map around"):
+            with pytest.raises(NoMapHere, match=r"no map within 60 m .* the map spans x .* the pose is at"):
                 initializer.initialize(scan, RoughPose(x, 0.0))
+
+
+def test_the_program_away_from_the_map_says_where_it_is(town: TownDrive, daemon: DaemonFactory) -> None:
+    one = daemon(town.map_dir)
+    program = [sys.executable, "-m", "shmmap_clients.pose_initializer", "--endpoint", one.endpoint]
+    words = ["--scan", str(town.scans / "scan_0002.npz"), "--pose", "5000,0,0,0,0,0", "--json"]
+    done = subprocess.run([*program, *words], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert re.fullmatch(
+        r"shmmap-pose-init: no map within 150 m of the rough pose: the map spans x \S+ .. \S+ m,"
+        r" y \S+ .. \S+ m, the pose is at \(5000.000, 0.000\)\n",
+        done.stderr,
+    )
+    document = json.loads(done.stdout)
+    assert document["no_map"]
+    assert document["T_map_base"] is None
+    assert not document["reliable"]
+    allowed = subprocess.run([*program, *words, "--allow-empty"], capture_output=True, text=True)
+    assert (allowed.returncode, allowed.stderr) == (0, done.stderr)
 
 
 def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
@@ -67,7 +88,7 @@ def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> 
         "--scan",
         str(town.scans / "scan_0002.npz"),
         "--pose",
-        f"{x + 1},{y - 1},{yaw}",
+        f"{x + 1},{y - 1},0,0,0,{yaw}",
         "--height",
         "1.8",
     ]
@@ -78,6 +99,9 @@ def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> 
     assert document["reliable"] is True
     done = subprocess.run([*program, *words], capture_output=True, text=True)
     assert ": reliable" in done.stdout
-    missing = [*program, "--scan", str(tmp_path / "none.npz"), "--pose", "0,0,0"]
+    flat = [*words[:3], f"{x + 1},{y - 1},{yaw}", *words[4:], "--pose-format", "xyyaw"]
+    again = subprocess.run([*program, *flat], capture_output=True, text=True)
+    assert again.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]  # the last are times
+    missing = [*program, "--scan", str(tmp_path / "none.npz"), "--pose", "0,0,0,0,0,0"]
     assert subprocess.run(missing, capture_output=True).returncode == 66
     assert subprocess.run([*program, "--scan", "x"], capture_output=True).returncode == 2

@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
+from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import warmup_alignment
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.scans.scan_file import read_scan
 
@@ -25,7 +25,7 @@ def main() -> None:
     endpoint, scan_file, words, radius = sys.argv[1:5]
     scan = read_scan(scan_file)
     guess = np.array([float(word) for word in words.split(",")])
-    align_smallest()  # loads the compiled kernels
+    warmup_alignment()  # loads the compiled kernels
     with NdtMatcher() as matcher:
         matcher.align(scan, matrix_from_pose(guess))  # touches the buffers
         print("ready", flush=True)

@@ -1,8 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Removes from a live scan what the map explains, and leaves what moved."""
 
-from shmmap_clients.compare_map_filter.filter import CompareMapFilter as CompareMapFilter
-from shmmap_clients.compare_map_filter.filter import Comparison as Comparison
-from shmmap_clients.compare_map_filter.rule import CompareRule as CompareRule
+from __future__ import annotations
 
-__all__ = ["CompareMapFilter", "CompareRule", "Comparison"]
+from typing import TYPE_CHECKING
+
+from shmmap_clients.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap_clients.compare_map_filter.filter import CompareMapFilter, Comparison
+    from shmmap_clients.compare_map_filter.rule import CompareRule
+
+__all__ = [
+    "CompareMapFilter",
+    "CompareRule",
+    "Comparison",
+]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "CompareMapFilter": "filter",
+        "CompareRule": "rule",
+        "Comparison": "filter",
+    },
+)

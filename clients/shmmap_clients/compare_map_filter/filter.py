@@ -31,7 +31,10 @@ class Comparison:
     kept
         (N,) bool: points that the map does not explain; those not finite among them, as upstream.
     cells
-        How many cells with points were looked into.
+        How many cells there were to look into.
+    no_map
+        No cell reaches where the scan is: all its points are kept because there was no map, not because
+        something has changed.
     compare_s, update_s
         Seconds for the comparison, and for taking over the window's cells before it (0 where the
         window had not changed).
@@ -39,6 +42,7 @@ class Comparison:
 
     kept: NDArray[np.bool_]
     cells: int
+    no_map: bool
     compare_s: float
     update_s: float
 
@@ -137,7 +141,7 @@ class CompareMapFilter:
         leaves = {cell.leaf for cell in cells.values()} - {self.rule.distance}
         if leaves:  # its columns would not hold the neighbours
             raise BadRequest(
-                f"columns of {leaves.pop():g} m do not answer a distance of {self.rule.distance:g} m",
+                f"a search layer of {leaves.pop():g} m cannot answer a distance of {self.rule.distance:g} m",
                 hint=f"this rule needs {self._layer}",
             )
         self._table = SearchTable.of_cells(list(cells.values()))
@@ -170,9 +174,24 @@ class CompareMapFilter:
             explained = self._compiled(scan, pose)
         else:
             explained = numpy_path.explain(scan, pose, self.rule, self._table)
+        no_map = not explained.any() and not self._reached(scan, pose)
         compare_s = time.perf_counter() - begin
         update_s, self._update_s = self._update_s, 0.0
-        return Comparison(~explained, len(self._table.cells), compare_s, update_s)
+        return Comparison(~explained, len(self._table.cells), no_map, compare_s, update_s)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Where the cells are: min_x, min_y, max_x, max_y, metres, map frame; None without any."""
+        return self._table.bounds
+
+    def _reached(self, scan: NDArray[Any], pose: NDArray[np.float64]) -> bool:
+        """Whether a cell has columns where the scan is; an empty scan is everywhere."""
+        places = numpy_path.to_map(scan, pose)[:, :2]
+        places = places[np.isfinite(places).all(axis=1)]
+        if not len(places):
+            return bool(self._table.cells)
+        reach = self.rule.distance
+        return self._table.touches(places.min(axis=0) - reach, places.max(axis=0) + reach)
 
     def _compiled(self, scan: NDArray[Any], pose: NDArray[np.float64]) -> NDArray[np.bool_]:
         explained = np.empty(len(scan), np.bool_)

@@ -92,7 +92,9 @@ class Stream:
     def write(self, compared: ComparedScan) -> None:
         """Send one scan."""
         scan = compared.scan
-        self._publisher.send(Scan(scan.name, scan.stamp_s, _columns(compared, self._mask), scan.T_map_sensor))
+        columns = _columns(compared, self._mask)
+        no_map = compared.comparison.no_map
+        self._publisher.send(Scan(scan.name, scan.stamp_s, columns, scan.T_map_sensor, no_map))
 
     def close(self) -> None:
         """Say that it was the last one."""

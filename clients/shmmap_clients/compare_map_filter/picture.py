@@ -11,6 +11,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap_clients.decimation import Decimated
 from shmmap_clients.png import png_bytes
 
 __all__ = ["TopView"]
@@ -39,7 +40,7 @@ class TopView:
         self._offset = _OFFSET
         self._kept = np.empty(0, np.int64)
         self._removed = np.empty(0, np.int64)
-        self._path: list[tuple[float, float]] = []
+        self._path: Decimated[tuple[float, float]] = Decimated()
 
     def add(self, xyz: NDArray[Any], kept: NDArray[np.bool_], position: tuple[float, float]) -> None:
         """Add a scan: (N, 3) and (N,), metres, map frame; and where it was taken."""
@@ -50,7 +51,7 @@ class TopView:
         mine = kept[finite]
         self._kept = np.union1d(self._kept, packed[mine])
         self._removed = np.union1d(self._removed, packed[~mine])
-        self._path.append(position)
+        self._path.add(position)
         while len(self._kept) + len(self._removed) > _MOST:
             self._coarsen()
 
@@ -86,7 +87,7 @@ class TopView:
         def place(x: float, y: float) -> str:
             return f"{(x - corner[0]) / size * scale:.1f},{height - (y - corner[1]) / size * scale:.1f}"
 
-        path = " ".join(place(x, y) for x, y in self._path)
+        path = " ".join(place(x, y) for x, y in self._path.values)
         bar = 10.0 ** math.floor(math.log10(max(columns * size / 4, 1e-3)))
         bar_px = bar / size * scale
         top = height + 24

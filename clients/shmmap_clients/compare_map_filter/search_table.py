@@ -59,6 +59,21 @@ class SearchTable:
     bin_start: NDArray[np.int32]
     bin_cells: NDArray[np.int32]
 
+    @property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Around all columns: min_x, min_y, max_x, max_y, metres; None without any cell."""
+        if not self.cells:
+            return None
+        low = np.array([cell.first for cell in self.cells]).min(axis=0) * self.leaf
+        high = np.array([cell.columns_end for cell in self.cells]).max(axis=0) * self.leaf
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def touches(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> bool:
+        """Whether a cell has columns in the rectangle from ``low`` to ``high``, (2,) each, metres."""
+        first = np.array([cell.first for cell in self.cells]).reshape(-1, 2) * self.leaf
+        end = np.array([cell.columns_end for cell in self.cells]).reshape(-1, 2) * self.leaf
+        return bool(((first <= high) & (end >= low)).all(axis=1).any())
+
     @classmethod
     def of_cells(cls, given: Sequence[SearchCell]) -> SearchTable:
         """Make the table of cells, all of one ``leaf``; empty ones are left out."""

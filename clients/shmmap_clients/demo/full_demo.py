@@ -140,7 +140,7 @@ def run_full_demo(
             daemon.endpoint, daemon.shm_dir, daemon.instance,
             _simulated_drive(town, length=length), _poses(town, route), work,
             ndt=["--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(_SEEN_METRES), *window],
-            compare=["--mode", "distance", "--radius", str(_WINDOW_METRES), *window],
+            compare=["--mode", "distance", "--map-radius", str(_WINDOW_METRES), *window],
             after_scan=tell,
         )  # fmt: skip
         picture = (work / "compare.svg").read_text(encoding="utf-8")

@@ -1,9 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """The height of the ground over a whole map, in the memory of one cell; and around a moving vehicle."""
 
-from shmmap_clients.elevation_map.build import build_elevation_map as build_elevation_map
-from shmmap_clients.elevation_map.grid import ElevationGrid as ElevationGrid
-from shmmap_clients.elevation_map.rule import ElevationRule as ElevationRule
-from shmmap_clients.elevation_map.window_heights import WindowHeights as WindowHeights
+from __future__ import annotations
 
-__all__ = ["ElevationGrid", "ElevationRule", "WindowHeights", "build_elevation_map"]
+from typing import TYPE_CHECKING
+
+from shmmap_clients.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap_clients.elevation_map.build import build_elevation_map
+    from shmmap_clients.elevation_map.grid import ElevationGrid
+    from shmmap_clients.elevation_map.rule import ElevationRule
+    from shmmap_clients.elevation_map.window_heights import WindowHeights
+
+__all__ = [
+    "ElevationGrid",
+    "ElevationRule",
+    "WindowHeights",
+    "build_elevation_map",
+]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "ElevationGrid": "grid",
+        "ElevationRule": "rule",
+        "WindowHeights": "window_heights",
+        "build_elevation_map": "build",
+    },
+)

@@ -34,7 +34,7 @@ from shmmap_clients.elevation_map.seams import ColumnBox, Seams, column_boxes
 
 __all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map"]
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 _EVERY: Final = 64  # cells between checkpoints
 
 
@@ -68,16 +68,19 @@ class BuiltElevation:
         Cells of the map.
     loaded
         Of those, how many this call had to load: 0 where the cache had it all.
+    occupied
+        Columns with a point; in the ``surface`` rule not all of them have a height.
     stray
         Points left out because they lie outside the box of their cell.
     failed
-        Cells that could not be had; what they hold is missing.
+        Cells that could not be loaded; what they hold is missing.
     """
 
     grid: ElevationGrid
     map_version: int
     cells: int
     loaded: int
+    occupied: int
     stray: int
     failed: tuple[CellError, ...]
 
@@ -185,7 +188,9 @@ def _build(
         complete = seams.add(number, rows)
         del rows, cell
         if complete is not None:
-            grid.put(*heights_of(complete, rule))
+            i, j, heights = heights_of(complete, rule)
+            state.occupied += len(i)
+            grid.put(i, j, heights)
         state.done = number + 1
         if not failed and (state.done % _EVERY == 0 or state.done == len(order)):
             journal.write(state, seams)
@@ -193,11 +198,13 @@ def _build(
             progress(BuildProgress(state.done, len(order), state.rows))
     client.release()
     loaded = len(order) - begun
-    return BuiltElevation(grid, listing.map_version, len(order), loaded, state.stray, tuple(failed))
+    return BuiltElevation(
+        grid, listing.map_version, len(order), loaded, state.occupied, state.stray, tuple(failed)
+    )
 
 
 def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:
-    """The cell at the version that was listed; None if it cannot be had, which is remembered."""
+    """The cell at the version that was listed; None if it cannot be loaded, which is remembered."""
     answer = client.selected((info.id,), layer, wait=wait_s)
     if answer.failed:
         failed += answer.failed

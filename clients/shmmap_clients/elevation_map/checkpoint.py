@@ -18,11 +18,12 @@ __all__ = ["Checkpoint", "Journal"]
 
 @dataclass(slots=True)
 class Checkpoint:
-    """Cells done, in order; rows read; points outside their cell."""
+    """Cells done, in order; rows read; points outside their cell; columns that had a point."""
 
     done: int = 0
     rows: int = 0
     stray: int = 0
+    occupied: int = 0
 
 
 class Journal:

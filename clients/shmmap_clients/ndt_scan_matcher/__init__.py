@@ -9,29 +9,39 @@
     matcher.set_map(VoxelMap({"map": voxel_cell(points, leaf=2.0)}))
     result = matcher.align(scan, T_guess)
 
-The same result as Autoware's, ndt_omp's or PCL's program, by the chosen convention; see `Settings`.
+The same result as Autoware's, ndt_omp's or PCL's program, by the chosen variant; see `Settings`.
 """
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import BACKENDS, Backend
-from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
-from shmmap_clients.ndt_scan_matcher.matching.limits import Caps, Cut
-from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
-from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
-from shmmap_clients.ndt_scan_matcher.matching.result import Result
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from shmmap_clients.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
+    from shmmap_clients.ndt_scan_matcher.backends.registry import BACKENDS
+    from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
+    from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+    from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
+    from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
+    from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
+    from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
+    from shmmap_clients.ndt_scan_matcher.matching.result import Result
+    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 
 __all__ = [
     "BACKENDS",
     "Backend",
-    "Caps",
     "Cut",
     "Evaluation",
+    "Limits",
     "NdtMatcher",
     "Regularization",
     "Result",
     "Settings",
+    "TrustLimits",
     "VoxelCell",
     "VoxelMap",
     "cell_from_layer",
@@ -39,3 +49,25 @@ __all__ = [
     "pose_from_matrix",
     "voxel_cell",
 ]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "BACKENDS": "backends.registry",
+        "Backend": "backends.backend",
+        "Cut": "matching.limits",
+        "Evaluation": "matching.evaluation",
+        "Limits": "matching.limits",
+        "NdtMatcher": "matching.matcher",
+        "Regularization": "matching.regularization",
+        "Result": "matching.result",
+        "Settings": "matching.matcher",
+        "TrustLimits": "matching.trust",
+        "VoxelCell": "map.voxel_cell",
+        "VoxelMap": "map.voxel_map",
+        "cell_from_layer": "map.voxel_cell",
+        "matrix_from_pose": "matching.euler_derivatives",
+        "pose_from_matrix": "matching.euler_derivatives",
+        "voxel_cell": "map.voxel_cell",
+    },
+)

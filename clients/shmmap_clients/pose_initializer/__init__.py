@@ -9,8 +9,35 @@
         found = initializer.initialize(scan, RoughPose(x, y, yaw=0.3, sigma_m=2.0))
 """
 
-from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
-from shmmap_clients.pose_initializer.initializer import InitializerRules, PoseInitializer
-from shmmap_clients.pose_initializer.rough_pose import RoughPose
+from __future__ import annotations
 
-__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "RoughPose"]
+from typing import TYPE_CHECKING
+
+from shmmap_clients.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
+    from shmmap_clients.pose_initializer.initializer import InitializerRules, PoseInitializer
+    from shmmap_clients.pose_initializer.relocalizer import Relocalizer
+    from shmmap_clients.pose_initializer.rough_pose import RoughPose
+
+__all__ = [
+    "Alternative",
+    "InitialPose",
+    "InitializerRules",
+    "PoseInitializer",
+    "Relocalizer",
+    "RoughPose",
+]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Alternative": "initial_pose",
+        "InitialPose": "initial_pose",
+        "InitializerRules": "initializer",
+        "PoseInitializer": "initializer",
+        "Relocalizer": "relocalizer",
+        "RoughPose": "rough_pose",
+    },
+)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.result import Result
+from shmmap_clients.ndt_scan_matcher import Result
 
 __all__ = ["Alternative", "InitialPose"]
 
@@ -42,7 +42,7 @@ class InitialPose:
     score
         Its transform probability: over all points, also those that found no map.
     reliable
-        Converged, and NVTL above Autoware's threshold.
+        Whether the result is within all limits of trust.
     ground_z
         Height of the map's ground at the rough pose, metres; None where there is none near.
     alternatives

@@ -8,22 +8,24 @@ import os
 import time
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final
+from typing import Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest, Client, MapWindow, NoAnswer, canonical_layer
+from shmmap_clients.map_extent import NoMapHere, map_extent
 from shmmap_clients.ndt_scan_matcher import (
-    Caps,
+    Limits,
     NdtMatcher,
+    Result,
     Settings,
+    TrustLimits,
     VoxelCell,
     VoxelMap,
     cell_from_layer,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.matching.result import Result
 from shmmap_clients.pose_initializer.height import ground_heights
 from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
 from shmmap_clients.pose_initializer.parzen import ParzenEstimator
@@ -48,7 +50,8 @@ class InitializerRules:
     leaf
         Edge of a voxel, metres.
     height
-        Of the scan's frame above the ground, metres; 0 for Autoware's base_link.
+        Of the scan's frame above the ground, metres; 0 for Autoware's base_link.  None: the rough pose's z is
+        right, and the map's ground is not asked.
     candidates
         Poses that are scored: half drawn from the rough pose, half where good ones are expected.
     starts
@@ -65,7 +68,7 @@ class InitializerRules:
 
     map_radius: float = 150.0
     leaf: float = 2.0
-    height: float = 0.0
+    height: float | None = 0.0
     candidates: int = 200
     starts: int = 10
     finals: int = 3
@@ -86,8 +89,8 @@ class PoseInitializer:
     client
         A session with the daemon, or a socket as in `shmmap.connect`: then it has a session of its own.
     rules
-    caps
-        Of the final alignments.
+    limits, trust
+        Of the final alignments, as in `NdtMatcher`.
     backend, threads
         As in `NdtMatcher`.
 
@@ -102,18 +105,21 @@ class PoseInitializer:
         client: Client | str | os.PathLike[str] | None = None,
         rules: InitializerRules | None = None,
         *,
-        caps: Caps | None = None,
+        limits: Limits | None = None,
+        trust: TrustLimits | None = None,
         backend: str = "numba",
         threads: int = 1,
     ) -> None:
         self.rules = rules if rules is not None else InitializerRules()
         self._voxels = canonical_layer(f"ndt(leaf={self.rules.leaf!r})")
         self._ground = canonical_layer("ground")
-        few = Caps(source_points=self.rules.scoring_points)
+        few = Limits(source_points=self.rules.scoring_points)
         self._coarse = NdtMatcher(
-            Settings(steady=True, epsilon=0.05), caps=few, backend=backend, threads=threads
+            Settings(steady=True, epsilon=0.05), limits=few, backend=backend, threads=threads
         )
-        self._fine = NdtMatcher(Settings(mode="coarse_fine"), caps=caps, backend=backend, threads=threads)
+        self._fine = NdtMatcher(
+            Settings(mode="coarse_fine"), limits=limits, trust=trust, backend=backend, threads=threads
+        )
         self._window = MapWindow(
             client,
             self.rules.map_radius,
@@ -140,7 +146,7 @@ class PoseInitializer:
         self._coarse.close()
         self._fine.close()
 
-    def initialize(self, points: NDArray[np.floating], rough: RoughPose) -> InitialPose:
+    def initialize(self, points: NDArray[np.floating], rough: RoughPose, *, effort: int = 1) -> InitialPose:
         """Find where a scan was taken.
 
         Parameters
@@ -149,19 +155,22 @@ class PoseInitializer:
             The scan, base frame, metres.
         rough
             Where it was probably taken.
+        effort
+            So many times as many candidates are drawn from the rough pose as by the rules.
 
         Raises
         ------
-        NoAnswer
-            There is no map around the place.
+        NoMapHere
+            The map has nothing around the place.
         ShmmapError
             The daemon cannot be asked.
         """
         began = time.perf_counter()
         ground_z, grounds = self._take_map(rough)
         had_map = time.perf_counter()
+        height = self.rules.height
         # the rough z is a guess of GNSS; the ground of the map is known to centimetres
-        heights = [z + self.rules.height for z in grounds] or [rough.z]
+        heights = [z + height for z in grounds] if height is not None and grounds else [rough.z]
 
         def pose_of(candidate: NDArray[np.float64], z: float) -> NDArray[np.float64]:
             x, y, yaw = candidate
@@ -173,8 +182,8 @@ class PoseInitializer:
 
         estimator = ParzenEstimator(rough, self.rules.seed)
         half = max(1, self.rules.candidates // 2)
-        batches = [half, *(_split(self.rules.candidates - half, 4))]
-        first = estimator.first(half)
+        batches = [half * effort, *(_split(self.rules.candidates - half, 4))]
+        first = estimator.first(batches[0])
         by_height = [scores(first, z) for z in heights]
         best_height = int(np.argmax([one.max() for one in by_height]))
         z = heights[best_height]
@@ -208,10 +217,7 @@ class PoseInitializer:
         cells = self._window.cells
         voxels = {cell.id: cell for cell in cells if cell.layer == self._voxels}
         if not voxels:
-            raise NoAnswer(
-                f"no map around ({rough.x:.1f}, {rough.y:.1f})",
-                hint="`shmmap query --circle X,Y,R` tells which cells there are",
-            )
+            self._window_is_empty(rough)
         versions = self._window.versions()
         if versions != self._versions:
             known = self._map.cells
@@ -225,6 +231,18 @@ class PoseInitializer:
             self._fine.set_map(self._map)
             self._versions = versions
         return ground_heights([cell for cell in cells if cell.layer == self._ground], rough.x, rough.y)
+
+    def _window_is_empty(self, rough: RoughPose) -> NoReturn:
+        """Say why there is no map around the place."""
+        if not self._window.complete:
+            raise NoAnswer(
+                f"no cell around ({rough.x:.3f}, {rough.y:.3f}) was loaded within {self.rules.wait_s:g} s",
+                hint="`shmmap status` tells whether the daemon still loads, or has no memory left",
+            )
+        raise NoMapHere(
+            f"no map within {self.rules.map_radius:g} m of the rough pose: {map_extent(self._window.client)},"
+            f" the pose is at ({rough.x:.3f}, {rough.y:.3f})"
+        )
 
 
 def _split(count: int, parts: int) -> list[int]:

@@ -36,12 +36,15 @@ class Scan:
         ``xyz`` (N, 3) float32 or float64, sensor frame, metres; other columns of as many rows.
     T_map_sensor
         (4, 4) float64; None where it is not known.
+    no_map
+        Its points were filtered with a map, but there was none around it.
     """
 
     name: str
     stamp_s: float
     columns: dict[str, NDArray[Any]] = field(repr=False)
     T_map_sensor: NDArray[np.float64] | None = None
+    no_map: bool = False
 
     @property
     def xyz(self) -> NDArray[Any]:
@@ -111,7 +114,7 @@ def _row(path: Path, poses: int, scans: int) -> int:
     numbers = re.findall(r"\d+", path.stem)
     if not numbers or int(numbers[-1]) >= poses:
         raise BadRequest(
-            f"{poses} poses do not fit {scans} scans: which is that of {path.name}?",
+            f"{poses} poses do not fit {scans} scans: {path.name} has no number of one of them in its name",
             hint="give a pose for each scan, or number the scans by the poses' lines, from 0",
         )
     return int(numbers[-1])

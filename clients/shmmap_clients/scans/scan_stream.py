@@ -4,8 +4,9 @@
 A message has a first frame in msgpack, ``{"shmmap_scan": 1, "name", "stamp_s", "pose", "columns"}``,
 and one frame of plain bytes for each column.  ``pose`` is null or 16 numbers, the rows of
 T_map_sensor; ``columns`` are ``[name, dtype, shape]`` with numpy's dtype strings (``"<f4"``), in the
-order of the frames.  ``"last": true`` (without columns) says that no more scans come; it may come again
-and again until its reader unsubscribes.
+order of the frames.  ``"no_map": true`` comes with a filtered scan that had no map around it.
+``"last": true`` (without columns) says that no more scans come; it may come again and again until its reader
+unsubscribes.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ class _Head(msgspec.Struct, omit_defaults=True):
     stamp_s: float = 0.0
     pose: list[float] | None = None
     columns: list[tuple[str, str, list[int]]] = []
+    no_map: bool = False
     last: bool = False
 
 
@@ -49,7 +51,7 @@ def encode_scan(scan: Scan | None) -> list[bytes]:
     arrays = {name: np.ascontiguousarray(values) for name, values in scan.columns.items()}
     pose = None if scan.T_map_sensor is None else [float(v) for v in scan.T_map_sensor.ravel()]
     columns = [(name, values.dtype.str, list(values.shape)) for name, values in arrays.items()]
-    head = _Head(_VERSION, scan.name, scan.stamp_s, pose, columns)
+    head = _Head(_VERSION, scan.name, scan.stamp_s, pose, columns, scan.no_map)
     return [_encoder.encode(head), *(values.tobytes() for values in arrays.values())]
 
 
@@ -85,7 +87,7 @@ def decode_scan(frames: list[bytes]) -> Scan | None:
         pose = None if head.pose is None else pose_of(head.pose)
     except (msgspec.DecodeError, BadRequest, ValueError, TypeError, IndexError) as error:
         raise BadRequest(f"a message that is no scan: {error}") from None
-    return Scan(head.name, head.stamp_s, columns, pose)
+    return Scan(head.name, head.stamp_s, columns, pose, head.no_map)
 
 
 class ScanPublisher(Publisher):

@@ -205,6 +205,6 @@ def test_columns_of_another_edge_than_the_distance_are_refused(mode: str, leaf: 
     compare = CompareMapFilter(CompareRule(mode, 0.5)).use_tables([build_layer("search(leaf=0.5)", cloud)])
     mixed: list[LayerTable] = [build_layer(f"search(leaf={edge})", cloud + 9) for edge in (0.5, leaf)]
     for _ in range(2):
-        with pytest.raises(BadRequest, match=f"{leaf} m do not answer"):
+        with pytest.raises(BadRequest, match=f"of {leaf} m cannot answer"):
             compare.use_tables(mixed)
     assert not compare.apply(cloud).kept.any()  # what it had is still what it has

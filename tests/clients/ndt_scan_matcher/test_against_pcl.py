@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The convention ``pcl`` beside PCL itself, at any leaf size and guess; needs g++ and libpcl-dev.
+"""The variant ``pcl`` beside PCL itself, at any leaf size and guess; needs g++ and libpcl-dev.
 
 What PCL does its own way is repeated: it stops where a step's translation, squared, is below epsilon (0.1 by
 default: a third of a metre), takes angles below 1e-4 for zero in derivatives, and clips its line search.  Two
@@ -75,7 +75,7 @@ def test_scores_and_derivatives(program: Path, clouds: tuple[Points, Points], le
 
 @pytest.mark.parametrize("leaf", LEAVES)
 def test_every_step(program: Path, clouds: tuple[Points, Points], leaf: float) -> None:
-    # Over many steps rounding grows: from a guess 1 um beside another this convention, whose basin is narrow,
+    # Over many steps rounding grows: from a guess 1 um beside another this variant, whose basin is narrow,
     # may end elsewhere, and so may PCL's.  From the same place both take the same step.
     target, source = clouds
     off = []

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
-    Caps,
     Evaluation,
+    Limits,
     NdtMatcher,
     Regularization,
     Result,
@@ -19,8 +19,8 @@ from shmmap_clients.ndt_scan_matcher import (
 )
 from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule, ascend
 from shmmap_clients.ndt_scan_matcher.matching.result import covariance_of, oscillations
-from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_worst_case
-from shmmap_clients.ndt_scan_matcher.matching.variants import convention_named
+from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_time_bound
+from shmmap_clients.ndt_scan_matcher.matching.variants import variant_named
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
@@ -47,10 +47,10 @@ def aligned(
     settings: Settings | None = None,
     *,
     backend: str = "numba",
-    caps: Caps | None = None,
+    limits: Limits | None = None,
     regularization: Regularization | None = None,
 ) -> Result:
-    with NdtMatcher(settings, backend=backend, caps=caps) as matcher:
+    with NdtMatcher(settings, backend=backend, limits=limits) as matcher:
         matcher.set_map(voxel_map)
         return matcher.align(scan, guess, regularization=regularization)
 
@@ -59,13 +59,13 @@ def error_m(result: Result) -> float:
     return float(np.linalg.norm(result.T_map_base[:3, 3] - TRUTH[:3]))
 
 
-@pytest.mark.parametrize("convention", ["autoware", "pclomp", "pcl"])
+@pytest.mark.parametrize("variant", ["autoware", "pclomp", "pcl"])
 @pytest.mark.parametrize("neighbors", ["direct1", "direct7", "radius"])
 @pytest.mark.parametrize("line_search", [False, True])
 def test_backends_take_the_same_way(
-    points: NDArray[np.float64], scan: NDArray[np.float64], convention: str, neighbors: str, line_search: bool
+    points: NDArray[np.float64], scan: NDArray[np.float64], variant: str, neighbors: str, line_search: bool
 ) -> None:
-    settings = Settings(convention, neighbors, line_search=line_search)  # type: ignore[arg-type]
+    settings = Settings(variant, neighbors, line_search=line_search)  # type: ignore[arg-type]
     voxel_map = map_of(points, 2.0)
     a, b = (aligned(voxel_map, scan, settings=settings, backend=name) for name in ("numba", "numpy"))
     assert (a.iterations, a.evaluations, a.converged) == (b.iterations, b.evaluations, b.converged)
@@ -111,7 +111,7 @@ def test_steady_steps_do_not_swing() -> None:
 
     guess = np.eye(4)
     guess[:3, 3] = 0.55, 0.2, -0.1
-    rule = StepRule(convention_named("autoware"), 1e-3, 0.5, 40, False, steady=True)
+    rule = StepRule(variant_named("autoware"), 1e-3, 0.5, 40, False, steady=True)
     ascent = ascend(guess, evaluate, rule)
     assert ascent.converged
     np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=2e-3)
@@ -133,7 +133,7 @@ def test_steady_steps_do_not_bounce_between_the_sides_of_a_crease(start: float) 
 
     guess = np.eye(4)
     guess[:2, 3] = 0.8, start
-    rule = StepRule(convention_named("autoware"), 0.01, 0.1, 30, False, steady=True)
+    rule = StepRule(variant_named("autoware"), 0.01, 0.1, 30, False, steady=True)
     ascent = ascend(guess, evaluate, rule)
     assert ascent.converged
     np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=2e-3)
@@ -153,7 +153,7 @@ def test_a_steady_step_that_loses_much_is_not_taken() -> None:
         return Evaluation(value, gradient, hessian, 0.0, 1, 1, 0, 0)
 
     guess = matrix_from_pose(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.0199]))
-    rule = StepRule(convention_named("autoware"), 1e-4, 0.1, 30, False, steady=True)
+    rule = StepRule(variant_named("autoware"), 1e-4, 0.1, 30, False, steady=True)
     ascent = ascend(guess, evaluate, rule)
     assert ascent.converged
     np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=1e-3)
@@ -202,9 +202,9 @@ def test_regularization_pulls_along_the_way(points: NDArray[np.float64], scan: N
 
 
 def test_caps_are_reported(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
-    caps = Caps(source_points=1000, neighbors=2, voxels=400, iterations=3)
-    voxel_map = VoxelMap(cells_of(points, 2.0), max_voxels=caps.voxels, centre=(1.0, 0.0))
-    result = aligned(voxel_map, scan, caps=caps)
+    limits = Limits(source_points=1000, neighbors=2, voxels=400, iterations=3)
+    voxel_map = VoxelMap(cells_of(points, 2.0), max_voxels=limits.voxels, centre=(1.0, 0.0))
+    result = aligned(voxel_map, scan, limits=limits)
     assert result.cut.points == 500
     assert result.cut.neighbor_points > 0
     assert result.cut.neighbors > 0
@@ -213,16 +213,16 @@ def test_caps_are_reported(points: NDArray[np.float64], scan: NDArray[np.float64
     assert not result.converged
 
 
-@pytest.mark.parametrize("convention", ["autoware", "pclomp"])
+@pytest.mark.parametrize("variant", ["autoware", "pclomp"])
 def test_evaluations_never_exceed_what_the_caps_allow(
-    points: NDArray[np.float64], scan: NDArray[np.float64], convention: str
+    points: NDArray[np.float64], scan: NDArray[np.float64], variant: str
 ) -> None:
-    settings = Settings(convention, epsilon=1e-9, mode="coarse_fine", fine_epsilon=1e-9)
-    with NdtMatcher(settings, caps=Caps(source_points=600, iterations=4)) as matcher:
+    settings = Settings(variant, epsilon=1e-9, mode="coarse_fine", fine_epsilon=1e-9)
+    with NdtMatcher(settings, limits=Limits(source_points=600, iterations=4)) as matcher:
         matcher.set_map(map_of(points, 2.0))
         result = matcher.align(scan, GUESS)
         assert result.evaluations <= matcher.most_evaluations
-        worst = predict_worst_case(matcher, scan, result.T_map_base)
+        worst = predict_time_bound(matcher, scan, result.T_map_base)
         assert worst.points == 600
         assert worst.total_ms > 0
 
@@ -256,7 +256,7 @@ def test_wrong_requests_are_refused(points: NDArray[np.float64], scan: NDArray[n
     with pytest.raises(shmmap.BadRequest):
         NdtMatcher(backend="fortran")
     with pytest.raises(shmmap.BadRequest):
-        Caps(neighbors=0)
+        Limits(neighbors=0)
     with NdtMatcher() as matcher:
         with pytest.raises(shmmap.BadRequest):
             matcher.align(scan, np.full((4, 4), np.nan))

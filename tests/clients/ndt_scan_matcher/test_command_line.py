@@ -49,7 +49,7 @@ def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture
         [
             "align", "--map", str(files["map.npz"]), "--scan", str(files["scan.npz"]), "--guess", GUESS,
             "--leaf", "2", "--epsilon", "0.05", "--max-iterations", "20", "--step-size", "0.2",
-            "--convention", "pclomp", "--neighbors", "direct7", "--line-search", "--max-points", "700",
+            "--variant", "pclomp", "--neighbors", "direct7", "--line-search", "--max-points", "700",
             "--backend", "numpy",
         ]
     )  # fmt: skip
@@ -57,7 +57,8 @@ def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture
     assert code == 0
     assert "T_map_base" in out
     assert "points 500" in out  # left out by the cap
-    assert "by the caps" in out
+    assert "by the limits" in out
+    assert "trusted                 yes" in out
 
 
 def test_align_far_from_the_map_is_a_negative_answer(
@@ -73,7 +74,9 @@ def test_align_far_from_the_map_is_a_negative_answer(
     [
         (["--scan", "missing.pcd"], 66),
         (["--scan", __file__], 65),
-        (["--leaf", "0"], 2),
+        (["--guess", "1,2,3"], 2),
+        (["--guess", "1,2,3,0,0,0,1"], 2),
+        (["--guess", "1,2,3,0,0,0,0", "--pose-format", "tum"], 2),
         (["--backend", "fortran"], 2),
     ],
 )
@@ -83,7 +86,8 @@ def test_errors_have_the_exit_codes_of_shmmap(files: dict[str, Path], change: li
 
 
 def test_wrong_words_are_usage_errors(files: dict[str, Path]) -> None:
-    for words in ([], ["align"], ["align", "--map", "a", "--scan", "b", "--guess", "1,2,3"]):
+    files_ = ["align", "--map", "a", "--scan", "b"]
+    for words in ([], ["align"], [*files_, "--guess", "1,2"], [*files_, "--leaf", "0"]):
         with pytest.raises(SystemExit) as exit_:
             main(words)
         assert exit_.value.code == 2

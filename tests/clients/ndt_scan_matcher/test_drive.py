@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+import pickle
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -13,14 +16,21 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.ndt_scan_matcher import NdtMatcher, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.drive.drive_plot import drive_svg
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
-from shmmap_clients.ndt_scan_matcher.drive.follower import Frame, thinned
+from shmmap_clients.decimation import KEPT
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
+from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+from shmmap_clients.ndt_scan_matcher.drive.frame_json import frame_document
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
 from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher, decode_pose
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import Spread, drive_errors, pose_errors
-from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdate
+from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
+    RunningErrors,
+    TrajectoryErrors,
+    pose_errors,
+)
+from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.scans.thinning import thinned
 from shmmap_clients.scans.trajectory import Trajectory
 
 import shmmap
@@ -40,7 +50,18 @@ def frame(number: int, T: NDArray[np.float64], truth: NDArray[np.float64] | None
         matcher.set_map(VoxelMap({}))
         result = matcher.align(np.zeros((1, 3)), T)
     return Frame(
-        f"scan_{number}", 0.1 * number, result, T, truth, 0.001, 0.0, 0.01 + number * 1e-3, number == 0
+        name=f"scan_{number}",
+        stamp_s=0.1 * number,
+        result=result,
+        T_guess=T,
+        T_truth=truth,
+        state="lost",
+        relocalized=False,
+        thin_s=0.001,
+        map_s=0.0,
+        align_s=0.01 + number * 1e-3,
+        relocalize_s=0.0,
+        waited=number == 0,
     )
 
 
@@ -76,13 +97,22 @@ def test_odometry_gives_the_motion_in_any_frame() -> None:
     assert interpolate(other, 0.41) is None
 
 
+def trajectory_errors(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> TrajectoryErrors:
+    """Compare (N, 4, 4) poses with the truth."""
+    running = RunningErrors()
+    for pose, true in zip(poses, truth, strict=True):
+        running.add(pose, true)
+    assert running.errors is not None
+    return running.errors
+
+
 def test_errors_are_those_that_were_made() -> None:
     truth = arc(200).T_map_sensor
     off = matrix_from_pose(np.array([0.3, 0.4, 0.0, 0.0, 0.0, np.radians(2.0)]))
     metres, degrees = pose_errors(truth @ off, truth)
     np.testing.assert_allclose(metres, 0.5)
     np.testing.assert_allclose(degrees, 2.0, atol=1e-6)
-    same = drive_errors(truth, truth)
+    same = trajectory_errors(truth, truth)
     assert same.ate_m.max < 1e-9
     assert set(same.rte) == {10.0, 50.0, 100.0}
     assert max(same.rte.values()) < 1e-6
@@ -93,28 +123,91 @@ def test_errors_are_those_that_were_made() -> None:
     straight[:, 0, 3] = np.arange(200)
     stretched = straight.copy()
     stretched[:, 0, 3] *= 1.01
-    assert drive_errors(stretched, straight).rte[50.0] == pytest.approx(1.0)
+    assert trajectory_errors(stretched, straight).rte[50.0] == pytest.approx(1.0)
 
 
-def test_a_spread_of_nothing_is_not_a_number() -> None:
-    assert np.isnan(Spread.of(np.empty(0)).mean)
-    spread = Spread.of(np.arange(101.0))
-    assert (spread.mean, spread.p50, spread.p99, spread.max) == (50.0, 50.0, 99.0, 100.0)
+def test_relative_errors_are_of_every_stretch() -> None:
+    """Against the definition: from each pose to the first one that is so far along the way."""
+    truth = arc(150).T_map_sensor
+    noise = np.random.default_rng(4).normal(0.0, 0.05, (150, 6)) * (1, 1, 1, 0.1, 0.1, 0.1)
+    poses = np.array([T @ matrix_from_pose(one) for T, one in zip(truth, noise, strict=True)])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+    for stretch, found in trajectory_errors(poses, truth).rte.items():
+        errors = []
+        for start in range(150):
+            later = np.flatnonzero(way >= way[start] + stretch)
+            if len(later):
+                ours = np.linalg.inv(poses[start]) @ poses[later[0]]
+                theirs = np.linalg.inv(truth[start]) @ truth[later[0]]
+                errors.append(np.linalg.norm((np.linalg.inv(theirs) @ ours)[:3, 3]) * 100.0 / stretch)
+        assert found == pytest.approx(np.mean(errors))
+
+
+def test_a_vehicle_that_stands_begins_no_stretches() -> None:
+    running = RunningErrors()
+    for _ in range(1000):
+        running.add(np.eye(4), np.eye(4))
+    assert max(len(starts) for starts in running._starts.values()) == 1
+    assert running.errors is not None
+    assert running.errors.rte == {}
 
 
 def test_summary_and_picture_of_a_drive(tmp_path: Path) -> None:
     drive = arc(30)
     frames = [frame(i, T, T) for i, T in enumerate(drive.T_map_sensor)]
-    summary = summarize(frames, [MapUpdate(5, 2, 0.1, 0.01, 1000)], 1)
+    updates = UpdateStatistics()
+    updates.add(added=5, removed=2, request_s=0.1, build_s=0.01, private_bytes=1000)
+    statistics = DriveStatistics()
+    for one in frames:
+        statistics.add(one)
+    summary = statistics.summary(updates, 1, TrustLimits(nvtl=2.3))
     assert summary.errors is not None
     assert summary.errors.ate_rmse_m < 1e-9
     assert (summary.frames, summary.waited, summary.too_slow) == (30, 1, 1)
     assert (summary.cells_added, summary.cells_removed, summary.map_private_bytes) == (5, 2, 1000)
     assert summary.latency_ms.max == pytest.approx(11.0 + 29.0)
     json.dumps(summary.as_document(), allow_nan=False)
-    json.dumps(summarize([], [], 0).as_document(), allow_nan=False)
+    assert (summary.no_map, summary.lost, summary.trustworthy) == (30, 30, 0)
+    assert summary.failed_limits == {"no_map": 30}
+    assert summary.as_document()["trust"]["nvtl"] == 2.3
+    nothing = DriveStatistics().summary(UpdateStatistics(), 0, TrustLimits())
+    json.dumps(nothing.as_document(), allow_nan=False)
     for drawn in (frames, frames[:1], [frame(0, np.eye(4), None)], []):
-        assert ElementTree.fromstring(drive_svg(drawn)).tag.endswith("svg")
+        plot = DrivePlot()
+        for one in drawn:
+            plot.add(one)
+        assert ElementTree.fromstring(plot.svg()).tag.endswith("svg")
+
+
+def test_a_frame_as_json_says_how_far_it_is_from_the_truth() -> None:
+    off = matrix_from_pose(np.array([0.3, 0.4, 0.0, 0.0, 0.0, np.radians(2.0)]))
+    document = frame_document(frame(1, off, np.eye(4)))
+    json.dumps(document, allow_nan=False)
+    assert document["error_m"] == pytest.approx(0.5)
+    assert document["error_deg"] == pytest.approx(2.0)
+    assert document["pose"][:2] == pytest.approx([0.3, 0.4])
+    assert document["no_map"]
+    assert document["failed_limits"] == ["no_map"]
+    assert document["state"] == "lost"
+    assert frame_document(frame(1, off, None))["error_m"] is None
+
+
+def test_a_long_drive_takes_no_more_memory() -> None:
+    statistics, plot = DriveStatistics(), DrivePlot()
+    one = frame(0, np.eye(4), np.eye(4))
+    sizes = []
+    for number in range(3 * KEPT):
+        truth = np.eye(4)
+        truth[0, 3] = 0.4 * number
+        moved = dataclasses.replace(one, T_truth=truth)
+        statistics.add(moved)
+        plot.add(moved)
+        if number + 1 in (KEPT, 3 * KEPT):
+            sizes.append(len(pickle.dumps((statistics, plot))))
+    assert sizes[1] < 1.1 * sizes[0]
+    summary = statistics.summary(UpdateStatistics(), 0, TrustLimits())
+    assert summary.frames == 3 * KEPT
+    assert len(re.findall("<circle", plot.svg())) <= KEPT
 
 
 def test_thinning_leaves_a_point_per_cube() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Score, gradient and Hessian: against their definition, between backends, under caps."""
+"""Score, gradient and Hessian: against their definition, between backends, under limits."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
-    Caps,
     Evaluation,
+    Limits,
     VoxelMap,
     matrix_from_pose,
     pose_from_matrix,
     voxel_cell,
 )
-from shmmap_clients.ndt_scan_matcher.backends.backend import backend_named
+from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 
 from tests.clients.ndt_scan_matcher.brute_force import rotation, score
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
@@ -39,11 +39,11 @@ def evaluated(
     scan: NDArray[np.floating],
     pose: NDArray[np.float64],
     *,
-    caps: Caps | None = None,
+    limits: Limits | None = None,
     threads: int = 1,
     **settings: Any,
 ) -> Evaluation:
-    computer = backend_named(backend, caps or Caps(source_points=4096), threads)
+    computer = backend_named(backend, limits or Limits(source_points=4096), threads)
     computer.set_map(voxel_map)
     computer.set_source(scan)
     result = computer.evaluate(pose, **settings)
@@ -103,7 +103,7 @@ def test_any_leaf_and_pose_equal_the_textbook(
 def test_derivatives_are_those_of_the_score(points: NDArray[np.float64], backend: str) -> None:
     voxel_map = map_of(points, 2.0)
     scan = scan_from(points, TRUTH, 300)
-    computer = backend_named(backend, Caps(source_points=300))
+    computer = backend_named(backend, Limits(source_points=300))
     computer.set_map(voxel_map)
     computer.set_source(scan)
 
@@ -140,9 +140,9 @@ def test_the_nearest_neighbours_are_kept_under_a_cap(points: NDArray[np.float64]
     voxel_map = map_of(points, 2.0)
     scan = scan_from(points, TRUTH, 500)
     settings: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
-    caps = Caps(source_points=500, neighbors=most)
-    compiled = evaluated("numba", voxel_map, scan, NEAR, caps=caps, **settings)
-    assert_equal(evaluated("numpy", voxel_map, scan, NEAR, caps=caps, **settings), compiled)
+    limits = Limits(source_points=500, neighbors=most)
+    compiled = evaluated("numba", voxel_map, scan, NEAR, limits=limits, **settings)
+    assert_equal(evaluated("numpy", voxel_map, scan, NEAR, limits=limits, **settings), compiled)
     free = evaluated("numba", voxel_map, scan, NEAR, **settings)
     assert compiled.neighbours + compiled.cut_neighbours == free.neighbours
     assert compiled.neighbours <= most * compiled.found
@@ -153,7 +153,7 @@ def test_the_nearest_neighbours_are_kept_under_a_cap(points: NDArray[np.float64]
 def test_points_beyond_the_cap_are_left_out_evenly(points: NDArray[np.float64]) -> None:
     scan = scan_from(points, TRUTH, 1000)
     for backend in ("numba", "numpy"):
-        computer = backend_named(backend, Caps(source_points=300))
+        computer = backend_named(backend, Limits(source_points=300))
         computer.set_map(map_of(points, 2.0))
         assert computer.set_source(scan) == 700
         some = computer.evaluate(NEAR, neighbors="radius", covariance="autoware")

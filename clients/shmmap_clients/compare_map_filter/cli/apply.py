@@ -4,53 +4,62 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Any, Final
 
 from shmmap_clients.command_line import (
+    add_allow_empty_option,
     add_json_option,
-    add_scan_option,
-    numbers,
+    add_verb,
+    nothing_found,
     output_file,
     print_json,
     write_text,
     writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
+from shmmap_clients.shared_options import add_scan_option
 
 __all__ = ["add_parser", "run"]
+
+_EPILOG: Final = """\
+JSON (fields may be added, none is removed):
+  {"points", "kept", "no_map": bool, "compare_ms"}
+The file written has the kept points with all fields, and a column index: their
+rows in the scan; with --mask all points, and a column kept.
+Exit code: 0; 1 when there is no map around the scan, or no point is kept."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "apply",
-        help="filter one scan with one map, both files",
+        run,
+        help="filter one scan with one map file; no daemon",
         description="Filter one scan with one map file; no daemon is needed.",
-        epilog="JSON: points, kept, compare_ms.  The output has the kept points with all fields and a column"
-        " index, their rows in the scan; with --mask all points and a column kept.",
+        epilog=_EPILOG,
     )
-    parser.add_argument("--map", required=True, metavar="FILE", help="PCD, NPZ or any cloud file")
+    parser.add_argument("--map", required=True, metavar="FILE", help="map: PCD, NPZ or any other cloud file")
     add_scan_option(parser)
-    parser.add_argument(
-        "--pose",
-        type=numbers(7),
-        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        metavar="X,Y,Z,QX,QY,QZ,QW",
-        help="of the sensor in the map, metres (default: the scan is in the map frame)",
-    )
+    add_pose_option(parser, "--pose", "pose of the sensor (default: the scan is in the map frame)")
+    add_pose_format_option(parser)
     add_rule_options(parser)
-    parser.add_argument("--out", metavar="DIR", help="write SCAN.pcd there")
-    parser.add_argument("--mask", action="store_true", help="write all points, with a column kept")
-    parser.add_argument(
+    out = parser.add_argument_group("output")
+    out.add_argument("--out", metavar="DIR", help="write SCAN.pcd into this directory")
+    out.add_argument("--mask", action="store_true", help="write all points, with a column kept")
+    out.add_argument(
         "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
     )
+    add_allow_empty_option(out)
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Filter and print."""
     from pathlib import Path
+
+    import numpy as np
 
     from shmmap import build_layer
     from shmmap_clients.compare_map_filter.drive import ComparedScan
@@ -58,15 +67,16 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.compare_map_filter.numpy_path import to_map
     from shmmap_clients.compare_map_filter.output import PcdDirectory
     from shmmap_clients.compare_map_filter.picture import TopView
+    from shmmap_clients.map_extent import extent_text
     from shmmap_clients.scans.scan_file import read_scan, read_scan_fields
     from shmmap_clients.scans.scan_sequence import Scan
-    from shmmap_clients.scans.trajectory import matrix_of
 
     rule = rule_from(args)
-    T = matrix_of(args.pose[:3], args.pose[3:])
+    T = pose_from(args, "--pose") if args.pose is not None else np.eye(4)
     scan = Scan(Path(args.scan).stem, 0.0, read_scan_fields(args.scan), T)
     table = build_layer(rule.layer, read_scan(args.map))
-    comparison = CompareMapFilter(rule, backend=args.backend).use_tables([table]).apply(scan.xyz, T)
+    compare = CompareMapFilter(rule, backend=args.backend).use_tables([table])
+    comparison = compare.apply(scan.xyz, T)
     kept = int(comparison.kept.sum())
     if args.out:
         with writing_errors(args.out):
@@ -76,9 +86,16 @@ def run(args: argparse.Namespace) -> int:
         view.add(to_map(scan.xyz, T), comparison.kept, (float(T[0, 3]), float(T[1, 3])))
         note = f"{len(scan.xyz)} points, {kept} kept; {args.mode}, {args.distance:g} m"
         write_text(args.picture, view.svg(scan.name, note))
+    milliseconds = comparison.compare_s * 1e3
     if args.json:
-        milliseconds = comparison.compare_s * 1e3
-        print_json({"points": len(scan.xyz), "kept": kept, "compare_ms": milliseconds})
+        found = {"points": len(scan.xyz), "kept": kept, "no_map": comparison.no_map}
+        print_json({**found, "compare_ms": milliseconds})
     else:
-        print(f"{len(scan.xyz)} points, {kept} kept, {comparison.compare_s * 1e3:.1f} ms")
+        print(f"{len(scan.xyz)} points, {kept} kept, {milliseconds:.1f} ms")
+    if comparison.no_map:
+        x, y = T[:2, 3]
+        where = f"{extent_text(compare.bounds)}, the pose is at ({x:.3f}, {y:.3f})"
+        return nothing_found(args, "shmmap-compare", f"no map around the scan: {where}")
+    if not kept:
+        return nothing_found(args, "shmmap-compare", "no point is kept: the map explains all of them")
     return 0

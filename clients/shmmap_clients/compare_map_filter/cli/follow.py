@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-compare follow``: a drive through the daemon's map."""
+"""``shmmap-compare follow``: filter scan after scan with the daemon's map."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
+    add_allow_empty_option,
     add_daemon_options,
     add_json_option,
+    add_verb,
     connect,
+    nothing_found,
     output_file,
     print_json,
     seconds,
@@ -18,49 +22,85 @@ from shmmap_clients.command_line import (
     writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
+from shmmap_clients.shared_options import (
+    add_quiet_option,
+    add_radius_option,
+    add_scans_option,
+    not_negative,
+)
+
+if TYPE_CHECKING:
+    from shmmap_clients.compare_map_filter.statistics import DriveStatistics
 
 __all__ = ["add_parser", "run"]
 
-_JSON = (
-    "JSON: scans, points, kept, incomplete_scans (compared while cells of the window were missing),"
-    " first_missing (the first of them, and what it lacked), updates (how often the window's cells changed),"
-    " compare_ms and update_ms (p50, p99, max; null without any)."
-    "  Exit code: 0, or 1 where a scan was compared with cells missing."
-)
+_NAME: Final = "shmmap-compare"
+_EPILOG: Final = """\
+JSON (fields may be added, none is removed).
+--json prints one document at the end:
+  {"scans", "points", "kept", "no_map_scans": without a map around them,
+   "incomplete_scans": compared while cells around them were missing,
+   "first_missing": the first of these and what it lacked, or null,
+   "updates": how often the cells around the vehicle changed,
+   "compare_ms", "update_ms": {"p50", "p99", "max"}, or null}
+--json-lines writes a line for each scan:
+  {"name", "stamp_s", "points", "kept", "cells", "no_map",
+   "missing": text or null, "compare_ms", "update_ms"}
+
+Exit code: 0; 1 when a scan had no map around it, cells were missing, there was
+no scan, or no point was kept."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "follow",
+        run,
         help="filter scan after scan around the moving vehicle",
-        description="Filter scans with the daemon's map, in a window that follows their poses.",
-        epilog=_JSON,
+        description="Filter scan after scan with the daemon's map around their poses: what the map explains"
+        " is removed.",
+        epilog=_EPILOG,
     )
+    add_scans_option(parser)
     parser.add_argument(
-        "--scans", required=True, metavar="DIR|ENDPOINT", help="a directory (PCD, NPZ, .bin), or a publisher"
+        "--poses",
+        metavar="FILE",
+        help="poses of the sensor for the scans of a directory, TUM format; a publisher's scans bring theirs",
     )
-    parser.add_argument("--poses", metavar="FILE", help="T_map_sensor of each scan, TUM format")
     add_rule_options(parser)
-    window = parser.add_argument_group("window")
-    window.add_argument("--radius", type=float, default=150.0, metavar="M", help="default 150")
-    window.add_argument("--update-distance", type=float, default=10.0, metavar="M", help="default 10")
+    window = parser.add_argument_group("map around the vehicle")
+    add_radius_option(window)
     window.add_argument(
-        "--wait", type=seconds, metavar="SECONDS",
+        "--update-distance",
+        type=not_negative,
+        default=10.0,
+        metavar="M",
+        help="ask for the next map after so many metres (default: 10)",
+    )
+    window.add_argument(
+        "--wait",
+        type=seconds,
+        metavar="SECONDS",
         help="how long a scan may wait for cells (default: 30 for a directory, not at all for a publisher)",
-    )  # fmt: skip
-    output = parser.add_argument_group("output")
-    output.add_argument("--out", metavar="DIR|ENDPOINT", help="PCD files, or a publisher's address to bind")
-    output.add_argument(
-        "--mask", action="store_true", help="all points with a column kept, not the kept ones"
     )
-    output.add_argument(
-        "--picture", type=output_file, metavar="FILE", help="an SVG of kept and removed points"
+    out = parser.add_argument_group("output")
+    out.add_argument(
+        "--out", metavar="DIR|ENDPOINT", help="write PCD files, or publish scans at this ZeroMQ address"
     )
-    output.add_argument("--quiet", action="store_true", help="no line for each scan on stderr")
-    add_json_option(output)
-    add_daemon_options(parser)
-    parser.set_defaults(run=run)
+    out.add_argument(
+        "--mask", action="store_true", help="give all points, with a column kept, not only the kept ones"
+    )
+    out.add_argument(
+        "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
+    )
+    out.add_argument(
+        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
+    )
+    add_quiet_option(out)
+    add_allow_empty_option(out)
+    add_json_option(parser)
+    add_daemon_options(parser, json=False)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -74,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.compare_map_filter.output import open_output
     from shmmap_clients.compare_map_filter.picture import TopView
     from shmmap_clients.compare_map_filter.statistics import DriveStatistics
+    from shmmap_clients.map_extent import map_extent
     from shmmap_clients.scans.scan_source import open_scans
     from shmmap_clients.streams import is_endpoint
 
@@ -81,13 +122,19 @@ def run(args: argparse.Namespace) -> int:
     compare = CompareMapFilter(rule, backend=args.backend)  # compiles before anybody waits
     statistics, view = DriveStatistics(), TopView()
     wait_s = args.wait if args.wait is not None else (None if is_endpoint(args.scans) else 30.0)
+    code = 0
     with ExitStack() as stack:
         scans = open_scans(args.scans, args.poses, stack)
-        client = stack.enter_context(connect(args, "shmmap-compare"))
+        client = stack.enter_context(connect(args, _NAME))
         window = stack.enter_context(
-            MapWindow(client, args.radius, layers=rule.layer, update_distance=args.update_distance)
+            MapWindow(client, args.map_radius, layers=rule.layer, update_distance=args.update_distance)
         )
-        output = None
+        output = lines = None
+        if args.json_lines == "-":
+            lines = sys.stdout
+        elif args.json_lines:
+            stack.enter_context(writing_errors(args.json_lines))
+            lines = stack.enter_context(open(args.json_lines, "w", encoding="utf-8"))
         if args.out:
             stack.enter_context(writing_errors(args.out))
             output = open_output(args.out, mask=args.mask, wait_s=30.0)
@@ -100,23 +147,43 @@ def run(args: argparse.Namespace) -> int:
             if args.picture and T is not None:
                 position = (float(T[0, 3]), float(T[1, 3]))
                 view.add(to_map(compared.scan.xyz, T), compared.comparison.kept, position)
+            if lines is not None:
+                lines.write(json.dumps(statistics.document(compared), allow_nan=False) + "\n")
+                lines.flush()
+            if compared.comparison.no_map and statistics.no_map == 1 and T is not None:
+                x, y = T[:2, 3]
+                where = f"{map_extent(client)}, the pose is at ({x:.3f}, {y:.3f})"
+                code = nothing_found(args, _NAME, f"no map around scan {compared.scan.name}: {where}")
             if not args.quiet:
                 print(statistics.line(compared), file=sys.stderr)
         compare.use_cells(())
-    summary = statistics.summary()
     if args.picture:
         note = (
             f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;"
             f" {args.mode}, {args.distance:g} m"
         )
-        write_text(args.picture, view.svg("shmmap-compare", note))
+        write_text(args.picture, view.svg(_NAME, note))
     if args.json:
-        print_json(summary)
+        print_json(statistics.summary())
     else:
-        times = summary["compare_ms"] or {"p50": 0.0, "p99": 0.0}
-        print(
-            f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;"
-            f" {times['p50']:.1f} ms each (p99 {times['p99']:.1f});"
-            f" {statistics.incomplete} scans with cells missing"
-        )
-    return 1 if statistics.incomplete or not statistics.scans else 0
+        _print(statistics)
+    return max(code, _exit_code(args, statistics))
+
+
+def _print(statistics: DriveStatistics) -> None:
+    times = statistics.summary()["compare_ms"] or {"p50": 0.0, "p99": 0.0}
+    print(
+        f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;"
+        f" {times['p50']:.1f} ms each (p99 {times['p99']:.1f});"
+        f" {statistics.incomplete} scans with cells missing, {statistics.no_map} without a map"
+    )
+
+
+def _exit_code(args: argparse.Namespace, statistics: DriveStatistics) -> int:
+    code = 1 if statistics.incomplete else 0
+    if not statistics.scans:
+        return nothing_found(args, _NAME, f"no scan came from {args.scans}")
+    if not statistics.kept:
+        explained = f"the map explains all {statistics.points} points"
+        return max(code, nothing_found(args, _NAME, f"no point was kept: {explained}"))
+    return code

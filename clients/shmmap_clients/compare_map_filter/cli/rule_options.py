@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that say when the map explains a point."""
+"""Options that say which points the map explains."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
+
+from shmmap_clients.shared_options import add_backend_option, positive
 
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.rule import CompareRule
@@ -19,13 +21,20 @@ def add_rule_options(parser: argparse.ArgumentParser) -> None:
         "--mode",
         choices=("voxel", "voxel-distance", "distance"),
         default="voxel",
-        help="a voxel's centroid is near; or a map point is in the voxel or near; or a map point is near",
+        help="a point is removed when voxel: a voxel's centroid is near it; voxel-distance: a map point is in"
+        " its voxel or near it; distance: a map point is near it (default: voxel)",
     )
-    group.add_argument("--distance", type=float, default=0.5, metavar="M", help="how near (default 0.5)")
     group.add_argument(
-        "--z-ratio", type=float, default=0.5, metavar="R", help="height of a voxel over the distance (0.5)"
+        "--distance", type=positive, default=0.5, metavar="M", help="what near means (default: 0.5)"
     )
-    group.add_argument("--backend", choices=("numba", "numpy"), default="numba", help="same result, slower")
+    group.add_argument(
+        "--z-ratio",
+        type=positive,
+        default=0.5,
+        metavar="R",
+        help="height of a voxel, as a multiple of --distance (default: 0.5)",
+    )
+    add_backend_option(group)
 
 
 def rule_from(args: argparse.Namespace) -> CompareRule:

@@ -12,7 +12,10 @@ __all__ = ["add_parser", "run"]
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
-        "warmup", help="compile the kernel", description="Compile the kernel and keep it in numba's cache."
+        "warmup",
+        help="compile the kernel and cache it",
+        description="Compile the kernel and keep it in numba's cache (NUMBA_CACHE_DIR where it is set), so"
+        " that no filter has to wait for the compiler.",
     )
     parser.set_defaults(run=run)
 

@@ -8,65 +8,125 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
+    add_allow_empty_option,
     add_daemon_options,
     add_json_option,
+    add_verb,
     at_least,
     connect,
+    nothing_found,
     output_file,
     print_json,
     seconds,
     writing_errors,
 )
+from shmmap_clients.shared_options import add_quiet_option, not_negative, positive
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress
+    from shmmap_clients.elevation_map.rule import ElevationRule
 
 __all__ = ["add_parser", "run"]
 
 _ATTEMPTS = 3
 _EVERY_S = 0.5
+_NAME: Final = "shmmap-elevation"
+_FEW: Final = 0.5
+"""Share of the columns with points that should have a height; a map of sparse points has fewer."""
+
+_EPILOG: Final = """\
+JSON (fields may be added, none is removed):
+  {"map_version": hex, "cells", "loaded": cells that this run loaded,
+   "rows", "columns": of the grid, "resolution", "origin": south-west corner,
+   "occupied": columns with a point, "measured": columns with a height,
+   "measured_share": of the occupied ones, or null, "filled": columns,
+   "stray": points outside their cell, "failed": [{"id", "code", "message"}],
+   "files": [path]}
+Exit code: 0; 1 when cells could not be loaded, or no column has a height."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "build",
+        run,
         help="make an elevation map of the whole map",
-        description="Make the elevation of the daemon's whole map, one cell at a time, and write it."
-        "  What was made before is kept by the map's version and the rule, and an interrupted run goes on.",
-        epilog="JSON: map_version, cells, loaded (cells that this run loaded), rows and columns of the grid,"
-        " resolution, origin (its south-west corner), measured and filled columns, stray points outside"
-        " their cell, failed (cells that could not be had), files.  Exit code: 0, or 1 where cells failed.",
+        description="Make an elevation map of the daemon's whole map, one cell at a time, and write it.  What"
+        " was made before is cached for each version of the map, and an interrupted run goes on.",
+        epilog=_EPILOG,
     )
     parser.add_argument(
-        "--out", action="append", default=[], type=output_file, metavar="FILE",
-        help=".npz, .tif or .png; may be given again",
-    )  # fmt: skip
+        "--out",
+        action="extend",
+        nargs="+",
+        default=[],
+        type=output_file,
+        metavar="FILE",
+        help="write .npz, .tif (GeoTIFF) or .png files",
+    )
     parser.add_argument(
-        "--hillshade", type=output_file, metavar="FILE", help="a shaded picture (PNG) and its world file"
+        "--hillshade", type=output_file, metavar="FILE", help="write a shaded relief (PNG) and its world file"
     )
     rule = parser.add_argument_group("heights")
     rule.add_argument(
-        "--rule", choices=("surface", "min", "mean", "max"), default="surface",
-        help="lowest surface as Autoware makes it from points (default); the others from elevation layers",
-    )  # fmt: skip
-    rule.add_argument("--resolution", type=float, default=0.3, metavar="M", help="default 0.3")
-    rule.add_argument("--tolerance", type=float, default=0.2, metavar="M", help="within a cluster (0.2)")
-    rule.add_argument("--height-range", type=float, default=1.0, metavar="M", help="above the lowest (1.0)")
-    rule.add_argument("--min-points", type=int, default=3, metavar="N", help="of a cluster (3)")
-    rule.add_argument(
-        "--fill-radius", type=float, default=1.0, metavar="M", help="fill holes this near to heights (1.0)"
+        "--rule",
+        choices=("surface", "min", "mean", "max"),
+        default="surface",
+        help="height of a column: surface: its lowest cluster of points, as in Autoware; min, mean, max: of"
+        " all its points (default: surface)",
     )
-    parser.add_argument("--epsg", type=at_least(1), metavar="CODE", help="coordinate system of a GeoTIFF")
-    parser.add_argument("--cache", metavar="DIR", help="default: $XDG_CACHE_HOME/shmmap/elevation")
-    parser.add_argument("--wait", type=seconds, default=60.0, metavar="SECONDS", help="for one cell (60)")
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    rule.add_argument(
+        "--resolution", type=positive, default=0.3, metavar="M", help="edge of a column (default: 0.3)"
+    )
+    rule.add_argument(
+        "--tolerance",
+        type=positive,
+        default=0.2,
+        metavar="M",
+        help="surface: how near points of one cluster are to each other (default: 0.2)",
+    )
+    rule.add_argument(
+        "--height-range",
+        type=positive,
+        default=1.0,
+        metavar="M",
+        help="surface: how far above the lowest cluster the chosen one may be (default: 1)",
+    )
+    rule.add_argument(
+        "--min-points",
+        type=at_least(1),
+        default=3,
+        metavar="N",
+        help="surface: points that a cluster needs (default: 3)",
+    )
+    rule.add_argument(
+        "--fill-radius",
+        type=not_negative,
+        default=1.0,
+        metavar="M",
+        help="give a height to columns without one that are this near to others with one (default: 1)",
+    )
+    parser.add_argument(
+        "--epsg", type=at_least(1), metavar="CODE", help="coordinate system to name in a GeoTIFF"
+    )
+    parser.add_argument(
+        "--cache", metavar="DIR", help="where heights are kept (default: $XDG_CACHE_HOME/shmmap/elevation)"
+    )
+    parser.add_argument(
+        "--wait",
+        type=seconds,
+        default=60.0,
+        metavar="SECONDS",
+        help="how long to wait for one cell (default: 60)",
+    )
+    add_quiet_option(parser)
+    add_allow_empty_option(parser)
     add_json_option(parser)
-    add_daemon_options(parser)
-    parser.set_defaults(run=run)
+    add_daemon_options(parser, json=False)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -79,6 +139,7 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.elevation_map.holes import fill_reach
     from shmmap_clients.elevation_map.output import check_output, write_elevation, write_hillshade
     from shmmap_clients.elevation_map.rule import ElevationRule
+    from shmmap_clients.map_extent import map_extent
 
     rule = ElevationRule(args.rule, args.resolution, args.tolerance, args.height_range, args.min_points)
     files: list[Path] = args.out
@@ -88,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest(f"{args.hillshade}: a hillshade is written as .png")
     fill_reach(args.fill_radius / rule.resolution)
     with _ProgressLine(quiet=args.quiet) as progress:
-        with connect(args, "shmmap-elevation") as client:
+        with connect(args, _NAME) as client:
             for attempt in range(_ATTEMPTS):
                 try:
                     with writing_errors("the cache of elevation maps"):
@@ -99,6 +160,7 @@ def run(args: argparse.Namespace) -> int:
                 except MapChanged:
                     if attempt == _ATTEMPTS - 1:
                         raise
+            extent = map_extent(client)
         grid = built.grid
         document = {
             "map_version": f"{built.map_version:016x}",
@@ -116,6 +178,8 @@ def run(args: argparse.Namespace) -> int:
         counts = np.zeros(3, np.int64)
         for _, _, kind in grid.blocks(args.fill_radius):
             counts += np.bincount(kind.ravel(), minlength=3)
+    measured = int(counts[MEASURED])
+    share = measured / built.occupied if built.occupied else None
     written = [*files, *([args.hillshade] if args.hillshade else [])]
     summary = {
         "map_version": document["map_version"],
@@ -125,7 +189,9 @@ def run(args: argparse.Namespace) -> int:
         "columns": grid.shape[1],
         "resolution": grid.resolution,
         "origin": list(grid.origin),
-        "measured": int(counts[MEASURED]),
+        "occupied": built.occupied,
+        "measured": measured,
+        "measured_share": share,
         "filled": int(counts[FILLED]),
         "stray": built.stray,
         "failed": [
@@ -138,12 +204,28 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(
             f"{built.cells} cells, {built.loaded} loaded: {grid.shape[1]} x {grid.shape[0]} columns of"
-            f" {grid.resolution:g} m, {counts[MEASURED]} measured, {counts[FILLED]} filled"
+            f" {grid.resolution:g} m, {built.occupied} with points, {measured} measured,"
+            f" {counts[FILLED]} filled"
         )
         print(f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out")
         for error in built.failed:
             print(f"missing: {error}", file=sys.stderr)
-    return 1 if built.failed else 0
+    code = 1 if built.failed else 0
+    if not measured:
+        why = "no cell has a point" if not built.occupied else _sparse(rule, measured, built.occupied)
+        return max(code, nothing_found(args, _NAME, f"no column has a height: {why}; {extent}"))
+    if share is not None and share < _FEW:
+        print(f"{_NAME}: warning: {_sparse(rule, measured, built.occupied)}", file=sys.stderr)
+    return code
+
+
+def _sparse(rule: ElevationRule, measured: int, occupied: int) -> str:
+    """Say that few columns have a height, why, and what helps."""
+    return (
+        f"{measured} of {occupied} columns with points ({100 * measured / occupied:.1f} %) have a height;"
+        f" a column of {rule.resolution:g} m needs {rule.min_points} points within {rule.tolerance:g} m of"
+        " each other: try a larger --resolution, a larger --tolerance or --min-points 1"
+    )
 
 
 def _cache(named: str | None) -> Path:

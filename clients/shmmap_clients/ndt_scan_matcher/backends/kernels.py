@@ -100,7 +100,7 @@ def accumulate(
                         if voxel < 0 or voxel >= table[cell, 10]:
                             continue
                         inverse = table[cell, 2] + voxel * 48
-                        if not float64_at(inverse, 0) > 0.0:  # refused in this convention
+                        if not float64_at(inverse, 0) > 0.0:  # refused in this variant
                             continue
                         dx = px - origins[cell, 0] - float64_at(table[cell, 1], voxel * 3)
                         dy = py - origins[cell, 1] - float64_at(table[cell, 1], voxel * 3 + 1)

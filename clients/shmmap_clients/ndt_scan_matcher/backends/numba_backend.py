@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.backends.kernels import accumulate
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import derivative_matrices, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     CHUNK_POINTS,
     SUMS,
@@ -21,8 +21,8 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     search_columns,
     total,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Caps
-from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import SourcePoints
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
 
 __all__ = ["NumbaBackend"]
 
@@ -36,12 +36,12 @@ class NumbaBackend:
 
     name = "numba"
 
-    def __init__(self, caps: Caps, threads: int = 1) -> None:
-        self._source = SourcePoints(caps.source_points)
+    def __init__(self, limits: Limits, threads: int = 1) -> None:
+        self._source = ScanBuffer(limits.source_points)
         self._map = VoxelMap({})
-        self._rows = np.zeros((-(-caps.source_points // CHUNK_POINTS), SUMS))
+        self._rows = np.zeros((-(-limits.source_points // CHUNK_POINTS), SUMS))
         self._scratch = [
-            (np.empty((caps.neighbors, 4)), np.empty(caps.neighbors, np.int64)) for _ in range(threads)
+            (np.empty((limits.neighbors, 4)), np.empty(limits.neighbors, np.int64)) for _ in range(threads)
         ]
         self._columns = {name: search_columns(name) for name in ("direct1", "direct7", "radius")}
         self._pool = ThreadPoolExecutor(threads - 1, "ndt") if threads > 1 else None
@@ -56,7 +56,7 @@ class NumbaBackend:
         self._map = voxel_map
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points the cap left out."""
+        """Take a scan; returns how many points the limit left out."""
         return self._source.take(points)
 
     def evaluate(
@@ -78,7 +78,7 @@ class NumbaBackend:
         radius2 = voxel_map.leaf**2 if neighbors == "radius" else math.inf
         table = voxel_map.table(covariance)
         matrix = matrix_from_pose(pose) if T is None else T
-        derivatives = derivative_matrices(pose, pitch_sign)
+        derivatives = euler_derivatives(pose, pitch_sign)
 
         def run(part: int) -> None:
             near, near_inverse = self._scratch[part]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import derivative_matrices, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     AX,
     BJ,
@@ -27,8 +27,8 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     search_columns,
     total,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Caps
-from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import SourcePoints
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
 
 __all__ = ["NumpyBackend"]
 
@@ -76,9 +76,9 @@ class NumpyBackend:
 
     name = "numpy"
 
-    def __init__(self, caps: Caps, threads: int = 1) -> None:  # noqa: ARG002
-        self._source = SourcePoints(caps.source_points)
-        self._most = caps.neighbors
+    def __init__(self, limits: Limits, threads: int = 1) -> None:  # noqa: ARG002
+        self._source = ScanBuffer(limits.source_points)
+        self._most = limits.neighbors
         self._gaussians = _Gaussians(VoxelMap({}))
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ class NumpyBackend:
         self._gaussians = _Gaussians(voxel_map)
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points the cap left out."""
+        """Take a scan; returns how many points the limit left out."""
         return self._source.take(points)
 
     def evaluate(
@@ -103,7 +103,7 @@ class NumpyBackend:
     ) -> Evaluation:
         """Return score, gradient and Hessian at a pose vector."""
         matrix = matrix_from_pose(pose) if T is None else T
-        J = derivative_matrices(pose, pitch_sign)[:3]
+        J = euler_derivatives(pose, pitch_sign)[:3]
         source = self._source.points
         blocks = [source[at : at + _BLOCK_POINTS] for at in range(0, len(source), _BLOCK_POINTS)]
         rows = [self._sums(block, matrix, J, neighbors, covariance) for block in blocks]
@@ -115,7 +115,7 @@ class NumpyBackend:
         neighbors: Neighbors,
         inverse: NDArray[np.float64],
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], int, int]:
-        """Return points and their neighbours, point by point; and what the cap cut off."""
+        """Return points and their neighbours, point by point; and what the limit cut off."""
         gaussians = self._gaussians
         leaf = gaussians.map.leaf
         lattice = np.floor(moved * (1.0 / leaf)) - gaussians.low
@@ -139,7 +139,7 @@ class NumpyBackend:
         begin = np.cumsum(repeats) - repeats
         voxel = np.repeat(first.ravel()[hits] - begin, repeats) + np.arange(int(repeats.sum()))
         point = points[np.repeat(hits // len(steps), repeats)]
-        usable = inverse[voxel, 0] > 0.0  # else refused in this convention
+        usable = inverse[voxel, 0] > 0.0  # else refused in this variant
         distance2 = ((moved[point] - gaussians.mean[voxel]) ** 2).sum(axis=1)
         if neighbors == "radius":
             usable &= distance2 <= leaf**2

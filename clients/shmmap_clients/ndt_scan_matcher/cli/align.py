@@ -6,97 +6,53 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from shmmap_clients.command_line import add_json_option, add_scan_option, numbers, print_json
+from shmmap_clients.command_line import (
+    add_allow_empty_option,
+    add_json_option,
+    add_verb,
+    nothing_found,
+    print_json,
+)
+from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options, matcher_from
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
+from shmmap_clients.shared_options import add_leaf_option, add_scan_option, add_thin_option
 
-__all__ = ["add_alignment_options", "add_backend_options", "add_parser", "matcher_from", "run"]
+__all__ = ["add_parser", "run"]
+
+_JSON = """\
+JSON (fields may be added, none is removed):
+  {"T_map_base": 4x4 in metres, "iterations", "converged",
+   "transform_probability", "nvtl", "oscillations", "evaluations",
+   "trustworthy": bool, "no_map": bool, "failed_limits": [name],
+   "covariance": 6x6 of x y z roll pitch yaw, or null,
+   "cut": {"points", "neighbor_points", "neighbors", "voxels"}: left out by
+     limits, "worst_case_ms": bound by the limits, on this machine,
+   "align_ms": measured, "points", "voxels", "variant", "convention": the same,
+   "neighbors", "backend"}
+  Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
+Exit code: 0; 1 when the alignment did not converge, or no point of the scan has
+a voxel of the map near."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "align",
-        help="align one scan with one map, both files",
-        description="Align one scan with one map file; no daemon is needed.  What is left out of the options"
-        " is the convention's own default.",
-        epilog="JSON: T_map_base (4x4, metres), iterations, converged, transform_probability, nvtl,"
-        " oscillations, evaluations, covariance (6x6 or null, after x y z roll pitch yaw), cut (points,"
-        " neighbor_points, neighbors, voxels that caps left out), worst_case_ms (predicted from the caps"
-        " for this machine), align_ms (wall time of the alignment),"
-        " points, voxels, convention, neighbors, backend.",
+        run,
+        help="align one scan with one map file; no daemon",
+        description="Align one scan with one map file and print the pose of the scan; no daemon is needed.",
+        epilog=_JSON,
     )
-    parser.add_argument("--map", required=True, metavar="FILE", help="PCD, NPZ or any cloud file")
+    parser.add_argument("--map", required=True, metavar="FILE", help="map: PCD, NPZ or any other cloud file")
     add_scan_option(parser)
-    parser.add_argument(
-        "--guess",
-        type=numbers(6),
-        default=(0.0,) * 6,
-        metavar="X,Y,Z,ROLL,PITCH,YAW",
-        help="metres, radians, R = Rx Ry Rz (default: zeros)",
-    )
-    parser.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
+    add_pose_option(parser, "--guess", "pose to start from (default: zeros)", default=None)
+    add_pose_format_option(parser)
+    add_leaf_option(parser)
+    add_thin_option(parser, default=0.0)
     add_alignment_options(parser)
+    add_allow_empty_option(parser)
     add_json_option(parser)
-    parser.set_defaults(run=run)
-
-
-def add_alignment_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how to align."""
-    group = parser.add_argument_group("alignment")
-    group.add_argument("--convention", choices=("autoware", "pclomp", "pcl"), default="autoware")
-    group.add_argument("--neighbors", choices=("direct1", "direct7", "radius"))
-    group.add_argument("--epsilon", type=float, metavar="E", help="a smaller step ends it")
-    group.add_argument("--max-iterations", type=int, metavar="N")
-    group.add_argument("--step-size", type=float, default=0.1, metavar="M", help="longest step (default 0.1)")
-    group.add_argument(
-        "--line-search",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="More-Thuente's (default: as the convention's program)",
-    )
-    group.add_argument(
-        "--fine", action="store_true", help="go on with the true covariances: several times more accurate"
-    )
-    group.add_argument(
-        "--steady",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="steps that never swing to and fro, unlike the originals' (default: with --fine)",
-    )
-    add_backend_options(group)
-    caps = parser.add_argument_group("caps (what exceeds one is left out and reported)")
-    caps.add_argument("--max-points", type=int, metavar="N", help="points of a scan")
-    caps.add_argument("--max-neighbors", type=int, metavar="N", help="voxels per point, the nearest")
-    caps.add_argument("--max-voxels", type=int, metavar="N", help="voxels of the map, whole cells")
-
-
-def add_backend_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add the options that say what computes."""
-    parser.add_argument("--backend", default="numba", metavar="NAME", help="numba (default) or numpy")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="results do not depend on it")
-
-
-def matcher_from(args: argparse.Namespace) -> Any:
-    """Return the matcher that the options ask for."""
-    from shmmap_clients.ndt_scan_matcher.matching.limits import Caps
-    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
-
-    settings = Settings(
-        convention=args.convention,
-        neighbors=args.neighbors,
-        epsilon=args.epsilon,
-        max_iterations=args.max_iterations,
-        step_size=args.step_size,
-        line_search=args.line_search,
-        mode="coarse_fine" if args.fine else "single",
-        steady=args.steady,
-    )
-    given = {
-        "source_points": args.max_points,
-        "neighbors": args.max_neighbors,
-        "voxels": args.max_voxels,
-    }
-    caps = Caps(**{name: value for name, value in given.items() if value is not None})
-    return NdtMatcher(settings, caps=caps, backend=args.backend, threads=args.threads)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -105,23 +61,23 @@ def run(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from shmmap import BadRequest
+    from shmmap_clients.map_extent import extent_text
     from shmmap_clients.ndt_scan_matcher.map.voxel_cell import voxel_cell
     from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
-    from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose
-    from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_worst_case
+    from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_time_bound
     from shmmap_clients.scans.scan_file import read_scan
+    from shmmap_clients.scans.thinning import thinned
 
-    if not args.leaf > 0:
-        raise BadRequest(f"--leaf must be positive, it is {args.leaf}")
-    cloud, scan = read_scan(args.map), read_scan(args.scan)
+    T_guess = pose_from(args, "--guess") if args.guess is not None else np.eye(4)
+    cloud, scan = read_scan(args.map), thinned(read_scan(args.scan), args.thin or None)
     with matcher_from(args) as matcher:
-        voxel_map = VoxelMap({args.map: voxel_cell(cloud, args.leaf)}, max_voxels=matcher.caps.voxels)
+        voxel_map = VoxelMap({args.map: voxel_cell(cloud, args.leaf)}, max_voxels=matcher.limits.voxels)
         matcher.set_map(matcher.prepare(voxel_map))
         begin = time.perf_counter()
-        result = matcher.align(scan, matrix_from_pose(np.array(args.guess)))
+        result = matcher.align(scan, T_guess)
         took_ms = (time.perf_counter() - begin) * 1e3
-        worst = predict_worst_case(matcher, scan, result.T_map_base)
+        bound = predict_time_bound(matcher, scan, result.T_map_base)
+        trust = matcher.trust
         document = {
             "T_map_base": result.T_map_base.tolist(),
             "iterations": result.iterations,
@@ -130,6 +86,9 @@ def run(args: argparse.Namespace) -> int:
             "nvtl": result.nvtl,
             "oscillations": result.oscillations,
             "evaluations": result.evaluations,
+            "trustworthy": result.trustworthy,
+            "no_map": result.no_map,
+            "failed_limits": list(result.failed_limits),
             "covariance": None if result.covariance is None else result.covariance.tolist(),
             "cut": {
                 "points": result.cut.points,
@@ -137,22 +96,29 @@ def run(args: argparse.Namespace) -> int:
                 "neighbors": result.cut.neighbors,
                 "voxels": result.cut.voxels,
             },
-            "worst_case_ms": worst.total_ms,
+            "worst_case_ms": bound.total_ms,
             "align_ms": took_ms,
             "points": len(scan) - result.cut.points,
             "voxels": voxel_map.voxels,
-            "convention": args.convention,
+            "variant": args.variant,
+            "convention": args.variant,
             "neighbors": matcher.neighbors,
             "backend": matcher.backend_name,
         }
     if args.json:
         print_json(document)
     else:
-        _print(document, worst.describe())
+        _print(document, [trust.describe(name) for name in result.failed_limits], bound.describe())
+    if result.no_map:
+        x, y, z = result.T_map_base[:3, 3]
+        bounds = [*cloud[:, :2].min(axis=0), *cloud[:, :2].max(axis=0)] if len(cloud) else None
+        where = f"the pose is at ({x:.3f}, {y:.3f}, {z:.3f})"
+        found = f"no voxel of the map near any point of the scan: {extent_text(bounds)}, {where}"
+        return nothing_found(args, "shmmap-ndt", found)
     return 0 if result.converged else 1
 
 
-def _print(document: dict[str, Any], worst: str) -> None:
+def _print(document: dict[str, Any], failed: list[str], bound: str) -> None:
     rows = document.pop("T_map_base")
     print("T_map_base")
     for row in rows:
@@ -161,6 +127,7 @@ def _print(document: dict[str, Any], worst: str) -> None:
     for name in (*names, "points", "voxels"):
         value = document[name]
         print(f"{name:24}{value:.6f}" if isinstance(value, float) else f"{name:24}{value}")
+    print(f"{'trusted':24}{'no: ' + ', '.join(failed) if failed else 'yes'}")
     cut = {name: count for name, count in document["cut"].items() if count}
-    print(f"{'left out by caps':24}{', '.join(f'{n} {c}' for n, c in cut.items()) or 'nothing'}")
-    print(f"{'time':24}{document['align_ms']:.2f} ms; {worst}")
+    print(f"{'left out by limits':24}{', '.join(f'{n} {c}' for n, c in cut.items()) or 'nothing'}")
+    print(f"{'time':24}{document['align_ms']:.2f} ms; {bound}")

@@ -5,109 +5,53 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import (
-    add_daemon_options,
-    add_json_option,
-    at_least,
-    connect,
-    numbers,
-    output_file,
-    positive,
-    print_json,
-    seconds,
-    write_text,
-    writing_errors,
-)
-from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, matcher_from
+from shmmap_clients.command_line import add_verb, connect, print_json, write_text
+from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, trust_from
+from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
+from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
+from shmmap_clients.pose_option import pose_from
 
 if TYPE_CHECKING:
-    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveSummary
-    from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener
+    from shmmap_clients.pose_initializer import Relocalizer
+    from shmmap_clients.scans.scan_sequence import Scan
 
 __all__ = ["add_parser", "run"]
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "follow",
-        help="localize a stream of scans in the daemon's map",
-        description="Localize scan after scan in the map that a daemon serves.  Scans come from a directory"
-        " (PCD, NPZ, KITTI .bin; by name) or a ZeroMQ endpoint; the map around the vehicle is kept by"
-        " Autoware's rules in a thread of its own.",
-        epilog="JSON: frames, converged, trustworthy, waited, too_slow, cut_frames, errors (null, or ate_m,"
-        " ate_deg, ate_rmse_m, rte by metres), transform_probability, nvtl, iterations, latency_ms, align_ms,"
-        " thin_ms, map_ms, map_updates, cells_added, cells_removed, map_request_ms, map_build_ms,"
-        " map_private_bytes; a spread is mean, variance, p50, p99, max.  Exit code 1: a scan could not be"
-        " trusted, or the map did not keep up.",
+        run,
+        help="localize scan after scan in the daemon's map",
+        description="Localize scan after scan in the map that a daemon serves.  The map around the vehicle is"
+        " kept by Autoware's rules, in a thread of its own.",
+        epilog=EPILOG,
     )
-    parser.add_argument("--scans", required=True, metavar="DIR|ENDPOINT")
-    parser.add_argument(
-        "--truth", metavar="FILE", help="TUM poses of the scans, to start from and compare with"
-    )
-    parser.add_argument(
-        "--init", type=numbers(6), metavar="X,Y,Z,ROLL,PITCH,YAW", help="where to start (default: the truth)"
-    )
-    parser.add_argument("--odometry", metavar="FILE|ENDPOINT", help="TUM file, or poses over ZeroMQ")
-    parser.add_argument(
-        "--odometry-wait",
-        type=seconds,
-        default=0.0,
-        metavar="S",
-        help="how long a scan may wait until an endpoint's odometry has reached its time (default: not at"
-        " all; what is not there yet is predicted at constant velocity)",
-    )
-    parser.add_argument(
-        "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m; 0: all)"
-    )
-    parser.add_argument("--frames", type=at_least(1), metavar="N", help="stop after so many scans")
-    parser.add_argument(
-        "--rate", type=positive, metavar="HZ", help="hold scans of a directory back to this rate"
-    )
-    window = parser.add_argument_group("map window, as in Autoware")
-    window.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
-    window.add_argument("--update-distance", type=float, default=20.0, metavar="M", help="default 20")
-    window.add_argument("--map-radius", type=float, default=150.0, metavar="M", help="default 150")
-    window.add_argument("--lidar-radius", type=float, default=100.0, metavar="M", help="default 100")
-    add_alignment_options(parser)
-    out = parser.add_argument_group("output")
-    out.add_argument("--tum", type=output_file, metavar="FILE", help="write poses in the TUM format")
-    out.add_argument("--publish", metavar="ENDPOINT", help="bind a ZeroMQ publisher of poses")
-    out.add_argument(
-        "--listener-wait",
-        type=seconds,
-        default=0.0,
-        metavar="S",
-        help="how long to wait for the first subscriber, which then gets every pose (default: not at all)",
-    )
-    out.add_argument(
-        "--plot", type=output_file, metavar="FILE", help="write an SVG of way, errors and latency"
-    )
-    add_json_option(out)
-    add_daemon_options(parser)
-    parser.set_defaults(run=run)
+    add_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Follow, then print the summary."""
-    import numpy as np
-
-    from shmmap import BadRequest
-    from shmmap_clients.ndt_scan_matcher.drive.drive_plot import drive_svg
-    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import summarize
+    from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
+    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
     from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
-    from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, Prediction
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
+    from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
-    from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose
     from shmmap_clients.scans.scan_source import open_scans
-    from shmmap_clients.scans.trajectory import read_trajectory, tum_line
     from shmmap_clients.streams import is_endpoint
 
-    frames: list[Frame] = []
+    statistics, plot = DriveStatistics(), DrivePlot()
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: who waits for this program's subscription finds it
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
@@ -119,119 +63,99 @@ def run(args: argparse.Namespace) -> int:
         scans = iter(_paced(source, args.rate) if args.rate and not is_endpoint(args.scans) else source)
         if publisher is not None and args.listener_wait > 0:
             publisher.wait_for_listener(args.listener_wait)
+        report = stack.enter_context(FollowReport(args))
         first = next(scans, None)
         if first is None:
-            raise BadRequest("there are no scans")
-        if args.init is not None:
-            T_first = matrix_from_pose(np.array(args.init))
-        elif first.T_map_sensor is not None:
-            T_first = first.T_map_sensor
-        else:
-            raise BadRequest("where does the drive begin?", hint="give --init, or poses with --truth")
-        prediction: Prediction
-        if listener is not None:
-            heard = listener
-            prediction = Odometry(T_first, lambda: heard.trajectory)
-        elif args.odometry is None:
-            prediction = ConstantVelocity(T_first)
-        else:
-            read = read_trajectory(args.odometry)
-            prediction = Odometry(T_first, lambda: read)
+            return report.no_scans()
+        T_first, known = _start(args, first)
+        prediction = _prediction(args, T_first, listener)
         matcher = stack.enter_context(matcher_from(args))
         rules = MapRules(
-            args.update_distance, args.map_radius, args.lidar_radius, args.leaf, matcher.caps.voxels
+            args.update_distance, args.map_radius, args.lidar_radius, args.leaf, matcher.limits.voxels
         )
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(MapUpdater(client, rules, prepare=matcher.prepare))
-        follower = Follower(matcher, maps, prediction, thin=args.thin or None)
-        tum = None
-        if args.tum:
-            stack.enter_context(writing_errors(str(args.tum)))
-            tum = stack.enter_context(open(args.tum, "w", encoding="utf-8"))
-        told = 0
-        scan = first
-        while scan is not None and (args.frames is None or len(frames) < args.frames):
+        relocalizer = None
+        if args.relocalize or args.rough is not None:
+            relocalizer = _relocalizer(args, stack)
+        follower = Follower(
+            matcher,
+            maps,
+            prediction,
+            thin=args.thin or None,
+            tracking=Tracking(args.lost_after, lost=not known),
+            relocalize=relocalizer,
+        )
+        scan: Scan | None = first
+        while scan is not None and (args.frames is None or statistics.frames < args.frames):
             if listener is not None and args.odometry_wait > 0:
                 listener.wait_until(scan.stamp_s, args.odometry_wait)
             frame = follower.follow(scan)
-            frames.append(frame)
+            statistics.add(frame)
+            if args.plot:
+                plot.add(frame)
             if publisher is not None:
                 publisher.send(frame)
-            if tum is not None:
-                tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
-            if maps.too_slow > told:
-                told = maps.too_slow
-                _say(f"shmmap-ndt: error: the map is not keeping up at {frame.name}; the scan waited for it")
-            _progress(len(frames), frame)
+            report.frame(frame, client, matcher.trust, maps.too_slow, relocalizer)
             scan = next(scans, None)
-        summary = summarize(frames, list(maps.updates), maps.too_slow)
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
+    summary = statistics.summary(maps.statistics, maps.too_slow, matcher.trust)
     if args.plot:
-        write_text(args.plot, drive_svg(frames))
+        write_text(args.plot, plot.svg())
     if args.json:
         print_json(summary.as_document())
     else:
-        _print(summary)
-    return 0 if summary.trustworthy == summary.frames and not summary.too_slow else 1
+        print_summary(summary)
+    allowed = summary.no_map if args.allow_empty else 0
+    return 0 if summary.trustworthy + allowed == summary.frames and not summary.too_slow else 1
 
 
-def _paced(scans: Any, rate: float) -> Any:
+def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], bool]:
+    """Return the pose where the drive begins, and whether it is known well."""
+    from shmmap import BadRequest
+
+    if args.init is not None:
+        return pose_from(args, "--init"), True
+    if args.rough is not None:
+        return pose_from(args, "--rough"), False
+    if first.T_map_sensor is not None:
+        return first.T_map_sensor, True
+    raise BadRequest("no start pose: give --init, --rough or --truth")
+
+
+def _prediction(
+    args: argparse.Namespace, T_first: NDArray[np.float64], listener: OdometryListener | None
+) -> MotionPrediction:
+    from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry
+    from shmmap_clients.scans.trajectory import read_trajectory
+
+    if listener is not None:
+        return Odometry(T_first, lambda: listener.trajectory)
+    if args.odometry is None:
+        return ConstantVelocity(T_first)
+    read = read_trajectory(args.odometry)
+    return Odometry(T_first, lambda: read)
+
+
+def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer:
+    """Return what searches for a lost vehicle; it has a session of its own from the first search on."""
+    from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
+
+    rules = InitializerRules(map_radius=args.map_radius, leaf=args.leaf, height=args.height)
+
+    def initializer() -> PoseInitializer:
+        client = stack.enter_context(connect(args, "shmmap-ndt (relocalization)"))
+        made = PoseInitializer(
+            client, rules, trust=trust_from(args), backend=args.backend, threads=args.threads
+        )
+        return stack.enter_context(made)
+
+    return Relocalizer(initializer, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
+
+
+def _paced(scans: Iterable[Scan], rate: float) -> Iterator[Scan]:
     import time
 
     begin = time.monotonic()
     for number, scan in enumerate(scans):
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))
         yield scan
-
-
-def _say(text: str) -> None:
-    print(("\n" if sys.stderr.isatty() else "") + text, file=sys.stderr)
-
-
-def _progress(number: int, frame: Frame) -> None:
-    if sys.stderr.isatty():
-        x, y = frame.result.T_map_base[:2, 3]
-        state = "ok" if frame.result.trustworthy else "NOT TO BE TRUSTED"
-        line = (
-            f"\r{number:6} {frame.name:20.20} ({x:9.2f}, {y:9.2f}) NVTL {frame.result.nvtl:5.2f}"
-            f" {frame.result.iterations:3} it {frame.latency_s * 1e3:7.1f} ms {state:18}"
-        )
-        print(line, end="", file=sys.stderr, flush=True)
-
-
-def _print(summary: DriveSummary) -> None:
-    s = summary
-    print(
-        f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} to be trusted,"
-        f" {s.cut_frames} cut by caps"
-    )
-    print(
-        f"map             {s.map_updates} updates, +{s.cells_added} -{s.cells_removed} cells;"
-        f" {s.waited} scans waited"
-    )
-    print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most")
-    if s.errors is not None:
-        e = s.errors
-        print(
-            f"error           ATE {e.ate_rmse_m:.3f} m RMSE, p50 {e.ate_m.p50:.3f} p99 {e.ate_m.p99:.3f}"
-            f" max {e.ate_m.max:.3f} m; p50 {e.ate_deg.p50:.3f} max {e.ate_deg.max:.3f} deg"
-        )
-        words = [f"{value:.2f} per 100 m over {metres:.0f} m" for metres, value in e.rte.items()]
-        if words:
-            print(f"  relative      {'; '.join(words)}")
-    for name, spread in (
-        ("TP", s.transform_probability),
-        ("NVTL", s.nvtl),
-        ("iterations", s.iterations),
-        ("latency ms", s.latency_ms),
-        ("  thin ms", s.thin_ms),
-        ("  map ms", s.map_ms),
-        ("  align ms", s.align_ms),
-        ("update ask ms", s.map_request_ms),
-        ("update make ms", s.map_build_ms),
-    ):
-        print(
-            f"{name:15} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
-            f"  p99 {spread.p99:8.3f}  max {spread.max:8.3f}"
-        )

@@ -26,10 +26,10 @@ def run(args: argparse.Namespace) -> int:
     del args
     begin = time.monotonic()
     from shmmap_clients.ndt_scan_matcher.backends import kernels
-    from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import align_smallest
+    from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import warmup_alignment
 
     loaded = kernels.loaded_from_cache()
-    align_smallest()
+    warmup_alignment()
     what = "loaded from the cache" if loaded else "compiled"
     print(f"kernels {what} in {time.monotonic() - begin:.1f} s")
     return 0

@@ -10,10 +10,10 @@ from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 from shmmap_clients.ndt_scan_matcher.matching.result import Result
 
-__all__ = ["align_smallest"]
+__all__ = ["warmup_alignment"]
 
 
-def align_smallest(backend: str = "numba", threads: int = 1) -> Result:
+def warmup_alignment(backend: str = "numba", threads: int = 1) -> Result:
     """Align the walls of a room of 8 m with themselves from a guess 0.2 m away."""
     line = np.arange(0.1, 8.0, 0.25)
     u, v = (grid.ravel() for grid in np.meshgrid(line, line))

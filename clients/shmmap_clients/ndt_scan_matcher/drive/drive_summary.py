@@ -5,17 +5,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import DriveErrors, Spread, drive_errors
-from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdate
+from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import RunningErrors, TrajectoryErrors
+from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+from shmmap_clients.spread import RunningSpread, Spread
 
-__all__ = ["DriveSummary", "summarize"]
+__all__ = ["DriveStatistics", "DriveSummary"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +26,20 @@ class DriveSummary:
     ----------
     frames, converged, trustworthy
         Scans, and how many of their alignments were that.
+    no_map
+        Scans that had no map around them.
+    lost, relocalized
+        Scans after which the vehicle was lost, and searches that found it again.
+    failed_limits
+        How many results failed each limit of trust, by its name.
+    trust
+        Those limits.
     waited
         Scans that had to wait for the map; the first always does.
     too_slow
         How often the map did not reach far enough any more.
     cut_frames
-        Scans of which a cap left something out.
+        Scans of which a limit left something out.
     errors
         None where no truth was given.
     transform_probability, nvtl, iterations
@@ -50,10 +58,15 @@ class DriveSummary:
     frames: int
     converged: int
     trustworthy: int
+    no_map: int
+    lost: int
+    relocalized: int
+    failed_limits: dict[str, int]
+    trust: TrustLimits
     waited: int
     too_slow: int
     cut_frames: int
-    errors: DriveErrors | None
+    errors: TrajectoryErrors | None
     transform_probability: Spread
     nvtl: Spread
     iterations: Spread
@@ -75,40 +88,66 @@ class DriveSummary:
         return document
 
 
-def summarize(frames: Sequence[Frame], updates: Sequence[MapUpdate], too_slow: int) -> DriveSummary:
-    """Summarize a drive."""
-    true = [frame for frame in frames if frame.T_truth is not None]
-    errors = None
-    if true:
-        poses = np.array([frame.result.T_map_base for frame in true])
-        errors = drive_errors(poses, np.array([frame.T_truth for frame in true]))
-    timed = frames[1:]
+class DriveStatistics:
+    """Sums up frame after frame; its size does not depend on how many."""
 
-    def spread(values: Sequence[float], scale: float = 1.0) -> Spread:
-        return Spread.of(np.array(values, np.float64) * scale)
+    def __init__(self) -> None:
+        self.frames = self.trustworthy = self.no_map = 0
+        self._converged = self._waited = self._cut = self._lost = self._relocalized = 0
+        self._failed_limits: Counter[str] = Counter()
+        self._errors = RunningErrors()
+        self._results = {name: RunningSpread() for name in ("transform_probability", "nvtl", "iterations")}
+        self._times = {name: RunningSpread() for name in ("latency_s", "align_s", "thin_s", "map_s")}
 
-    return DriveSummary(
-        frames=len(frames),
-        converged=sum(frame.result.converged for frame in frames),
-        trustworthy=sum(frame.result.trustworthy for frame in frames),
-        waited=sum(frame.waited for frame in frames),
-        too_slow=too_slow,
-        cut_frames=sum(bool(frame.result.cut) for frame in frames),
-        errors=errors,
-        transform_probability=spread([frame.result.transform_probability for frame in frames]),
-        nvtl=spread([frame.result.nvtl for frame in frames]),
-        iterations=spread([frame.result.iterations for frame in frames]),
-        latency_ms=spread([frame.latency_s for frame in timed], 1e3),
-        align_ms=spread([frame.align_s for frame in timed], 1e3),
-        thin_ms=spread([frame.thin_s for frame in timed], 1e3),
-        map_ms=spread([frame.map_s for frame in timed], 1e3),
-        map_updates=len(updates),
-        cells_added=sum(update.added for update in updates),
-        cells_removed=sum(update.removed for update in updates),
-        map_request_ms=spread([update.request_s for update in updates], 1e3),
-        map_build_ms=spread([update.build_s for update in updates], 1e3),
-        map_private_bytes=max((update.private_bytes for update in updates), default=0),
-    )
+    def add(self, frame: Frame) -> None:
+        """Take the next frame."""
+        result = frame.result
+        self.frames += 1
+        self._converged += result.converged
+        self.trustworthy += result.trustworthy
+        self.no_map += result.no_map
+        self._failed_limits.update(result.failed_limits)
+        self._waited += frame.waited
+        self._cut += bool(result.cut)
+        self._lost += frame.state == "lost"
+        self._relocalized += frame.relocalized
+        if frame.T_truth is not None:
+            self._errors.add(result.T_map_base, frame.T_truth)
+        for name, running in self._results.items():
+            running.add(float(getattr(result, name)))
+        if self.frames > 1:
+            for name, running in self._times.items():
+                running.add(getattr(frame, name) * 1e3)
+
+    def summary(self, updates: UpdateStatistics, too_slow: int, trust: TrustLimits) -> DriveSummary:
+        """Return the drive so far, with what its map's updates were like and the limits of trust."""
+        return DriveSummary(
+            frames=self.frames,
+            converged=self._converged,
+            trustworthy=self.trustworthy,
+            no_map=self.no_map,
+            lost=self._lost,
+            relocalized=self._relocalized,
+            failed_limits=dict(self._failed_limits),
+            trust=trust,
+            waited=self._waited,
+            too_slow=too_slow,
+            cut_frames=self._cut,
+            errors=self._errors.errors,
+            transform_probability=self._results["transform_probability"].spread,
+            nvtl=self._results["nvtl"].spread,
+            iterations=self._results["iterations"].spread,
+            latency_ms=self._times["latency_s"].spread,
+            align_ms=self._times["align_s"].spread,
+            thin_ms=self._times["thin_s"].spread,
+            map_ms=self._times["map_s"].spread,
+            map_updates=updates.updates,
+            cells_added=updates.added,
+            cells_removed=updates.removed,
+            map_request_ms=updates.request_ms.spread,
+            map_build_ms=updates.build_ms.spread,
+            map_private_bytes=updates.private_bytes,
+        )
 
 
 def _without_nan(value: Any) -> Any:

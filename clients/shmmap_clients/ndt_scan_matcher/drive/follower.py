@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Localization of a drive, scan by scan: predict, take the newest map, align, judge."""
+"""Localization of a drive, scan by scan: predict, take the newest map, align, judge; search when lost."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import build_layer
-from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import Prediction
+from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
+from shmmap_clients.ndt_scan_matcher.drive.tracking import State, Tracking
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 from shmmap_clients.ndt_scan_matcher.matching.result import Result
 from shmmap_clients.scans.scan_sequence import Scan
+from shmmap_clients.scans.thinning import thinned
 
-__all__ = ["Follower", "Frame", "thinned"]
+__all__ = ["Follower", "Frame", "Relocalize"]
+
+Relocalize = Callable[[NDArray[np.floating], NDArray[np.float64]], Result | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,8 +38,12 @@ class Frame:
         Where it began.
     T_truth : (4, 4) or None
         Where the scan was really taken, if it says so.
-    thin_s, map_s, align_s
-        Seconds for thinning the scan, for taking the map, for the alignment.
+    state
+        Whether the vehicle is followed or lost, see `Tracking`.
+    relocalized
+        Whether the result is one of a search for the lost vehicle.
+    thin_s, map_s, align_s, relocalize_s
+        Seconds for thinning the scan, for taking the map, for the alignment, for the search.
     waited
         Whether the scan had to wait for the map.
     """
@@ -45,23 +53,18 @@ class Frame:
     result: Result
     T_guess: NDArray[np.float64] = field(repr=False)
     T_truth: NDArray[np.float64] | None = field(repr=False)
+    state: State
+    relocalized: bool
     thin_s: float
     map_s: float
     align_s: float
+    relocalize_s: float
     waited: bool
 
     @property
     def latency_s(self) -> float:
         """From having the scan to having the pose."""
-        return self.thin_s + self.map_s + self.align_s
-
-
-def thinned(points: NDArray[np.floating], edge: float | None) -> NDArray[np.floating]:
-    """Return one point per cube of ``edge`` metres, their mean; the points themselves without an edge."""
-    if edge is None or not len(points):
-        return points
-    columns = build_layer(f"voxel(leaf={edge!r})", points).columns
-    return np.asarray(columns["xyz"], points.dtype)
+        return self.thin_s + self.map_s + self.align_s + self.relocalize_s
 
 
 class Follower:
@@ -73,15 +76,30 @@ class Follower:
         What aligns, what keeps the map, what guesses.
     thin
         Scans are thinned to one point per cube of this many metres; None: not at all.
+    tracking
+        Says when the vehicle is lost.
+    relocalize
+        Called with each scan of a lost vehicle, (N, 3), metres, and the pose where it probably is, (4, 4):
+        returns a result that is trusted, or None.
     """
 
     def __init__(
-        self, matcher: NdtMatcher, maps: MapUpdater, prediction: Prediction, *, thin: float | None = 1.0
+        self,
+        matcher: NdtMatcher,
+        maps: MapUpdater,
+        prediction: MotionPrediction,
+        *,
+        thin: float | None = 1.0,
+        tracking: Tracking | None = None,
+        relocalize: Relocalize | None = None,
     ) -> None:
         self._matcher = matcher
         self._maps = maps
         self._prediction = prediction
         self._thin = thin
+        self._tracking = tracking if tracking is not None else Tracking()
+        self._relocalize = relocalize
+        self._jumped = False
         self._map: VoxelMap | None = None
 
     def follow(self, scan: Scan) -> Frame:
@@ -90,31 +108,45 @@ class Follower:
         Raises
         ------
         ShmmapError
-            There is no map.
+            The daemon cannot give the map.
         """
         begin = time.perf_counter()
         points = thinned(scan.xyz, self._thin)
         T_guess = self._prediction.predict(scan.stamp_s)
         thinned_at = time.perf_counter()
         vx, vy = self._prediction.velocity
-        voxel_map, waited = self._maps.map_at(float(T_guess[0, 3]), float(T_guess[1, 3]), vx=vx, vy=vy)
+        voxel_map, waited = self._maps.map_at(
+            float(T_guess[0, 3]), float(T_guess[1, 3]), vx=vx, vy=vy, jumped=self._jumped
+        )
+        self._jumped = False
         if voxel_map is not self._map:
             self._matcher.set_map(voxel_map)
             self._map = voxel_map
         had_map_at = time.perf_counter()
         result = self._matcher.align(points, T_guess)
-        done_at = time.perf_counter()
-        # a pose that is not to be trusted teaches the prediction nothing but to go on
-        believed = result.T_map_base if result.trustworthy else T_guess
-        self._prediction.correct(scan.stamp_s, believed)
+        aligned_at = time.perf_counter()
+        state = self._tracking.update(result)
+        relocalized = False
+        if state == "lost" and self._relocalize is not None:
+            found = self._relocalize(points, T_guess)
+            if found is not None:
+                result, relocalized, self._jumped = found, True, True
+                state = self._tracking.update(result)
+        # a pose that is not trusted teaches the prediction nothing but to go on
+        self._prediction.correct(scan.stamp_s, result.T_map_base if result.trustworthy else T_guess)
+        if relocalized or state == "lost":
+            self._prediction.hold()
         return Frame(
-            scan.name,
-            scan.stamp_s,
-            result,
-            T_guess,
-            scan.T_map_sensor,
-            thinned_at - begin,
-            had_map_at - thinned_at,
-            done_at - had_map_at,
-            waited,
+            name=scan.name,
+            stamp_s=scan.stamp_s,
+            result=result,
+            T_guess=T_guess,
+            T_truth=scan.T_map_sensor,
+            state=state,
+            relocalized=relocalized,
+            thin_s=thinned_at - begin,
+            map_s=had_map_at - thinned_at,
+            align_s=aligned_at - had_map_at,
+            relocalize_s=time.perf_counter() - aligned_at,
+            waited=waited,
         )

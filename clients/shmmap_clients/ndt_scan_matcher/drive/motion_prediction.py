@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shmmap_clients.scans.trajectory import Trajectory
 
-__all__ = ["ConstantVelocity", "Odometry", "Prediction", "interpolate"]
+__all__ = ["ConstantVelocity", "MotionPrediction", "Odometry", "interpolate"]
 
 Matrix = NDArray[np.float64]
 
@@ -41,6 +41,10 @@ class ConstantVelocity:
         if self._stamp_s is not None and stamp_s > self._stamp_s:
             self._twist = _motion(np.linalg.inv(self._last) @ T_map_base) / (stamp_s - self._stamp_s)
         self._last, self._stamp_s = T_map_base, stamp_s
+
+    def hold(self) -> None:
+        """Forget the velocity: the last two poses do not tell it, or it was long ago."""
+        self._twist = np.zeros(6)
 
     @property
     def velocity(self) -> tuple[float, float]:
@@ -75,7 +79,7 @@ class Odometry(ConstantVelocity):
         return np.asarray(self._last @ np.linalg.inv(before) @ now, np.float64)
 
 
-Prediction = ConstantVelocity
+MotionPrediction = ConstantVelocity
 
 
 def interpolate(trajectory: Trajectory, stamp_s: float) -> Matrix | None:

@@ -2,8 +2,8 @@
 """Poses over ZeroMQ, one msgpack message each: what localization publishes, and odometry that it hears.
 
 A message is ``{"shmmap_pose": 1, "name", "stamp_s", "T" (16 numbers, rows of T_map_base), "converged",
-"trustworthy", "iterations", "transform_probability", "nvtl"}``; of odometry only ``stamp_s`` and ``T`` are
-read.
+"trustworthy", "iterations", "transform_probability", "nvtl", "no_map", "state", "failed_limits"}``, the last
+three as in `frame_document`; of odometry only ``stamp_s`` and ``T`` are read.
 
 Whoever sends binds and knows who has subscribed: a sender that waits for its listener before the first
 message loses none to it, as long as the listener stays less than 1000 messages behind.
@@ -43,6 +43,9 @@ class PoseMessage(msgspec.Struct):
     iterations: int = 0
     transform_probability: float = 0.0
     nvtl: float = 0.0
+    no_map: bool = False
+    state: str = ""
+    failed_limits: list[str] = []
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -93,6 +96,9 @@ class PosePublisher(Publisher):
             iterations=result.iterations,
             transform_probability=result.transform_probability,
             nvtl=result.nvtl,
+            no_map=result.no_map,
+            state=frame.state,
+            failed_limits=list(result.failed_limits),
         )
         self.publish([_encoder.encode(message)])
 

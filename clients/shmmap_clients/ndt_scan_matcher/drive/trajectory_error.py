@@ -3,39 +3,26 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DriveErrors", "Spread", "drive_errors", "pose_errors"]
+from shmmap_clients.spread import RunningSpread, Spread
+
+__all__ = ["RunningErrors", "TrajectoryErrors", "pose_errors"]
 
 _STRETCHES_M: Final = (10.0, 50.0, 100.0)
+_START_EVERY_M: Final = 0.05  # a vehicle that stands begins no stretches
+
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """What a row of numbers is like; NaN where there are none."""
-
-    mean: float
-    variance: float
-    p50: float
-    p99: float
-    max: float
-
-    @classmethod
-    def of(cls, values: NDArray[np.float64]) -> Spread:
-        """Return the spread of (N,) values."""
-        if not len(values):
-            return cls(*(float("nan"),) * 5)
-        p50, p99 = np.percentile(values, (50, 99))
-        return cls(float(values.mean()), float(values.var()), float(p50), float(p99), float(values.max()))
-
-
-@dataclass(frozen=True, slots=True)
-class DriveErrors:
-    """Errors of a drive.
+class TrajectoryErrors:
+    """Errors of a trajectory.
 
     Attributes
     ----------
@@ -62,24 +49,39 @@ def pose_errors(
     return np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(np.arccos(cosine))
 
 
-def drive_errors(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> DriveErrors:
-    """Compare a drive with the truth, (N, 4, 4) each."""
-    metres, degrees = pose_errors(poses, truth)
-    steps = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    rte: dict[float, float] = {}
-    for stretch in _STRETCHES_M:
-        ends = np.searchsorted(way, way + stretch)
-        starts = np.flatnonzero(ends < len(way))
-        if len(starts):
-            ends = ends[starts]
-            ours = np.linalg.inv(poses[starts]) @ poses[ends]
-            theirs = np.linalg.inv(truth[starts]) @ truth[ends]
-            off = np.linalg.inv(theirs) @ ours
-            rte[stretch] = float(np.linalg.norm(off[:, :3, 3], axis=1).mean() * 100.0 / stretch)
-    return DriveErrors(
-        Spread.of(metres),
-        Spread.of(degrees),
-        float(np.sqrt((metres**2).mean())) if len(metres) else float("nan"),
-        rte,
-    )
+class RunningErrors:
+    """Compares pose after pose with the truth; its size does not depend on how many."""
+
+    def __init__(self) -> None:
+        self._ate_m, self._ate_deg = RunningSpread(), RunningSpread()
+        self._way = 0.0
+        self._last: Matrix | None = None
+        # by length of stretch: where stretches have begun whose end has not come, with both poses
+        self._starts: dict[float, deque[tuple[float, Matrix, Matrix]]] = {m: deque() for m in _STRETCHES_M}
+        self._rte = {metres: RunningSpread() for metres in _STRETCHES_M}
+
+    def add(self, pose: Matrix, truth: Matrix) -> None:
+        """Take the next pose, (4, 4), and the true one."""
+        metres, degrees = pose_errors(pose[None], truth[None])
+        self._ate_m.add(float(metres[0]))
+        self._ate_deg.add(float(degrees[0]))
+        if self._last is not None:
+            self._way += float(np.linalg.norm(truth[:3, 3] - self._last[:3, 3]))
+        self._last = truth
+        for stretch, starts in self._starts.items():
+            while starts and starts[0][0] + stretch <= self._way:
+                _, pose_then, truth_then = starts.popleft()
+                ours = np.linalg.inv(pose_then) @ pose
+                theirs = np.linalg.inv(truth_then) @ truth
+                off = np.linalg.inv(theirs) @ ours
+                self._rte[stretch].add(float(np.linalg.norm(off[:3, 3])) * 100.0 / stretch)
+            if not starts or self._way - starts[-1][0] >= _START_EVERY_M:
+                starts.append((self._way, pose, truth))
+
+    @property
+    def errors(self) -> TrajectoryErrors | None:
+        """Of the poses so far; None where there is none."""
+        if not self._ate_m.count:
+            return None
+        rte = {metres: running.spread.mean for metres, running in self._rte.items() if running.count}
+        return TrajectoryErrors(self._ate_m.spread, self._ate_deg.spread, self._ate_m.root_mean_square, rte)

@@ -21,8 +21,9 @@ from typing import Final
 from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.spread import RunningSpread
 
-__all__ = ["MapRules", "MapUpdate", "MapUpdater"]
+__all__ = ["MapRules", "MapUpdater", "UpdateStatistics"]
 
 _REFRESH_S: Final = 1.0  # Autoware's timer; also how soon a changed map is noticed
 _REQUEST_S: Final = 60.0
@@ -43,7 +44,7 @@ class MapRules:
     leaf
         Edge of a voxel, metres.
     max_voxels
-        Cap on the map, see `VoxelMap`.
+        Limit on the map, see `VoxelMap`.
     wait_s
         How long a map that has to be waited for may take.
     """
@@ -71,27 +72,39 @@ class MapRules:
         return canonical_layer(f"ndt(leaf={self.leaf!r})")
 
 
-@dataclass(frozen=True, slots=True)
-class MapUpdate:
-    """One change of the map in use.
+class UpdateStatistics:
+    """What the changes of the map in use were like.
 
     Attributes
     ----------
+    updates
+        How many there were.
     added, removed
-        Cells.
-    request_s
-        From asking until the daemon's cells were attached.
-    build_s
-        For the tables beside the map in use.
+        Cells, over all of them.
+    request_ms
+        From asking until the daemon's cells were attached, milliseconds.
+    build_ms
+        For the tables beside the map in use, milliseconds.
     private_bytes
-        This process's own memory for the new map.
+        This process's own memory for a map, at most.
     """
 
-    added: int
-    removed: int
-    request_s: float
-    build_s: float
-    private_bytes: int
+    def __init__(self) -> None:
+        self.updates = 0
+        self.added = 0
+        self.removed = 0
+        self.request_ms = RunningSpread()
+        self.build_ms = RunningSpread()
+        self.private_bytes = 0
+
+    def add(self, *, added: int, removed: int, request_s: float, build_s: float, private_bytes: int) -> None:
+        """Count one change."""
+        self.updates += 1
+        self.added += added
+        self.removed += removed
+        self.request_ms.add(request_s * 1e3)
+        self.build_ms.add(build_s * 1e3)
+        self.private_bytes = max(self.private_bytes, private_bytes)
 
 
 class MapUpdater:
@@ -122,7 +135,7 @@ class MapUpdater:
         name: str = "shmmap-ndt",
     ) -> None:
         self.rules = rules if rules is not None else MapRules()
-        self.updates: list[MapUpdate] = []
+        self.statistics = UpdateStatistics()
         self.too_slow = 0
         self._prepare = prepare
         self._window = MapWindow(
@@ -167,8 +180,12 @@ class MapUpdater:
         """Why the last update failed; None if it did not."""
         return self._error
 
-    def map_at(self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0) -> tuple[VoxelMap, bool]:
+    def map_at(
+        self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0, jumped: bool = False
+    ) -> tuple[VoxelMap, bool]:
         """Return the newest map, and whether it had to be waited for.
+
+        Where the daemon's map has nothing around the place, this is a `VoxelMap` without cells.
 
         Parameters
         ----------
@@ -176,20 +193,22 @@ class MapUpdater:
             Where the vehicle is, metres, map frame.
         vx, vy
             Its velocity, metres per second: what lies ahead is loaded first.
+        jumped
+            The pose was corrected: that the map does not reach so far does not count as ``too_slow``.
 
         Raises
         ------
         NoAnswer
             There is still no map that reaches far enough after ``wait_s``.
         ShmmapError
-            The first map could not be had.
+            The first map could not be loaded.
         """
         rules = self.rules
         with self._changed:
             reached = (
                 self._latest is not None and self._distance(x, y) + rules.lidar_radius <= rules.map_radius
             )
-            if self._latest is not None and not reached:
+            if self._latest is not None and not reached and not jumped:
                 self.too_slow += 1
             if self._distance(x, y) > rules.update_distance:
                 self._asked = (x, y, vx, vy)
@@ -215,8 +234,8 @@ class MapUpdater:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 raise NoAnswer(
-                    f"no map around ({x:.1f}, {y:.1f}) within {rules.wait_s:.0f} s",
-                    hint="`shmmap status` tells whether the daemon still loads, or has no budget left",
+                    f"the map around ({x:.1f}, {y:.1f}) was not loaded within {rules.wait_s:.0f} s",
+                    hint="`shmmap status` tells whether the daemon still loads, or has no memory left",
                 )
             self._changed.wait(left_s)
 
@@ -264,7 +283,7 @@ class MapUpdater:
         self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
         cells = self._window.cells
         if not cells and not self._window.complete:
-            raise NoAnswer("none of the cells could be had", hint="`shmmap status` tells why")
+            raise NoAnswer("none of the cells could be loaded", hint="`shmmap status` tells why")
         request_s = time.perf_counter() - begin_s
         known = {cell.id: self._voxels(cell) for cell in cells}
         before = self._latest
@@ -283,8 +302,12 @@ class MapUpdater:
                 )
             )
             build_s = time.perf_counter() - begin_s
-            self.updates.append(
-                MapUpdate(len(changed), len(gone), request_s, build_s, voxel_map.private_bytes)
+            self.statistics.add(
+                added=len(changed),
+                removed=len(gone),
+                request_s=request_s,
+                build_s=build_s,
+                private_bytes=voxel_map.private_bytes,
             )
         with self._changed:
             self._known = known

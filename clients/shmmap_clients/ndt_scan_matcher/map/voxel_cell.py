@@ -37,7 +37,7 @@ class VoxelCell:
     scatter : (V, 6) float64
         xx xy xz yy yz zz of the sum of (x - mean)(x - mean)^T, square metres.
     inverse : (V, 6) float64
-        Inverse covariance in Autoware's convention, xx xy xz yy yz zz, 1/m^2; zero where refused.
+        Inverse covariance in Autoware's variant, xx xy xz yy yz zz, 1/m^2; zero where refused.
     memory
         What the arrays belong to.
     """

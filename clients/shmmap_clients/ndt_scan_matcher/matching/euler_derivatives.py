@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["derivative_matrices", "matrix_from_pose", "pose_from_matrix"]
+__all__ = ["euler_derivatives", "matrix_from_pose", "pose_from_matrix"]
 
 _SMALL_ANGLE: Final = 10e-5  # below it the originals take the angle for zero in derivatives
 
@@ -48,7 +48,7 @@ def pose_from_matrix(T: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.array([*matrix[:3, 3], roll, pitch, yaw])
 
 
-def derivative_matrices(pose: NDArray[np.float64], pitch_sign: float = -1.0) -> NDArray[np.float64]:
+def euler_derivatives(pose: NDArray[np.float64], pitch_sign: float = -1.0) -> NDArray[np.float64]:
     """Return nine matrices M with d(Rx)/dp = M x and d2(Rx)/dpdq = M x.
 
     Parameters

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import derivative_matrices
+from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives
 
 __all__ = [
     "AX",
@@ -98,7 +98,7 @@ class Evaluation:
     neighbours
         Neighbours over all points.
     cut_points, cut_neighbours
-        Points that had more neighbours than the cap, and how many were left out.
+        Points that had more neighbours than the limit, and how many were left out.
     """
 
     score: float
@@ -124,10 +124,10 @@ def total(rows: NDArray[np.float64], pose: NDArray[np.float64], pitch_sign: floa
     rows : (chunks, `SUMS`) float64
     pose : (6,) float64
     pitch_sign
-        As in `derivative_matrices`.
+        As in `euler_derivatives`.
     """
     sums = np.add.accumulate(rows, axis=0)[-1] if len(rows) else np.zeros(SUMS)
-    contracted = (derivative_matrices(pose, pitch_sign).reshape(9, 9) @ sums[AX]).tolist()
+    contracted = (euler_derivatives(pose, pitch_sign).reshape(9, 9) @ sums[AX]).tolist()
     a, b, bj, jbj = sums[A].tolist(), sums[B].tolist(), sums[BJ].tolist(), sums[JBJ].tolist()
     gradient = np.array([*a, *contracted[:3]])
     rotation = [value + second for value, second in zip(jbj, contracted[3:], strict=True)]

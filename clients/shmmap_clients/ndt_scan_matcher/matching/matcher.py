@@ -12,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors, backend_named
+from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
-from shmmap_clients.ndt_scan_matcher.matching.limits import Caps, Cut
+from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS
 from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, ascend
 from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
 from shmmap_clients.ndt_scan_matcher.matching.result import Result, covariance_of, oscillations
-from shmmap_clients.ndt_scan_matcher.matching.variants import CONVENTIONS, Convention, convention_named
+from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+from shmmap_clients.ndt_scan_matcher.matching.variants import VARIANTS, Variant, variant_named
 
 __all__ = ["Mode", "NdtMatcher", "Settings"]
 
@@ -32,11 +34,11 @@ _SHARED_PLACES: Final = 4  # at a corner of four cells each has its own voxel in
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How to align; what is None is the convention's own default.
+    """How to align; what is None is the variant's own default.
 
     Attributes
     ----------
-    convention
+    variant
         ``"autoware"``, ``"pclomp"`` or ``"pcl"``: covariances, stop rule and neighbours of that program.
     neighbors
         ``"direct1"``, ``"direct7"`` or ``"radius"`` (all voxels whose mean is within one leaf).
@@ -48,7 +50,7 @@ class Settings:
     line_search
         More-Thuente's line search.
     mode
-        ``"coarse_fine"``: when the convention's alignment has ended, go on from there with the voxels' true
+        ``"coarse_fine"``: when the variant's alignment has ended, go on from there with the voxels' true
         covariances: the wide basin of the one and the accuracy of the other.
     fine_epsilon
         Where the fine part stops.
@@ -56,7 +58,7 @@ class Settings:
         Steps that never swing, see `StepRule`; default: not in ``"single"``, which equals the originals.
     """
 
-    convention: str = "autoware"
+    variant: str = "autoware"
     neighbors: Neighbors | None = None
     epsilon: float | None = None
     max_iterations: int | None = None
@@ -73,7 +75,9 @@ class NdtMatcher:
     Parameters
     ----------
     settings
-    caps
+    limits
+    trust
+        What a result has to reach to be trusted.
     backend
         ``"numba"`` or ``"numpy"``.
     threads
@@ -89,20 +93,22 @@ class NdtMatcher:
         self,
         settings: Settings | None = None,
         *,
-        caps: Caps | None = None,
+        limits: Limits | None = None,
+        trust: TrustLimits | None = None,
         backend: str = "numba",
         threads: int = 1,
     ) -> None:
         self.settings = settings if settings is not None else Settings()
-        self.caps = caps if caps is not None else Caps()
-        self._convention = convention_named(self.settings.convention)
-        self._rule = _rule(self.settings, self._convention, self.caps)
-        self._neighbors: Neighbors = self.settings.neighbors or self._convention.neighbors
+        self.limits = limits if limits is not None else Limits()
+        self._trust = trust if trust is not None else TrustLimits()
+        self._variant = variant_named(self.settings.variant)
+        self._rule = _rule(self.settings, self._variant, self.limits)
+        self._neighbors: Neighbors = self.settings.neighbors or self._variant.neighbors
         if self._neighbors not in ("direct1", "direct7", "radius"):
             raise BadRequest(
                 f"unknown neighbour search {self._neighbors!r}", hint="it is direct1, direct7 or radius"
             )
-        self._backend = backend_named(backend, self.caps, threads)
+        self._backend = backend_named(backend, self.limits, threads)
         self._map = VoxelMap({})
 
     def __enter__(self) -> NdtMatcher:
@@ -130,16 +136,21 @@ class NdtMatcher:
     @property
     def most_neighbors(self) -> int:
         """Voxels that one point can be scored against, at most."""
-        return min(self.caps.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
+        return min(self.limits.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
 
     @property
     def most_evaluations(self) -> int:
         """Passes over the scan that one alignment can take, at most."""
-        steps = self._rule.max_iterations + (2 if self._convention.stop == "step_late" else 0)
+        steps = self._rule.max_iterations + (2 if self._variant.stop == "step_late" else 0)
         # a line search ends with the Hessian of where it ended
         coarse = 1 + steps * (MAX_TRIALS + 2 if self._rule.line_search else 1)
         fine = 1 + self._rule.max_iterations if self.settings.mode == "coarse_fine" else 0
         return coarse + fine
+
+    @property
+    def trust(self) -> TrustLimits:
+        """What a result has to reach to be trusted, with the map's leaf."""
+        return self._trust.for_leaf(self._map.leaf, fine=self.settings.mode == "coarse_fine")
 
     @property
     def map(self) -> VoxelMap:
@@ -153,7 +164,7 @@ class NdtMatcher:
 
     def prepare(self, voxel_map: VoxelMap) -> VoxelMap:
         """Compute what alignments will need of a map, so that none of them waits for it."""
-        voxel_map.table(self._convention.covariance)
+        voxel_map.table(self._variant.covariance)
         if self.settings.mode == "coarse_fine":
             voxel_map.table("pcl")
         return voxel_map
@@ -186,48 +197,48 @@ class NdtMatcher:
             raise BadRequest("a guess is a (4, 4) matrix of finite numbers")
         dropped = self._backend.set_source(points)
         used = len(points) - dropped
-        way = self._ascend(guess, self._convention, self._rule, regularization)
+        way = self._ascend(guess, self._variant, self._rule, regularization)
         ways = [way]
         if self.settings.mode == "coarse_fine" and way.last.found:
             fine = replace(
                 self._rule,
-                convention=CONVENTIONS["pcl"],
+                variant=VARIANTS["pcl"],
                 epsilon=self.settings.fine_epsilon,
                 line_search=False,
             )
-            fine = replace(fine, convention=replace(fine.convention, stop="step"))
-            ways.append(self._ascend(way.transforms[-1], fine.convention, fine, regularization))
+            fine = replace(fine, variant=replace(fine.variant, stop="step"))
+            ways.append(self._ascend(way.transforms[-1], fine.variant, fine, regularization))
         return self._result(ways, used, dropped)
 
     def evaluate(self, points: NDArray[np.floating], poses: NDArray[np.float64]) -> list[Evaluation]:
         """Score a scan at several pose vectors, (k, 6), without moving them."""
         self._backend.set_source(points)
-        return [self._evaluate(pose, self._convention, None, None) for pose in poses]
+        return [self._evaluate(pose, self._variant, None, None) for pose in poses]
 
     def _ascend(
         self,
         T_guess: NDArray[np.float64],
-        convention: Convention,
+        variant: Variant,
         rule: StepRule,
         regularization: Regularization | None,
     ) -> Ascent:
         def evaluate(pose: NDArray[np.float64], pitch_sign: float) -> Evaluation:
-            return self._evaluate(pose, convention, pitch_sign, regularization)
+            return self._evaluate(pose, variant, pitch_sign, regularization)
 
         return ascend(T_guess, evaluate, rule)
 
     def _evaluate(
         self,
         pose: NDArray[np.float64],
-        convention: Convention,
+        variant: Variant,
         pitch_sign: float | None,
         regularization: Regularization | None,
     ) -> Evaluation:
         found = self._backend.evaluate(
             pose,
             neighbors=self._neighbors,
-            covariance=convention.covariance,
-            pitch_sign=convention.pitch_sign if pitch_sign is None else pitch_sign,
+            covariance=variant.covariance,
+            pitch_sign=variant.pitch_sign if pitch_sign is None else pitch_sign,
         )
         return found if regularization is None else regularization.applied(found, pose)
 
@@ -238,26 +249,36 @@ class NdtMatcher:
         )
         evaluations = [at for way in ways for at in way.evaluations]
         points = max(used, 1)
+        converged, probability, swings = ways[-1].converged, last.score / points, oscillations(transforms)
+        no_map = used > 0 and not last.found
         return Result(
             T_map_base=transforms[-1],
             iterations=sum(way.iterations for way in ways),
-            converged=ways[-1].converged,
-            transform_probability=last.score / points,
+            converged=converged,
+            transform_probability=probability,
             nvtl=last.nvtl,
             transforms=transforms,
             transform_probabilities=np.array([at.score / points for at in evaluations]),
             nvtls=np.array([at.nvtl for at in evaluations]),
             hessian=last.hessian,
             covariance=covariance_of(last.hessian),
-            oscillations=oscillations(transforms),
+            oscillations=swings,
             evaluations=len(evaluations),
             cut=Cut(dropped, last.cut_points, last.cut_neighbours, self._map.voxels_left_out),
+            no_map=no_map,
+            failed_limits=self.trust.failed(
+                no_map=no_map,
+                converged=converged,
+                nvtl=last.nvtl,
+                transform_probability=probability,
+                oscillations=swings,
+            ),
         )
 
 
-def _rule(settings: Settings, convention: Convention, caps: Caps) -> StepRule:
-    epsilon = convention.epsilon if settings.epsilon is None else settings.epsilon
-    iterations = convention.max_iterations if settings.max_iterations is None else settings.max_iterations
+def _rule(settings: Settings, variant: Variant, limits: Limits) -> StepRule:
+    epsilon = variant.epsilon if settings.epsilon is None else settings.epsilon
+    iterations = variant.max_iterations if settings.max_iterations is None else settings.max_iterations
     if not epsilon > 0 or not settings.step_size > 0 or not settings.fine_epsilon > 0 or iterations < 1:
         raise BadRequest(
             "epsilon, step_size and max_iterations must be positive,"
@@ -265,8 +286,8 @@ def _rule(settings: Settings, convention: Convention, caps: Caps) -> StepRule:
         )
     if settings.mode not in ("single", "coarse_fine"):
         raise BadRequest(f"unknown mode {settings.mode!r}", hint="it is single or coarse_fine")
-    if caps.iterations is not None:
-        iterations = min(iterations, caps.iterations)
-    line_search = convention.line_search if settings.line_search is None else settings.line_search
+    if limits.iterations is not None:
+        iterations = min(iterations, limits.iterations)
+    line_search = variant.line_search if settings.line_search is None else settings.line_search
     steady = settings.mode == "coarse_fine" if settings.steady is None else settings.steady
-    return StepRule(convention, epsilon, settings.step_size, iterations, line_search, steady)
+    return StepRule(variant, epsilon, settings.step_size, iterations, line_search, steady)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import search_step
-from shmmap_clients.ndt_scan_matcher.matching.variants import Convention
+from shmmap_clients.ndt_scan_matcher.matching.variants import Variant
 
 __all__ = ["Ascent", "StepRule", "ascend"]
 
@@ -33,7 +33,7 @@ class StepRule:
 
     Attributes
     ----------
-    convention
+    variant
     epsilon
         Metres and radians (the 6-norm of a step), as ``transformation_epsilon``; a step is at least half.
     max_step
@@ -49,7 +49,7 @@ class StepRule:
         back on the one before, then no lower; instead of others the longest step is halved.
     """
 
-    convention: Convention
+    variant: Variant
     epsilon: float
     max_step: float
     max_iterations: int
@@ -80,7 +80,7 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
     rule
     """
     pose = pose_from_matrix(T_guess)
-    at = evaluate(pose, rule.convention.pitch_sign)
+    at = evaluate(pose, rule.variant.pitch_sign)
     ascent = Ascent(pose, at, [at], [T_guess])
     longest, before, settling = rule.max_step, np.zeros(6), False
     while True:
@@ -146,7 +146,7 @@ def _take_step(
     longest: float,
 ) -> tuple[float, NDArray[np.float64], Evaluation]:
     """Return the step's length and direction, and the evaluation where it ends."""
-    sign = rule.convention.pitch_sign
+    sign = rule.variant.pitch_sign
     slope = -float(at.gradient @ direction)
     if slope == 0.0:
         return 0.0, direction, at
@@ -166,7 +166,7 @@ def _take_step(
         phi(length)
         return length, direction, latest
     length, trials = search_step(
-        length, shortest, longest, -at.score, slope, phi, by_upper_end=rule.convention.name == "pcl"
+        length, shortest, longest, -at.score, slope, phi, by_upper_end=rule.variant.name == "pcl"
     )
     if trials and sign > 0:
         # ndt_omp computes the Hessian anew after a search, and there with the right sign
@@ -175,15 +175,15 @@ def _take_step(
 
 
 def _is_small(iterations_before: int, length: float, direction: NDArray[np.float64], rule: StepRule) -> bool:
-    if rule.convention.stop == "squared_translation":
+    if rule.variant.stop == "squared_translation":
         translation = direction[:3] * length
         return float(translation @ translation) <= rule.epsilon
-    if rule.convention.stop == "step_late" and not iterations_before:
+    if rule.variant.stop == "step_late" and not iterations_before:
         return False
     return abs(length) < rule.epsilon
 
 
 def _is_last(iterations: int, rule: StepRule) -> bool:
     # ndt_omp compares before it counts, and with "greater than"
-    extra = 2 if rule.convention.stop == "step_late" else 0
+    extra = 2 if rule.variant.stop == "step_late" else 0
     return iterations >= rule.max_iterations + extra

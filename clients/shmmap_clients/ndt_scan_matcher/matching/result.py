@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an alignment gives, and how Autoware judges it."""
+"""What an alignment gives."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut
 
-__all__ = ["NVTL_THRESHOLD", "TP_THRESHOLD", "Result", "covariance_of", "oscillations"]
+__all__ = ["Result", "covariance_of", "oscillations"]
 
-# ndt_scan_matcher.param.yaml of autoware_core
-TP_THRESHOLD: Final = 3.0
-NVTL_THRESHOLD: Final = 2.3
-MAX_OSCILLATIONS: Final = 10
 _INVERSION: Final = -0.9  # cosine between two steps that counts as going back
 
 
@@ -29,7 +25,7 @@ class Result:
     T_map_base : (4, 4) float64
         Metres, map frame.
     iterations
-        Newton steps, counted as the convention's program counts them.
+        Newton steps, counted as the variant's program counts them.
     converged
         The last step was below epsilon, not merely the last one allowed; of the fine part where there is
         one.
@@ -51,7 +47,12 @@ class Result:
     evaluations
         Passes over the scan.
     cut
-        What the caps left out.
+        What the limits left out.
+    no_map
+        No point of the scan had a Gaussian of the map near: there was nothing to match, and the pose is the
+        guess.
+    failed_limits
+        Why the result is not trusted, as `TrustLimits.failed` names it; empty if it is.
     """
 
     T_map_base: NDArray[np.float64]
@@ -67,14 +68,13 @@ class Result:
     oscillations: int
     evaluations: int
     cut: Cut
+    no_map: bool
+    failed_limits: tuple[str, ...]
 
     @property
     def trustworthy(self) -> bool:
-        """Whether Autoware would publish this pose: converged, NVTL of at least 2.3, not swinging.
-
-        No score detects every divergence: a pose metres away may have an NVTL above the threshold.
-        """
-        return self.converged and self.nvtl >= NVTL_THRESHOLD and self.oscillations <= MAX_OSCILLATIONS
+        """Whether the result is within all limits of trust."""
+        return not self.failed_limits
 
 
 def covariance_of(hessian: NDArray[np.float64]) -> NDArray[np.float64] | None:

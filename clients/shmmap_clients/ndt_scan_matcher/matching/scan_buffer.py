@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest
 
-__all__ = ["SourcePoints"]
+__all__ = ["ScanBuffer"]
 
 
-class SourcePoints:
+class ScanBuffer:
     """Room for a scan of at most ``most`` points."""
 
     def __init__(self, most: int) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long an alignment can take at most: evaluations times points times the cost of one, measured here.
 
-The three caps bound the work: no scan, map or guess makes it more.
+The three limits bound the work: no scan, map or guess makes it more.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import pose_from_matrix
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 
-__all__ = ["WorstCase", "predict_worst_case"]
+__all__ = ["TimeBound", "predict_time_bound"]
 
 _REPEATS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class WorstCase:
+class TimeBound:
     """A bound of the time of one alignment on this machine.
 
     Attributes
@@ -32,7 +32,7 @@ class WorstCase:
         Of a scan, at most.
     point_ns
         CPU time of one point in one pass, measured on the given scan, scaled up to as many neighbours
-        as the cap allows.
+        as the limit allows.
     """
 
     evaluations: int
@@ -47,15 +47,15 @@ class WorstCase:
     def describe(self) -> str:
         """Return the bound with what it is made of."""
         return (
-            f"at most {self.total_ms:.0f} ms by the caps"
+            f"at most {self.total_ms:.0f} ms by the limits"
             f" ({self.evaluations} evaluations x {self.points} points x {self.point_ns:.0f} ns)"
         )
 
 
-def predict_worst_case(
+def predict_time_bound(
     matcher: NdtMatcher, points: NDArray[np.floating], T: NDArray[np.float64]
-) -> WorstCase:
-    """Predict from the caps and from evaluations of one scan.
+) -> TimeBound:
+    """Predict from the limits and from evaluations of one scan.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def predict_worst_case(
         at = matcher.evaluate(points, pose)[0]
         costs.append(time.thread_time_ns() - begin)
         per_point = max(at.neighbours / max(len(points), 1), 1.0)
-    used = max(min(len(points), matcher.caps.source_points), 1)
+    used = max(min(len(points), matcher.limits.source_points), 1)
     # what a point costs grows no faster than its neighbours
     ceiling = max(1.0, matcher.most_neighbors / per_point)
-    return WorstCase(matcher.most_evaluations, matcher.caps.source_points, min(costs) / used * ceiling)
+    return TimeBound(matcher.most_evaluations, matcher.limits.source_points, min(costs) / used * ceiling)

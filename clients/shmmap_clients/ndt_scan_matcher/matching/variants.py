@@ -10,13 +10,13 @@ from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 
-__all__ = ["CONVENTIONS", "Convention", "Stop", "convention_named"]
+__all__ = ["VARIANTS", "Stop", "Variant", "variant_named"]
 
 Stop = Literal["step", "step_late", "squared_translation"]
 
 
 @dataclass(frozen=True, slots=True)
-class Convention:
+class Variant:
     """One program's way to align.
 
     Attributes
@@ -47,21 +47,21 @@ class Convention:
     max_iterations: int
 
 
-CONVENTIONS: Final = {
-    convention.name: convention
-    for convention in (
+VARIANTS: Final = {
+    variant.name: variant
+    for variant in (
         # autoware_core 2026-08, multigrid_ndt_omp; defaults of ndt_scan_matcher.param.yaml
-        Convention("autoware", "autoware", "step", -1.0, False, "radius", 0.01, 30),
+        Variant("autoware", "autoware", "step", -1.0, False, "radius", 0.01, 30),
         # koide3/ndt_omp
-        Convention("pclomp", "pclomp", "step_late", 1.0, True, "direct7", 0.1, 35),
+        Variant("pclomp", "pclomp", "step_late", 1.0, True, "direct7", 0.1, 35),
         # PCL 1.13, pcl::NormalDistributionsTransform
-        Convention("pcl", "pcl", "squared_translation", -1.0, True, "radius", 0.1, 35),
+        Variant("pcl", "pcl", "squared_translation", -1.0, True, "radius", 0.1, 35),
     )
 }
 
 
-def convention_named(name: str) -> Convention:
-    """Return one of `CONVENTIONS`; `BadRequest` lists them for another name."""
-    if name not in CONVENTIONS:
-        raise BadRequest(f"unknown convention {name!r}", hint=f"conventions are: {', '.join(CONVENTIONS)}")
-    return CONVENTIONS[name]
+def variant_named(name: str) -> Variant:
+    """Return one of `VARIANTS`; `BadRequest` lists them for another name."""
+    if name not in VARIANTS:
+        raise BadRequest(f"unknown variant {name!r}", hint=f"variants are: {', '.join(VARIANTS)}")
+    return VARIANTS[name]

@@ -5,69 +5,95 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
+    add_allow_empty_option,
     add_daemon_options,
     add_json_option,
-    add_scan_option,
     at_least,
     connect,
-    numbers,
+    nothing_found,
     print_json,
     run_command,
 )
-from shmmap_clients.ndt_scan_matcher.cli.align import add_backend_options
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
+from shmmap_clients.shared_options import (
+    add_backend_option,
+    add_height_option,
+    add_leaf_option,
+    add_radius_option,
+    add_scan_option,
+    add_sigma_options,
+    add_thin_option,
+    add_threads_option,
+)
+
+if TYPE_CHECKING:
+    from shmmap_clients.pose_initializer import InitialPose
 
 __all__ = ["main"]
+
+_NAME: Final = "shmmap-pose-init"
+_JSON: Final = """\
+JSON (fields may be added, none is removed):
+  {"T_map_base": 4x4 in metres, "score": transform probability, "nvtl",
+   "reliable", "converged", "no_map": bool, "failed_limits": [name],
+   "ground_z": height of the map's ground there, or null,
+   "covariance": 6x6 of x y z roll pitch yaw, or null,
+   "alternatives": [{"T_map_base", "score", "nvtl"}] other poses, best first,
+   "candidates", "map_ms", "search_ms"}
+  Where there is no map, "no_map" is true and the others are null, false, 0 or
+  empty.  failed_limits says why a pose is not reliable.
+Exit code: 0; 1 when the pose is not reliable, or there is no map around it."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Find an initial pose and return the exit code."""
     return run_command(
-        "shmmap-pose-init",
-        "Find where a scan was taken, from a rough pose: the height from the map's ground, candidates scored"
-        " and aligned by NDT.",
+        _NAME,
+        "Find where a scan was taken, from a pose that is metres and degrees off: the map's ground gives the"
+        " height, many candidate poses are scored, and the best are aligned by NDT.",
         _add_options,
         _run,
         argv,
-        epilog="JSON: T_map_base (4x4), score (transform probability), nvtl, reliable, converged, ground_z"
-        " (null where the map has no ground near), covariance (6x6 or null), alternatives (T_map_base, score,"
-        " nvtl), candidates, map_ms, search_ms.  Exit code 1: the pose is not reliable.",
+        epilog=_JSON,
     )
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_scan_option(parser)
-    parser.add_argument("--pose", required=True, type=numbers(3), metavar="X,Y,YAW", help="metres, radians")
-    parser.add_argument(
-        "--z", type=float, default=0.0, metavar="M", help="where the map has no ground (default 0)"
+    add_pose_option(
+        parser, "--pose", "rough pose; its z counts only where the map has no ground near", required=True
     )
-    parser.add_argument("--sigma", type=float, default=2.0, metavar="M", help="of x and y (default 2)")
+    add_pose_format_option(parser)
+    add_sigma_options(parser)
+    add_height_option(parser, default=0.0, shown="0")
     parser.add_argument(
-        "--sigma-yaw", type=float, default=0.1745, metavar="RAD", help="default 0.1745 (10 deg)"
+        "--candidates", type=at_least(1), default=200, metavar="N", help="poses to score (default: 200)"
     )
     parser.add_argument(
-        "--height", type=float, default=0.0, metavar="M", help="of the scanner above the ground (default 0)"
+        "--seed", type=at_least(0), default=0, metavar="N", help="of the random search (default: 0)"
     )
-    parser.add_argument("--map-radius", type=float, default=150.0, metavar="M", help="default 150")
-    parser.add_argument("--leaf", type=float, default=2.0, metavar="M", help="voxel edge (default 2.0)")
-    parser.add_argument("--candidates", type=int, default=200, metavar="N", help="poses scored (default 200)")
-    parser.add_argument("--seed", type=at_least(0), default=0, metavar="N", help="of the search (default 0)")
-    parser.add_argument(
-        "--thin", type=float, default=1.0, metavar="M", help="one point per cube (default 1 m)"
-    )
-    add_backend_options(parser)
+    add_thin_option(parser, default=1.0)
+    add_leaf_option(parser)
+    add_radius_option(parser)
+    add_backend_option(parser)
+    add_threads_option(parser)
+    add_allow_empty_option(parser)
     add_json_option(parser)
-    add_daemon_options(parser)
+    add_daemon_options(parser, json=False)
 
 
 def _run(args: argparse.Namespace) -> int:
-    from shmmap_clients.ndt_scan_matcher.drive.follower import thinned
+    from shmmap_clients.map_extent import NoMapHere
+    from shmmap_clients.ndt_scan_matcher import pose_from_matrix
     from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
     from shmmap_clients.scans.scan_file import read_scan
+    from shmmap_clients.scans.thinning import thinned
 
-    x, y, yaw = args.pose
-    rough = RoughPose(x, y, args.z, yaw=yaw, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
+    x, y, z, roll, pitch, yaw = pose_from_matrix(pose_from(args, "--pose")).tolist()
+    rough = RoughPose(x, y, z, roll, pitch, yaw, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
     rules = InitializerRules(
         map_radius=args.map_radius,
         leaf=args.leaf,
@@ -77,39 +103,55 @@ def _run(args: argparse.Namespace) -> int:
     )
     scan = thinned(read_scan(args.scan), args.thin or None)
     with (
-        connect(args, "shmmap-pose-init") as client,
+        connect(args, _NAME) as client,
         PoseInitializer(client, rules, backend=args.backend, threads=args.threads) as initializer,
     ):
-        found = initializer.initialize(scan, rough)
-    result = found.result
+        try:
+            found = initializer.initialize(scan, rough)
+        except NoMapHere as error:
+            if args.json:
+                print_json(_document(None))
+            return nothing_found(args, _NAME, error.message)
     if args.json:
-        print_json(
-            {
-                "T_map_base": found.T_map_base.tolist(),
-                "score": found.score,
-                "nvtl": result.nvtl,
-                "reliable": found.reliable,
-                "converged": result.converged,
-                "ground_z": found.ground_z,
-                "covariance": None if result.covariance is None else result.covariance.tolist(),
-                "alternatives": [
-                    {"T_map_base": one.T_map_base.tolist(), "score": one.score, "nvtl": one.nvtl}
-                    for one in found.alternatives
-                ],
-                "candidates": found.candidates,
-                "map_ms": found.map_s * 1e3,
-                "search_ms": found.search_s * 1e3,
-            }
-        )
+        print_json(_document(found))
     else:
-        print("T_map_base")
-        for row in found.T_map_base:
-            print("  " + " ".join(f"{value:12.6f}" for value in row))
-        verdict = "reliable" if found.reliable else "NOT reliable"
-        print(f"score         {found.score:.3f}, NVTL {result.nvtl:.3f}: {verdict}")
-        print(f"ground        {'none near' if found.ground_z is None else f'{found.ground_z:.3f} m'}")
-        for one in found.alternatives:
-            x, y, z = one.T_map_base[:3, 3]
-            print(f"alternative   ({x:.2f}, {y:.2f}, {z:.2f}) score {one.score:.3f}, NVTL {one.nvtl:.3f}")
-        print(f"time          map {found.map_s * 1e3:.0f} ms, search {found.search_s * 1e3:.0f} ms")
+        _print(found)
     return 0 if found.reliable else 1
+
+
+def _document(found: InitialPose | None) -> dict[str, Any]:
+    """Return the JSON; None: there is no map."""
+    result = None if found is None else found.result
+    covariance = None if result is None else result.covariance
+    return {
+        "T_map_base": None if found is None else found.T_map_base.tolist(),
+        "score": None if found is None else found.score,
+        "nvtl": None if result is None else result.nvtl,
+        "reliable": found is not None and found.reliable,
+        "converged": result is not None and result.converged,
+        "no_map": result is None or result.no_map,
+        "failed_limits": ["no_map"] if result is None else list(result.failed_limits),
+        "ground_z": None if found is None else found.ground_z,
+        "covariance": None if covariance is None else covariance.tolist(),
+        "alternatives": [
+            {"T_map_base": one.T_map_base.tolist(), "score": one.score, "nvtl": one.nvtl}
+            for one in (() if found is None else found.alternatives)
+        ],
+        "candidates": 0 if found is None else found.candidates,
+        "map_ms": None if found is None else found.map_s * 1e3,
+        "search_ms": None if found is None else found.search_s * 1e3,
+    }
+
+
+def _print(found: InitialPose) -> None:
+    result = found.result
+    print("T_map_base")
+    for row in found.T_map_base:
+        print("  " + " ".join(f"{value:12.6f}" for value in row))
+    verdict = "reliable" if found.reliable else f"NOT reliable (failed: {', '.join(result.failed_limits)})"
+    print(f"score         {found.score:.3f}, NVTL {result.nvtl:.3f}: {verdict}")
+    print(f"ground        {'none near' if found.ground_z is None else f'{found.ground_z:.3f} m'}")
+    for one in found.alternatives:
+        x, y, z = one.T_map_base[:3, 3]
+        print(f"alternative   ({x:.2f}, {y:.2f}, {z:.2f}) score {one.score:.3f}, NVTL {one.nvtl:.3f}")
+    print(f"time          map {found.map_s * 1e3:.0f} ms, search {found.search_s * 1e3:.0f} ms")

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that say how to align, and which results are trusted."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from shmmap_clients.command_line import at_least
+from shmmap_clients.shared_options import add_backend_option, add_threads_option, not_negative, positive
+
+if TYPE_CHECKING:
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
+    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+
+__all__ = ["add_alignment_options", "matcher_from", "trust_from"]
+
+
+def add_alignment_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    group = parser.add_argument_group("alignment")
+    group.add_argument(
+        "--variant",
+        choices=("autoware", "pclomp", "pcl"),
+        default="autoware",
+        help="behave as this NDT program: its covariances, stop rule and neighbours (default: autoware)",
+    )
+    group.add_argument(
+        "--neighbors",
+        choices=("direct1", "direct7", "radius"),
+        help="voxels that a point is scored against: its own, also the six beside it, or all whose mean is"
+        " within one leaf (default: the variant's)",
+    )
+    group.add_argument(
+        "--epsilon", type=positive, metavar="E", help="end when a step is shorter (default: the variant's)"
+    )
+    group.add_argument(
+        "--max-iterations", type=at_least(1), metavar="N", help="Newton steps (default: the variant's)"
+    )
+    group.add_argument(
+        "--step-size", type=positive, default=0.1, metavar="M", help="longest step (default: 0.1)"
+    )
+    group.add_argument(
+        "--line-search",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="More-Thuente line search (default: the variant's)",
+    )
+    group.add_argument(
+        "--fine",
+        action="store_true",
+        help="after that, align again with the voxels' true covariances: several times more accurate",
+    )
+    group.add_argument(
+        "--steady",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="steps that do not oscillate between two places, as the originals' can (default: with --fine)",
+    )
+    add_backend_option(group)
+    add_threads_option(group)
+    limits = parser.add_argument_group("limits (what exceeds one is left out and counted)")
+    limits.add_argument("--max-points", type=at_least(1), metavar="N", help="points of a scan")
+    limits.add_argument(
+        "--max-neighbors", type=at_least(1), metavar="N", help="voxels per point; the nearest are taken"
+    )
+    limits.add_argument(
+        "--max-voxels", type=at_least(1), metavar="N", help="voxels of the map; whole cells are left out"
+    )
+    trust = parser.add_argument_group("trust (a result beyond one of these limits is not trusted)")
+    trust.add_argument(
+        "--trust-nvtl",
+        type=not_negative,
+        metavar="N",
+        help="lowest nearest-voxel transformation likelihood (default by --leaf: 1.22 at 1 m, 2.30 at 2 m,"
+        " 2.96 at 3 m; with --fine 0.91 at 1 m)",
+    )
+    trust.add_argument(
+        "--trust-tp", type=not_negative, metavar="N", help="lowest transform probability (default: any)"
+    )
+    trust.add_argument(
+        "--trust-oscillations",
+        type=at_least(0),
+        default=10,
+        metavar="N",
+        help="most reversals of the step (default: 10)",
+    )
+
+
+def matcher_from(args: argparse.Namespace) -> NdtMatcher:
+    """Return the matcher that the options ask for."""
+    from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
+
+    settings = Settings(
+        variant=args.variant,
+        neighbors=args.neighbors,
+        epsilon=args.epsilon,
+        max_iterations=args.max_iterations,
+        step_size=args.step_size,
+        line_search=args.line_search,
+        mode="coarse_fine" if args.fine else "single",
+        steady=args.steady,
+    )
+    given = {
+        "source_points": args.max_points,
+        "neighbors": args.max_neighbors,
+        "voxels": args.max_voxels,
+    }
+    limits = Limits(**{name: value for name, value in given.items() if value is not None})
+    return NdtMatcher(
+        settings, limits=limits, trust=trust_from(args), backend=args.backend, threads=args.threads
+    )
+
+
+def trust_from(args: argparse.Namespace) -> TrustLimits:
+    """Return the limits of trust that the options ask for."""
+    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+
+    return TrustLimits(args.trust_nvtl, args.trust_tp, args.trust_oscillations)

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of ``shmmap-ndt follow``, and what its JSON means."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Final
+
+from shmmap_clients.command_line import (
+    add_allow_empty_option,
+    add_daemon_options,
+    add_json_option,
+    at_least,
+    output_file,
+    seconds,
+)
+from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option
+from shmmap_clients.shared_options import (
+    add_height_option,
+    add_leaf_option,
+    add_quiet_option,
+    add_radius_option,
+    add_scans_option,
+    add_sigma_options,
+    add_thin_option,
+    not_negative,
+    positive,
+)
+
+__all__ = ["EPILOG", "add_options"]
+
+EPILOG: Final = """\
+A scan's result is trusted when it is within all limits of trust.  A vehicle is
+  tracking   when its last result was trusted,
+  uncertain  at the beginning, and when its last result was not trusted,
+  lost       after --lost-after such results in a row, or where there is no map.
+A pose that is not trusted is marked so; the next scan is then predicted from
+odometry or constant velocity alone, and without odometry a lost vehicle stands.
+
+JSON (fields may be added, none is removed).
+--json prints one document at the end:
+  {"frames", "converged", "trustworthy", "no_map": scans, "lost": scans,
+   "relocalized": times, "failed_limits": {name: scans},
+   "trust": {"nvtl", "transform_probability", "oscillations"}: limits in force,
+   "waited": for the map, "too_slow": times that the map did not keep up,
+   "cut_frames": cut by limits,
+   "errors": null without a truth, else {"ate_rmse_m", "ate_m": spread,
+     "ate_deg": spread, "rte": {metres: metres per 100 m}},
+   "transform_probability", "nvtl", "iterations", "latency_ms", "align_ms",
+   "thin_ms", "map_ms", "map_request_ms", "map_build_ms": spread each,
+   "map_updates", "cells_added", "cells_removed", "map_private_bytes"}
+  A spread is {"mean", "variance", "p50", "p99", "max"}; ate is the distance
+  of the poses to the true ones in metres, or degrees.
+--json-lines writes a line for each scan, as soon as it is localized:
+  {"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged",
+   "trustworthy", "failed_limits": [name], "no_map",
+   "state": tracking, uncertain or lost, "relocalized", "iterations",
+   "transform_probability", "nvtl", "waited", "latency_ms",
+   "error_m", "error_deg": to the true pose, null without a truth}
+Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
+
+Exit code: 0; 1 when a scan was not trusted (with --allow-empty: other than for
+want of a map), the map did not keep up, or there was no scan."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_scans_option(parser)
+    parser.add_argument(
+        "--truth",
+        metavar="FILE",
+        help="true poses of the scans of a directory, TUM format, to compare with and to start from; a"
+        " publisher's scans bring theirs",
+    )
+    add_pose_option(parser, "--init", "start pose (default: the first scan's true pose)")
+    add_pose_format_option(parser)
+    parser.add_argument(
+        "--odometry",
+        metavar="FILE|ENDPOINT",
+        help="motion between scans: a TUM file, or poses over ZeroMQ (default: constant velocity)",
+    )
+    parser.add_argument(
+        "--odometry-wait",
+        type=seconds,
+        default=0.0,
+        metavar="SECONDS",
+        help="how long a scan may wait until an endpoint's odometry has reached its time; else constant"
+        " velocity is assumed from the last entry on (default: 0)",
+    )
+    add_thin_option(parser, default=1.0)
+    parser.add_argument("--frames", type=at_least(1), metavar="N", help="stop after N scans")
+    parser.add_argument(
+        "--rate", type=positive, metavar="HZ", help="read a directory no faster than so many scans a second"
+    )
+    window = parser.add_argument_group("map around the vehicle, as in Autoware")
+    add_leaf_option(window)
+    add_radius_option(window)
+    window.add_argument(
+        "--update-distance",
+        type=not_negative,
+        default=20.0,
+        metavar="M",
+        help="ask for the next map after so many metres (default: 20)",
+    )
+    window.add_argument(
+        "--lidar-radius",
+        type=not_negative,
+        default=100.0,
+        metavar="M",
+        help="range of the scanner: a scan waits where the map does not reach so far (default: 100)",
+    )
+    _add_relocalization_options(parser)
+    add_alignment_options(parser)
+    _add_output_options(parser)
+    add_daemon_options(parser, json=False)
+
+
+def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("when the vehicle is lost")
+    group.add_argument(
+        "--lost-after",
+        type=at_least(1),
+        default=5,
+        metavar="N",
+        help="lost after N results in a row that are not trusted (default: 5)",
+    )
+    group.add_argument(
+        "--relocalize",
+        action="store_true",
+        help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose and what"
+        " odometry has added: with each scan until it is found, each time twice as far, up to eight times"
+        " --sigma",
+    )
+    add_pose_option(
+        group, "--rough", "start pose that is metres and degrees off: search around it; implies --relocalize"
+    )
+    add_sigma_options(group)
+    add_height_option(group, default=None, shown="the z of the pose to search around is right")
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    out = parser.add_argument_group("output")
+    out.add_argument("--tum", type=output_file, metavar="FILE", help="write the poses, TUM format")
+    out.add_argument("--publish", metavar="ENDPOINT", help="publish the poses at this ZeroMQ address")
+    out.add_argument(
+        "--listener-wait",
+        type=seconds,
+        default=0.0,
+        metavar="SECONDS",
+        help="how long to wait for the first subscriber, which then gets every pose (default: 0)",
+    )
+    out.add_argument(
+        "--plot", type=output_file, metavar="FILE", help="write an SVG of the way, errors and latency"
+    )
+    out.add_argument(
+        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
+    )
+    add_quiet_option(out)
+    add_allow_empty_option(out)
+    add_json_option(parser)

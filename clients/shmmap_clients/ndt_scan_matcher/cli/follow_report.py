@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``shmmap-ndt follow`` tells while it runs, and its summary in words."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+from types import TracebackType
+from typing import TYPE_CHECKING, TextIO
+
+from shmmap_clients.command_line import nothing_found, writing_errors
+
+if TYPE_CHECKING:
+    from shmmap import Client
+    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveSummary
+    from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+    from shmmap_clients.pose_initializer import Relocalizer
+
+__all__ = ["FollowReport", "print_summary"]
+
+_NAME: str = "shmmap-ndt"
+
+
+class FollowReport:
+    """Writes ``--tum`` and ``--json-lines``, and says on stderr what a reader has to know.
+
+    Parameters
+    ----------
+    args
+        Of the program.
+    """
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self._args = args
+        self._stack = contextlib.ExitStack()
+        self._tum: TextIO | None = None
+        self._lines: TextIO | None = None
+        self._terminal = sys.stderr.isatty() and not args.quiet
+        self._frames = 0
+        self._too_slow = 0
+        self._state = ""
+        self._no_map_told = False
+        self._error_told = ""
+
+    def __enter__(self) -> FollowReport:
+        args = self._args
+        if args.tum:
+            self._stack.enter_context(writing_errors(str(args.tum)))
+            self._tum = self._stack.enter_context(open(args.tum, "w", encoding="utf-8"))
+        if args.json_lines == "-":
+            self._lines = sys.stdout
+        elif args.json_lines:
+            self._stack.enter_context(writing_errors(args.json_lines))
+            self._lines = self._stack.enter_context(open(args.json_lines, "w", encoding="utf-8"))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal and self._frames:
+            print(file=sys.stderr)
+        self._stack.__exit__(kind, error, trace)
+
+    def no_scans(self) -> int:
+        """Say that there was no scan; returns the exit code."""
+        return nothing_found(self._args, _NAME, f"no scan came from {self._args.scans}")
+
+    def frame(
+        self,
+        frame: Frame,
+        client: Client,
+        trust: TrustLimits,
+        too_slow: int,
+        relocalizer: Relocalizer | None,
+    ) -> None:
+        """Tell of the next frame."""
+        from shmmap_clients.ndt_scan_matcher.drive.frame_json import frame_document
+        from shmmap_clients.scans.trajectory import tum_line
+
+        self._frames += 1
+        if self._tum is not None:
+            self._tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
+        if self._lines is not None:
+            self._lines.write(json.dumps(frame_document(frame), allow_nan=False) + "\n")
+            self._lines.flush()
+        if frame.result.no_map and not self._no_map_told:
+            self._no_map_told = True
+            self._say_no_map(frame, client)
+        if too_slow > self._too_slow:
+            self._too_slow = too_slow
+            self._say(f"the map did not keep up with the vehicle: scan {frame.name} waited for it")
+        self._tell_state(frame, trust, relocalizer)
+        self._progress(frame)
+
+    def _say_no_map(self, frame: Frame, client: Client) -> None:
+        from shmmap_clients.map_extent import map_extent
+
+        x, y = frame.result.T_map_base[:2, 3]
+        self._say(f"no map at scan {frame.name}: {map_extent(client)}, the pose is at ({x:.3f}, {y:.3f})")
+
+    def _tell_state(self, frame: Frame, trust: TrustLimits, relocalizer: Relocalizer | None) -> None:
+        """Say when the vehicle gets lost or is found again."""
+        before, self._state = self._state, frame.state
+        where = f"at scan {frame.name}"
+        if frame.relocalized:
+            x, y = frame.result.T_map_base[:2, 3]
+            self._say(f"relocalized {where}: ({x:.2f}, {y:.2f})")
+        elif frame.state == "lost" and before != "lost":
+            failed = ", ".join(trust.describe(name) for name in frame.result.failed_limits)
+            self._say(f"lost {where}: {failed}")
+        elif frame.state == "tracking" and before == "lost":
+            self._say(f"tracking again {where}")
+        error = "" if relocalizer is None or relocalizer.error is None else str(relocalizer.error)
+        if error and not self._error_told:
+            self._say(f"relocalization failed {where}: {error}")
+        self._error_told = error
+
+    def _say(self, text: str) -> None:
+        print(("\n" if self._terminal and self._frames > 1 else "") + f"{_NAME}: {text}", file=sys.stderr)
+
+    def _progress(self, frame: Frame) -> None:
+        if self._terminal:
+            x, y = frame.result.T_map_base[:2, 3]
+            line = (
+                f"\r{self._frames:6} {frame.name:20.20} ({x:9.2f}, {y:9.2f}) NVTL {frame.result.nvtl:5.2f}"
+                f" {frame.result.iterations:3} it {frame.latency_s * 1e3:7.1f} ms {frame.state:9}"
+            )
+            print(line, end="", file=sys.stderr, flush=True)
+
+
+def print_summary(summary: DriveSummary) -> None:
+    """Print the summary of a drive for people."""
+    s = summary
+    print(
+        f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} trusted,"
+        f" {s.cut_frames} cut by limits"
+    )
+    if s.failed_limits:
+        why = (f"{s.trust.describe(name)} ({count})" for name, count in s.failed_limits.items())
+        print(f"  not trusted   {', '.join(why)}")
+    if s.lost or s.relocalized:
+        print(f"  lost          {s.lost} scans; relocalized {s.relocalized} times")
+    print(
+        f"map             {s.map_updates} updates, +{s.cells_added} -{s.cells_removed} cells;"
+        f" {s.waited} scans waited"
+    )
+    print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most")
+    if s.errors is not None:
+        e = s.errors
+        print(
+            f"error           ATE {e.ate_rmse_m:.3f} m RMSE, p50 {e.ate_m.p50:.3f} p99 {e.ate_m.p99:.3f}"
+            f" max {e.ate_m.max:.3f} m; p50 {e.ate_deg.p50:.3f} max {e.ate_deg.max:.3f} deg"
+        )
+        words = [f"{value:.2f} m per 100 m over {metres:.0f} m" for metres, value in e.rte.items()]
+        if words:
+            print(f"  relative      {'; '.join(words)}")
+    for name, spread in (
+        ("TP", s.transform_probability),
+        ("NVTL", s.nvtl),
+        ("iterations", s.iterations),
+        ("latency ms", s.latency_ms),
+        ("  thin ms", s.thin_ms),
+        ("  map ms", s.map_ms),
+        ("  align ms", s.align_ms),
+        ("map request ms", s.map_request_ms),
+        ("map build ms", s.map_build_ms),
+    ):
+        print(
+            f"{name:15} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
+            f"  p99 {spread.p99:8.3f}  max {spread.max:8.3f}"
+        )

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several programs have: the same name, value and help wherever they mean the same."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+__all__ = [
+    "add_backend_option",
+    "add_height_option",
+    "add_leaf_option",
+    "add_quiet_option",
+    "add_radius_option",
+    "add_scan_option",
+    "add_scans_option",
+    "add_sigma_options",
+    "add_thin_option",
+    "add_threads_option",
+    "not_negative",
+    "positive",
+]
+
+Parser = argparse.ArgumentParser | argparse._ArgumentGroup
+
+
+def positive(text: str) -> float:
+    """Read a positive and finite number."""
+    value = _number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a finite number that is not negative."""
+    value = _number(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number, 0 or more, not {text!r}")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def add_scan_option(parser: Parser) -> None:
+    """Add ``--scan``, a file as `shmmap_clients.scans.scan_file` reads it."""
+    parser.add_argument(
+        "--scan", required=True, metavar="FILE", help="scan: PCD, NPZ (xyz or xyz_4mm) or KITTI .bin"
+    )
+
+
+def add_scans_option(parser: Parser) -> None:
+    """Add ``--scans``, see `shmmap_clients.scans.scan_source`."""
+    parser.add_argument(
+        "--scans",
+        required=True,
+        metavar="DIR|ENDPOINT",
+        help="scans: a directory (PCD, NPZ, KITTI .bin; in the order of their names), or the ZeroMQ address"
+        " of a publisher",
+    )
+
+
+def add_leaf_option(parser: Parser) -> None:
+    """Add ``--leaf``."""
+    parser.add_argument(
+        "--leaf", type=positive, default=2.0, metavar="M", help="edge of an NDT voxel (default: 2)"
+    )
+
+
+def add_thin_option(parser: Parser, *, default: float) -> None:
+    """Add ``--thin``."""
+    shown = f"{default:g}; 0: all points" if default else "0, all points, as the original programs do"
+    parser.add_argument(
+        "--thin",
+        type=not_negative,
+        default=default,
+        metavar="M",
+        help="replace the scan's points in each cube of M metres by their mean: with all points NDT takes 20"
+        f" times as long as with 1 m, and is less accurate (default: {shown})",
+    )
+
+
+def add_radius_option(parser: Parser) -> None:
+    """Add ``--map-radius``."""
+    parser.add_argument(
+        "--map-radius",
+        type=positive,
+        default=150.0,
+        metavar="M",
+        help="how far around the vehicle the map is kept (default: 150)",
+    )
+
+
+def add_backend_option(parser: Parser) -> None:
+    """Add ``--backend``."""
+    parser.add_argument(
+        "--backend",
+        default="numba",
+        metavar="NAME",
+        help="numba, or numpy: same results, slower, no compiler (default: numba)",
+    )
+
+
+def add_threads_option(parser: Parser) -> None:
+    """Add ``--threads``."""
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="threads to compute with; results do not depend on it (default: 1)",
+    )
+
+
+def add_quiet_option(parser: Parser) -> None:
+    """Add ``--quiet``."""
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+def add_sigma_options(parser: Parser) -> None:
+    """Add ``--sigma`` and ``--sigma-yaw``."""
+    parser.add_argument(
+        "--sigma",
+        type=positive,
+        default=2.0,
+        metavar="M",
+        help="how far off the rough x and y may be, standard deviation (default: 2)",
+    )
+    parser.add_argument(
+        "--sigma-yaw",
+        type=positive,
+        default=0.1745,
+        metavar="RAD",
+        help="how far off its yaw may be; 1.82 and more: not known at all (default: 0.1745, 10 degrees)",
+    )
+
+
+def add_height_option(parser: Parser, *, default: float | None, shown: str) -> None:
+    """Add ``--height``."""
+    parser.add_argument(
+        "--height",
+        type=float,
+        default=default,
+        metavar="M",
+        help=f"height of the scan's frame above the map's ground (default: {shown})",
+    )

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mean, variance, percentiles and maximum of a stream of numbers, in bounded memory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from shmmap_clients.decimation import Decimated
+
+__all__ = ["RunningSpread", "Spread"]
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How numbers are distributed; NaN where there are none."""
+
+    mean: float
+    variance: float
+    p50: float
+    p99: float
+    max: float
+
+
+class RunningSpread:
+    """Takes number after number; its size does not depend on how many.
+
+    Mean, variance and maximum are of all numbers (Welford 1962); percentiles too while there are few, later
+    they are those of some thousand numbers taken evenly from the whole stream (`Decimated`).
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._mean = 0.0
+        self._squares = 0.0  # sum of squared distances from the mean
+        self._max = -math.inf
+        self._sample: Decimated[float] = Decimated()
+
+    def add(self, value: float) -> None:
+        """Take one number."""
+        self.count += 1
+        before = value - self._mean
+        self._mean += before / self.count
+        self._squares += before * (value - self._mean)
+        self._max = max(self._max, value)
+        self._sample.add(value)
+
+    @property
+    def spread(self) -> Spread:
+        """Of the numbers so far."""
+        if not self.count:
+            return Spread(*(math.nan,) * 5)
+        p50, p99 = np.percentile(self._sample.values, (50, 99))
+        return Spread(self._mean, self._squares / self.count, float(p50), float(p99), self._max)
+
+    @property
+    def root_mean_square(self) -> float:
+        """Of the numbers so far; NaN where there are none."""
+        return math.sqrt(self._mean**2 + self._squares / self.count) if self.count else math.nan

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which results are trusted, at any leaf size; and when a vehicle is lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import (
+    NdtMatcher,
+    Result,
+    Settings,
+    TrustLimits,
+    VoxelMap,
+    matrix_from_pose,
+)
+from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
+from shmmap_clients.ndt_scan_matcher.matching.trust import default_nvtl
+
+import shmmap
+from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street
+
+TRUTH = np.array([1.0, -0.5, 1.8, 0.0, 0.0, 0.2])
+BESIDE = np.array([1.2, -0.6, 1.85, 0.0, 0.0, 0.21])
+FAR = np.array([5001.0, -0.5, 1.8, 0.0, 0.0, 0.2])
+GOOD = {"no_map": False, "converged": True, "nvtl": 3.0, "transform_probability": 5.0, "oscillations": 0}
+
+
+@pytest.fixture(scope="module")
+def points() -> NDArray[np.float64]:
+    return street()
+
+
+def aligned(
+    points: NDArray[np.float64], leaf: float, pose: NDArray[np.float64], trust: TrustLimits | None = None
+) -> Result:
+    """Align a scan of the street from a pose."""
+    with NdtMatcher(Settings(steady=True), trust=trust) as matcher:
+        matcher.set_map(map_of(points, leaf))
+        return matcher.align(scan_from(street(5), TRUTH, 1500), matrix_from_pose(pose))
+
+
+@pytest.mark.parametrize(("leaf", "nvtl"), [(1.0, 1.215), (2.0, 2.3), (3.0, 2.96)])
+def test_the_default_grows_with_the_leaf(leaf: float, nvtl: float) -> None:
+    assert default_nvtl(leaf) == pytest.approx(nvtl, abs=0.01)
+    assert TrustLimits().for_leaf(leaf).nvtl == default_nvtl(leaf)
+    assert TrustLimits(nvtl=0.7).for_leaf(leaf).nvtl == 0.7
+
+
+def test_true_covariances_score_lower_at_a_small_leaf() -> None:
+    assert default_nvtl(1.0, fine=True) == pytest.approx(0.91, abs=0.01)
+    assert default_nvtl(2.0, fine=True) == default_nvtl(2.0)
+    assert default_nvtl(1.0, fine=True) < default_nvtl(1.5, fine=True) < default_nvtl(1.5)
+
+
+@pytest.mark.parametrize("leaf", [1.0, 2.0, 3.0])
+def test_a_right_pose_is_trusted_at_any_leaf(points: NDArray[np.float64], leaf: float) -> None:
+    right = aligned(points, leaf, BESIDE)
+    assert np.linalg.norm(right.T_map_base[:3, 3] - TRUTH[:3]) < 0.1
+    assert right.trustworthy
+    assert right.failed_limits == ()
+    assert not right.no_map
+
+
+def test_a_result_says_which_limit_it_fails(points: NDArray[np.float64]) -> None:
+    assert aligned(points, 2.0, BESIDE, TrustLimits(nvtl=9.0)).failed_limits == ("nvtl",)
+    both = TrustLimits(nvtl=9.0, transform_probability=99.0)
+    assert aligned(points, 2.0, BESIDE, both).failed_limits == ("nvtl", "transform_probability")
+
+
+def test_a_place_without_map_is_said(points: NDArray[np.float64]) -> None:
+    nowhere = aligned(points, 2.0, FAR)
+    assert nowhere.no_map
+    assert nowhere.failed_limits == ("no_map",)
+    assert nowhere.T_map_base[0, 3] == 5001.0
+    with NdtMatcher() as matcher:
+        matcher.set_map(VoxelMap({}))
+        assert matcher.align(points[:10], np.eye(4)).no_map
+        assert not matcher.align(points[:0], np.eye(4)).no_map, "no scan is not no map"
+
+
+@pytest.mark.parametrize(
+    ("change", "failed"),
+    [
+        ({}, ()),
+        ({"converged": False}, ("converged",)),
+        ({"nvtl": 2.2}, ("nvtl",)),
+        ({"transform_probability": 3.9}, ("transform_probability",)),
+        ({"oscillations": 11}, ("oscillations",)),
+        ({"oscillations": 10, "nvtl": 2.3, "transform_probability": 4.0}, ()),
+        ({"no_map": True, "converged": False, "nvtl": 0.0}, ("no_map",)),
+    ],
+)
+def test_every_limit_counts(change: dict[str, float], failed: tuple[str, ...]) -> None:
+    limits = TrustLimits(nvtl=2.3, transform_probability=4.0)
+    result: dict[str, Any] = GOOD | change
+    assert limits.failed(**result) == failed
+    assert all(limits.describe(name) for name in failed)
+
+
+def test_limits_that_make_no_sense_are_refused() -> None:
+    refused: list[dict[str, Any]] = [
+        {"nvtl": -1.0},
+        {"transform_probability": float("nan")},
+        {"oscillations": -1},
+    ]
+    for wrong in refused:
+        with pytest.raises(shmmap.BadRequest, match="limit of trust"):
+            TrustLimits(**wrong)
+    with pytest.raises(shmmap.BadRequest, match="lost_after"):
+        Tracking(0)
+
+
+def test_a_vehicle_is_lost_after_so_many_results(points: NDArray[np.float64]) -> None:
+    trusted = aligned(points, 2.0, BESIDE)
+    doubtful = replace(trusted, failed_limits=("nvtl",))
+    nowhere = replace(trusted, failed_limits=("no_map",), no_map=True)
+    tracking = Tracking(3)
+    assert tracking.state == "uncertain"
+    states = [tracking.update(one) for one in (trusted, doubtful, doubtful, trusted)]
+    assert states == ["tracking", "uncertain", "uncertain", "tracking"], "a trusted one begins anew"
+    states = [tracking.update(one) for one in (doubtful, doubtful, doubtful, doubtful, trusted)]
+    assert states == ["uncertain", "uncertain", "lost", "lost", "tracking"]
+    assert tracking.update(nowhere) == "lost", "there is nothing to wait for"
+    assert Tracking(3, lost=True).update(doubtful) == "lost"
