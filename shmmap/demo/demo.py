@@ -8,6 +8,7 @@ and processor time as the kernel counts them, a program that localizes.  It leav
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -133,8 +134,8 @@ def run_demo(
     """
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
-        map_dir = map_dir or str(scratch / "map")
-        parent = Path(map_dir).absolute().parent
+        map_dir = os.path.abspath(map_dir or scratch / "map")
+        parent = Path(map_dir).parent
         parent.mkdir(parents=True, exist_ok=True)
         settings, budget_bytes = fit(
             settings,

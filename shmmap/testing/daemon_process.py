@@ -95,7 +95,7 @@ class DaemonProcess:
         command: Sequence[str] = (),
         pass_fds: Sequence[int] = (),
     ) -> None:
-        self.map_path = os.fspath(map_path)
+        self.map_path = os.path.abspath(map_path) if os.path.exists(map_path) else os.fspath(map_path)
         self.arguments = list(arguments)
         self.command = list(command)
         self.pass_fds = tuple(pass_fds)

@@ -92,7 +92,7 @@ def test_the_full_demonstration(tmp_path: Path) -> None:
     errors = document["errors"]
     assert 0.0 < errors["ndt"]["mean_m"] <= errors["ndt"]["max_m"] < 0.2
     assert errors["compare"]["still_kept"] < 0.2 < errors["compare"]["moving_kept"]
-    assert errors["elevation"]["places"] == 7
+    assert 5 <= errors["elevation"]["places"] <= 7
     assert errors["elevation"]["max_m"] < 0.1
     assert programs.picture_svg.startswith("<svg")
     mine = f"shmmap-test-{os.getpid()}-"

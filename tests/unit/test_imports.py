@@ -167,7 +167,7 @@ def test_programs_use_public_names_alone(module: str) -> None:
             ):
                 continue
             if module.startswith("shmmap_clients.demo.") and (node.module or "").startswith(
-                ("shmmap.demo.", "shmmap.simulation.", "shmmap.segment.directory")
+                ("shmmap.demo.", "shmmap.simulation.")
             ):
                 continue
             assert node.module == "shmmap", f"{module} imports {node.module}"

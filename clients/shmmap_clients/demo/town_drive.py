@@ -7,6 +7,7 @@ to what moves, and how high the road is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from shmmap_clients.scans.scan_sequence import Scan
 __all__ = ["ProgramErrors", "drive_through_town"]
 
 _WINDOW_METRES: Final = 80.0
+_RESOLUTION_METRES: Final = 0.3  # of the elevation map, where the town is dense enough
+_COLUMN_POINTS: Final = 9.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +74,12 @@ def drive_through_town(
     """
     window = ["--update-distance", "10"]
     heights = work / "elevation.npz"
+    resolution = max(_RESOLUTION_METRES, math.sqrt(_COLUMN_POINTS / drive.town.density))
     result = run_three_programs(
         endpoint, shm_dir, instance, _scans(drive), drive.odometry(), work,
         ndt=["--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(drive.lidar.farthest), *window],
         compare=["--mode", "distance", "--radius", str(_WINDOW_METRES), *window],
-        elevation=["--out", str(heights)],
+        elevation=["--resolution", f"{resolution:.2f}", "--out", str(heights)],
         after_scan=after_scan,
     )  # fmt: skip
     return result, _errors(drive, result, heights)
