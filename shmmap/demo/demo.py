@@ -148,7 +148,7 @@ def run_demo(
         localization = None if full else stack.enter_context(Localization(settings, scratch))
         town = build_town(settings, map_dir, progress)
         if localization is not None:
-            progress.stage("Simulating LiDAR scans, compiling kernels where that is still to be done", 1)
+            progress.stage("Simulating LiDAR scans, compiling kernels", 1)
             localization.wait_prepared()
             progress.step()
         show = _Show(settings, town, options, progress)
@@ -171,7 +171,7 @@ def run_demo(
                 result.missing = localization.missing
             else:
                 progress.stage("Localizing simulated LiDAR scans with shmmap-ndt", 1)
-                result.localization = localization.run(daemon)
+                result.localization = localization.run(watched)
                 progress.step()
         return result
 

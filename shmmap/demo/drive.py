@@ -113,6 +113,10 @@ class WatchedDaemon:
         self.counters = self._ask()
         return self.counters["loads_started"]
 
+    def layers_computed(self) -> int:
+        """Read the counters; returns how many layers its present life has computed."""
+        return self._ask()["layers_computed"]
+
     def traffic(self) -> Traffic:
         """Return what others sent and got since the beginning."""
         start = self._own

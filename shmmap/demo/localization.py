@@ -11,10 +11,11 @@ from types import TracebackType
 from typing import Any, Final
 
 from shmmap.demo.demo_town import DemoSettings
+from shmmap.demo.drive import WatchedDaemon
+from shmmap.demo.process_cpu import cpu_seconds
 from shmmap.demo.program import Program
 from shmmap.demo.scans import SEEN_METRES
 from shmmap.errors import InternalError
-from shmmap.testing.daemon_process import DaemonProcess
 
 __all__ = ["Localization", "LocalizationResult"]
 
@@ -36,6 +37,9 @@ class LocalizationResult:
         Distance of the found positions from the true ones: mean and largest, metres.
     scan_s
         From having a scan to having its pose, median.
+    layers, layers_cpu_s
+        NDT layers that the daemon computed for it, and the processor time of the daemon and its loaders
+        meanwhile.
     document
         All that the program says (``--json``).
     """
@@ -45,6 +49,8 @@ class LocalizationResult:
     error_m: float
     error_max_m: float
     scan_s: float
+    layers: int
+    layers_cpu_s: float
     document: dict[str, Any]
 
 
@@ -98,7 +104,7 @@ class Localization:
             if code := maker.wait(_PATIENCE_S):
                 raise InternalError(f"{maker.name} ended with {code}: {maker.last_words()}")
 
-    def run(self, daemon: DaemonProcess) -> LocalizationResult:
+    def run(self, daemon: WatchedDaemon) -> LocalizationResult:
         """Localize all scans on the daemon's map.
 
         Raises
@@ -108,10 +114,11 @@ class Localization:
         """
         words = [
             "follow", "--scans", str(self._work / "scans"), "--truth", str(self._work / "truth.txt"),
-            "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.endpoint, "--json",
+            "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.process.endpoint, "--json",
             "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(SEEN_METRES),
             "--update-distance", "10",
         ]  # fmt: skip
+        computed, cpu_s = daemon.layers_computed(), cpu_seconds(daemon.pids())
         with Program("shmmap-ndt", _PROGRAM, words, self._work) as program:
             document, _ = program.document(_PATIENCE_S)
         errors_m = document["errors"]["ate_m"]
@@ -121,5 +128,7 @@ class Localization:
             error_m=errors_m["mean"],
             error_max_m=errors_m["max"],
             scan_s=document["latency_ms"]["p50"] / 1e3,
+            layers=daemon.layers_computed() - computed,
+            layers_cpu_s=cpu_seconds(daemon.pids()) - cpu_s,
             document=document,
         )

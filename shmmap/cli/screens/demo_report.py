@@ -25,10 +25,8 @@ def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
 def _print_table(result: DemoResult) -> None:
     rows = []
     for count, each in result.rounds.items():
-        rows += [
-            _row(f"{count} with a private copy", each.private),
-            _row(f"{count} with shmmap", each.shared),
-        ]
+        copies = "private copies" if count > 1 else "private copy"
+        rows += [_row(f"{count} {copies}", each.private), _row(f"{count} with shmmap", each.shared)]
     columns = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP", "NEW CELLS")
     print_table([Column(name, "right" if number else "left") for number, name in enumerate(columns)], rows)
 
@@ -67,8 +65,8 @@ def _lines(result: DemoResult) -> list[tuple[str, str]]:
 def _town(result: DemoResult) -> str:
     town, one = result.town, result.many.shared
     return (
-        f"{town.cells} cells with {town.points / 1e6:.0f} million points; each process keeps the"
-        f" {one.cells} cells around the vehicle, {format_bytes(one.map_bytes)}."
+        f"{town.cells} cells, {town.points / 1e6:.0f} million points; each process keeps the {one.cells}"
+        f" cells around the vehicle, {format_bytes(one.map_bytes)}."
     )
 
 
@@ -77,14 +75,14 @@ def _memory(result: DemoResult) -> str:
     last = result.rounds[count]
     return (
         f"{count} processes with a private copy each: {format_bytes(last.private.total_bytes)}; with shmmap:"
-        f" {format_bytes(last.shared.total_bytes)}, the daemon included."
+        f" {format_bytes(last.shared.total_bytes)}."
     )
 
 
 def _one_more(result: DemoResult) -> str:
     shared_bytes, private_bytes = result.one_more_bytes
     return (
-        f"One process more costs {format_bytes(private_bytes)} with a private copy,"
+        f"Each further process costs {format_bytes(private_bytes)} with a private copy,"
         f" {format_bytes(shared_bytes)} with shmmap."
     )
 
@@ -92,29 +90,33 @@ def _one_more(result: DemoResult) -> str:
 def _waiting(result: DemoResult) -> str:
     shared, private = result.many.shared, result.many.private
     return (
-        f"Reading new cells into a private copy held a control loop up for"
-        f" {format_duration(private.follow_max_s)} at worst; shmmap gets them in the background:"
-        f" {format_duration(shared.follow_max_s)}."
+        f"New cells held a control loop up for {format_duration(private.follow_max_s)} with private copies,"
+        f" {format_duration(shared.follow_max_s)} with shmmap, at worst."
     )
 
 
 def _cpu(result: DemoResult) -> str:
     count = max(result.rounds)
-    last = result.rounds[count]
+    last, found = result.rounds[count], result.localization
+    text = (
+        f"{count} private copies: {format_duration(last.private.cpu_s)}; with shmmap:"
+        f" {format_duration(last.shared.cpu_s)}, its daemon and loaders included."
+    )
+    if found is None:
+        return text
     return (
-        f"{count} processes with a private copy each: {format_duration(last.private.cpu_s)} of CPU time; with"
-        f" shmmap: {format_duration(last.shared.cpu_s)}, the daemon and its loaders included."
+        f"{text} The NDT voxels of {found.layers} cells: {format_duration(found.layers_cpu_s)}, once for"
+        " all programs."
     )
 
 
 def _outage(result: DemoResult) -> str:
     out = result.outage
     return (
-        f"The daemon was killed and gone for {format_duration(out.down_s)}. {out.consumers} processes"
-        f" drove on and read {sum(out.counted) / 1e6:.0f} million map points meanwhile; running"
-        f" {1 / out.pace_s:.0f} times a second, none paused for more than"
-        f" {format_duration(out.longest_pause_s)}. The new daemon took over {out.adopted} of"
-        f" {out.segments} segments in shared memory."
+        f"Without a daemon for {format_duration(out.down_s)}, {out.consumers} processes read on:"
+        f" {sum(out.counted) / 1e6:.0f} million points, {1 / out.pace_s:.0f} times a second, at most"
+        f" {format_duration(out.longest_pause_s)} apart. The new daemon took over {out.adopted} of"
+        f" {out.segments} segments."
     )
 
 

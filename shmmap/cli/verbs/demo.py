@@ -31,7 +31,8 @@ _JSON = """\
               "pace_s": between poses, "current_s": from ready until all had all their cells,
               "segments": in shared memory before, "adopted": taken over},
    "localization": {"scans", "trustworthy", "error_m", "error_max_m": from the truth, mean and
-                    largest, "scan_s": per scan, median, "ndt": what shmmap-ndt says} or null,
+                    largest, "scan_s": per scan, median, "layers", "layers_cpu_s": that the daemon
+                    computed for it, and its CPU time, "ndt": what shmmap-ndt says} or null,
    "wire": {"requests", "request_bytes", "reply_bytes", "handles"}, "svg": path, "seconds"}
   DRIVE: {"consumers", "processes": with the daemon and its workers,
           "cells", "points", "map_bytes": of one consumer's window,
@@ -158,6 +159,8 @@ def _as_json(result: DemoResult, picture: str, duration_s: float) -> dict[str, o
             "error_m": found.error_m,
             "error_max_m": found.error_max_m,
             "scan_s": round(found.scan_s, 6),
+            "layers": found.layers,
+            "layers_cpu_s": round(found.layers_cpu_s, 3),
             "ndt": found.document,
         }
     return {
