@@ -4,7 +4,8 @@
 ``python -m shmmap.demo.consumer shared ENDPOINT RADIUS TASK`` follows through a `MapWindow`;
 ``... private MAP RADIUS TASK`` reads the same PCD files into memory of its own, as a program does that
 knows no shared memory.  All else is the same.  It reads one pose a line from stdin and answers with one
-line on stdout, both JSON, until stdin ends.
+line on stdout, both JSON, until stdin ends.  A pose with ``"drive_on": true`` is answered with what is there,
+complete or not, as a control loop must.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ __all__ = ["TASKS", "Cloud", "MapAround", "Pose", "PrivateMap", "SharedMap", "ma
 Points: TypeAlias = NDArray[Any]
 
 _PATIENCE_S: Final = 30.0
+_COUNTED_METRES: Final = 20.0  # around the vehicle: the points that a control loop reads
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,12 @@ class MapAround(Protocol):
     def complete(self) -> list[Cloud]:
         """Wait until ``clouds`` is complete for the last pose; returns the cells that are new."""
 
+    def take(self) -> None:
+        """Let ``clouds`` be what is there now."""
+
+    def current(self) -> bool:
+        """Whether all that the last pose needs is there."""
+
 
 class SharedMap:
     """Follows through shmmap: the points stay where the daemon put them.
@@ -100,6 +108,17 @@ class SharedMap:
                 raise self._window.error
             if time.monotonic() >= deadline_s:
                 raise NoAnswer(f"the window is not complete after {_PATIENCE_S:g} s")
+        return self._look()
+
+    def take(self) -> None:
+        """Look at what the window holds, whatever its thread is doing."""
+        self._look()
+
+    def current(self) -> bool:
+        """Whether the window's thread is done with the last pose."""
+        return self._window.wait_until_current(0.0)
+
+    def _look(self) -> list[Cloud]:
         before, self.clouds = self.clouds, {}
         new = []
         for cell in self._window.cells:
@@ -148,6 +167,14 @@ class PrivateMap:
         """Return the cells that are new."""
         new, self._new = self._new, []
         return new
+
+    def take(self) -> None:
+        """All is there: `follow` has read it."""
+        self._new = []
+
+    def current(self) -> bool:
+        """Return True: `follow` waits."""
+        return True
 
 
 def _near(clouds: Iterable[Cloud], pose: Pose, radius: float) -> Points:
@@ -207,15 +234,27 @@ def main(argv: list[str]) -> int:
     kind, source, radius, task = argv
     around: MapAround = (SharedMap if kind == "shared" else PrivateMap)(source, float(radius))
     compute = TASKS[task]
+    counted = 0
+    answered_s = time.perf_counter()
     _say({"ready": True})
     for line in sys.stdin:
-        pose = Pose(**json.loads(line))
+        order = json.loads(line)
+        drive_on = order.pop("drive_on")
+        pose = Pose(**order)
+        current = not drive_on or around.current()
         started_s = time.perf_counter()
         around.follow(pose)
         followed_s = time.perf_counter()
-        new = around.complete()
+        new = []
+        if drive_on:
+            around.take()
+        else:
+            new = around.complete()
         complete_s = time.perf_counter()
         answer = compute(around.clouds, pose)
+        if drive_on:
+            counted += len(_near(around.clouds.values(), pose, _COUNTED_METRES))
+        paused_s, answered_s = time.perf_counter() - answered_s, time.perf_counter()
         _say(
             {
                 "answer": answer,
@@ -226,6 +265,9 @@ def main(argv: list[str]) -> int:
                 "cells": len(around.clouds),
                 "points": sum(len(cloud.xyz) for cloud in around.clouds.values()),
                 "bytes": sum(cloud.nbytes for cloud in around.clouds.values()),
+                "current": current,
+                "counted": counted,
+                "paused_s": paused_s,
             }
         )
     return 0

@@ -1,204 +1,218 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration: a town, a daemon, a vehicle, four processes, and the same with private copies.
+"""The demonstration: a town, a vehicle, many processes on one copy of the map, and the same with a copy each.
 
-Everything is real: files on disk, a daemon process, consumer processes, memory as the kernel counts
-it.  It leaves nothing behind.
+Everything is real: files on disk, a daemon process that is killed and comes back, consumer processes, memory
+and processor time as the kernel counts them, a program that localizes.  It leaves nothing behind.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 import os
-import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-from shmmap.client import Client, connect
-from shmmap.demo.consumer import Pose
-from shmmap.demo.daemon_process import DaemonProcess
-from shmmap.demo.demo_town import DemoSettings, Progress, TownMap, build_town, fit, free_bytes
-from shmmap.demo.fleet import Fleet, StepReport
-from shmmap.demo.interrupts import scratch_directory
-from shmmap.demo.process_memory import ProcessMemory, sum_memory
-from shmmap.protocol.codec import encode
-from shmmap.protocol.messages import Stats
+from shmmap.client import connect
+from shmmap.demo.demo_town import (
+    DemoSettings,
+    Progress,
+    TownMap,
+    build_town,
+    fit,
+    free_bytes,
+    free_memory_bytes,
+)
+from shmmap.demo.drive import DriveResult, Traffic, WatchedDaemon, drive
+from shmmap.demo.fleet import Fleet
+from shmmap.demo.localization import Localization, LocalizationResult
+from shmmap.demo.outage import OutageResult, drive_through_outage
+from shmmap.demo.three_programs import ThreeProgramsResult, run_three_programs
+from shmmap.processes.interrupts import scratch_directory
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.reader import read_statistics
+from shmmap.testing.daemon_process import DaemonProcess
 
-__all__ = ["DemoResult", "DriveResult", "Traffic", "run_demo"]
+__all__ = ["COUNTS", "FULL_COUNTS", "MANY", "DemoResult", "Round", "run_demo"]
 
+MANY: Final = 8
+"""Processes that drive on while there is no daemon."""
 
-@dataclass(frozen=True, slots=True)
-class DriveResult:
-    """One drive of four processes.
+COUNTS: Final = (1, MANY)
+"""Processes that drive together, one drive after the other."""
 
-    Attributes
-    ----------
-    processes
-        How many processes, the daemon and its workers included.
-    cells, points, map_bytes
-        What one consumer holds at the end; bytes of its columns.
-    start_s
-        From the first pose until everybody had its first window.
-    updates
-        How often a consumer got new cells, the first window left out; what follows is about these.
-    follow_s, follow_max_s
-        How long a consumer's control loop waited for the map: median and longest.
-    complete_s
-        How long until the new cells were there, median.
-    warm_updates, warm_complete_s
-        The same of those for which the daemon had all cells in memory already (NaN: there was none).
-    handed_bytes
-        Columns that all consumers got in the drive, summed.
-    memory
-        Of all processes at the end, as the kernel counts it.
-    shm_bytes
-        Shared memory in use at the end, mapped or not, as the file system counts it.
-    """
-
-    processes: int
-    cells: int
-    points: int
-    map_bytes: int
-    start_s: float
-    updates: int
-    follow_s: float
-    follow_max_s: float
-    complete_s: float
-    warm_updates: int
-    warm_complete_s: float
-    handed_bytes: int
-    memory: ProcessMemory
-    shm_bytes: int
-
-    @property
-    def total_bytes(self) -> int:
-        """All memory: what processes have for themselves, and shared memory once."""
-        return self.memory.own_bytes + self.shm_bytes
+FULL_COUNTS: Final = (1, 2, 4, MANY, 16)
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
-    """Messages between consumers and daemon in a drive: how many requests, bytes, handles in replies."""
+class Round:
+    """The same drive on one shared copy, and with a private copy in each process."""
 
-    requests: int
-    request_bytes: int
-    reply_bytes: int
-    handles: int
+    shared: DriveResult
+    private: DriveResult
 
 
 @dataclass(slots=True)
 class DemoResult:
-    """Everything the demonstration measured."""
+    """Everything the demonstration measured.
+
+    Attributes
+    ----------
+    rounds
+        By how many processes drove.
+    outage
+        Of the daemon, with `MANY` processes.
+    traffic, resident
+        Messages of the shared drive of `MANY` processes, and the cells in shared memory at its end.
+    localization
+        None where a package is missing, see ``missing``; in a full demonstration ``programs`` holds it.
+    missing
+        The package that the localization lacks.
+    programs
+        The three programs of a full demonstration.
+    """
 
     settings: DemoSettings
     town: TownMap
-    shared: DriveResult
-    private: DriveResult
+    rounds: dict[int, Round]
+    outage: OutageResult
     traffic: Traffic
     resident: list[CellRow]
+    localization: LocalizationResult | None = None
+    missing: str = ""
+    programs: ThreeProgramsResult | None = None
+
+    @property
+    def many(self) -> Round:
+        """The drives of `MANY` processes."""
+        return self.rounds[MANY]
+
+    @property
+    def one_more_bytes(self) -> tuple[float, float]:
+        """What one process more costs in memory, from the first round to the last: shared, private."""
+        first, last = min(self.rounds), max(self.rounds)
+        shared, private = (
+            (after - before) / (last - first)
+            for before, after in (
+                (self.rounds[first].shared.total_bytes, self.rounds[last].shared.total_bytes),
+                (self.rounds[first].private.total_bytes, self.rounds[last].private.total_bytes),
+            )
+        )
+        return shared, private
 
 
-def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None = None) -> DemoResult:
+def run_demo(
+    settings: DemoSettings,
+    progress: Progress,
+    *,
+    map_dir: str | None = None,
+    counts: Sequence[int] = COUNTS,
+    full: bool = False,
+) -> DemoResult:
     """Build, drive, measure, clean up.
 
     Parameters
     ----------
     map_dir
         Where the map is built and stays; by default in a temporary directory that is removed.
+    counts
+        How many processes drive together; one of them is `MANY`.
+    full
+        Whether three programs drive in the end, and not just the localization.
 
     Raises
     ------
     ConfigError
-        There is not enough shared memory.
+        There is not enough memory.
     BadRequest
         ``map_dir`` exists and is not empty.
+    InternalError
+        A process failed.
     """
     with contextlib.ExitStack() as stack:
-        if map_dir is None:
-            scratch = stack.enter_context(scratch_directory("shmmap-demo-"))
-            map_dir = str(Path(scratch, "map"))
-        parent = Path(map_dir).absolute().parent
+        scratch = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
+        map_dir = os.path.abspath(map_dir or scratch / "map")
+        parent = Path(map_dir).parent
         parent.mkdir(parents=True, exist_ok=True)
         settings, budget_bytes = fit(
-            settings, shm_bytes=free_bytes(DEFAULT_SHM_DIR), disk_bytes=free_bytes(str(parent))
-        )
-        town = build_town(settings, map_dir, progress)
-        options = [
-            "--budget",
-            str(budget_bytes),
-            "--workers",
-            "2",
-            "--cache-dir",
-            str(Path(map_dir, ".cache")),
-        ]
-        with (
-            DaemonProcess(map_dir, options=options) as daemon,
-            connect(daemon.endpoint, name="demo", shm_dir=daemon.shm_dir) as client,
-            Fleet("shared", daemon.endpoint, settings.radius) as fleet,
-        ):
-            progress.stage("Driving, four processes on one copy", len(town.route))
-            watched = _WatchedDaemon(daemon, client)
-            shared = _drive(fleet, town.route, settings.pace_s, progress, watched)
-            traffic = watched.traffic()
-            resident = _resident_now(daemon)
-        with Fleet("private", map_dir, settings.radius) as fleet:
-            progress.stage("The same drive, four private copies", len(town.route))
-            private = _drive(fleet, town.route, 0.0, progress, None)
-        return DemoResult(
             settings,
-            town,
-            shared,
-            private,
-            traffic,
-            resident=resident,
+            shm_bytes=free_bytes(DEFAULT_SHM_DIR),
+            disk_bytes=free_bytes(str(parent)),
+            memory_bytes=free_memory_bytes(),
+            copies=max(counts),
         )
+        options = ["--budget", str(budget_bytes), "--workers", "2", "--cache-dir", str(scratch / "cache")]
+        localization = None if full else stack.enter_context(Localization(settings, scratch))
+        town = build_town(settings, map_dir, progress)
+        if localization is not None:
+            progress.stage("Simulating LiDAR scans, compiling kernels", 1)
+            localization.wait_prepared()
+            progress.step()
+        show = _Show(settings, town, options, progress)
+        rounds = {count: Round(*show.compare(count)) for count in counts if count != MANY}
+        private = show.private(MANY)
+        with (
+            DaemonProcess(town.path, *options) as daemon,
+            connect(daemon.endpoint, name="demo") as client,
+        ):
+            with Fleet("shared", daemon.endpoint, settings.radius, MANY) as fleet:
+                watched = WatchedDaemon(daemon, client)
+                rounds[MANY] = Round(show.shared(fleet, watched), private)
+                traffic, resident = watched.traffic(), _resident_now(daemon)
+                progress.stage(f"Killing the daemon while {MANY} processes drive on", len(town.onward))
+                outage = drive_through_outage(fleet, daemon, client, town.onward, progress)
+            result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
+            if localization is None:
+                result.programs = run_three_programs(settings, daemon, scratch, progress)
+            elif localization.missing:
+                result.missing = localization.missing
+            else:
+                progress.stage("Localizing simulated LiDAR scans with shmmap-ndt", 1)
+                result.localization = localization.run(watched)
+                progress.step()
+        return result
 
 
-def _drive(
-    fleet: Fleet, route: Sequence[Pose], pace_s: float, progress: Progress, daemon: _WatchedDaemon | None
-) -> DriveResult:
-    """Follow the route with everybody, in step."""
-    updates: list[StepReport] = []
-    warm: list[StepReport] = []
-    handed_bytes = 0
-    start_s = 0.0
-    reports: list[StepReport] = []
-    for pose, started_s in _paced(route, pace_s):
-        first = not reports
-        loaded_before = daemon.loads() if daemon else 0
-        reports = fleet.move_to(pose)
-        if first:
-            start_s = time.perf_counter() - started_s
-        else:
-            with_new = [report for report in reports if report.new]
-            updates += with_new
-            if daemon and daemon.loads() == loaded_before:
-                warm += with_new
-        handed_bytes += sum(report.new_bytes for report in reports)
-        progress.step(reports, daemon.counters if daemon else None)
-    pids = [*fleet.pids, *(daemon.process.pids() if daemon else ())]
-    one = reports[0]
-    return DriveResult(
-        processes=len(pids),
-        cells=one.cells,
-        points=one.points,
-        map_bytes=one.bytes,
-        start_s=start_s,
-        updates=len(updates),
-        follow_s=_median([report.follow_s for report in updates]),
-        follow_max_s=max((report.follow_s for report in updates), default=math.nan),
-        complete_s=_median([report.complete_s for report in updates]),
-        warm_updates=len(warm),
-        warm_complete_s=_median([report.complete_s for report in warm]),
-        handed_bytes=handed_bytes,
-        memory=sum_memory(pids),
-        shm_bytes=_shm_bytes(daemon.process) if daemon else 0,
-    )
+class _Show:
+    """The drives, each with processes of its own."""
+
+    def __init__(
+        self, settings: DemoSettings, town: TownMap, options: Sequence[str], progress: Progress
+    ) -> None:
+        self._settings, self._town, self._options, self._progress = settings, town, options, progress
+
+    def compare(self, count: int) -> tuple[DriveResult, DriveResult]:
+        """Drive with a copy each, then on a daemon of their own; returns shared, private."""
+        private = self.private(count)
+        with (
+            DaemonProcess(self._town.path, *self._options) as daemon,
+            connect(daemon.endpoint, name="demo") as client,
+            Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet,
+        ):
+            return self.shared(fleet, WatchedDaemon(daemon, client)), private
+
+    def private(self, count: int) -> DriveResult:
+        """Drive with a copy each."""
+        with Fleet("private", self._town.path, self._settings.radius, count) as fleet:
+            self._stage(
+                f"{_processes(count)} with a private copy each" if count > 1 else "1 process, private copy"
+            )
+            return drive(fleet, self._town.route, self._settings.pace_s, self._progress, None)
+
+    def shared(self, fleet: Fleet, daemon: WatchedDaemon) -> DriveResult:
+        """Drive on the daemon's copy."""
+        self._stage(f"{_processes(len(fleet.pids))} on the copy that shmmap shares")
+        return drive(fleet, self._town.route, self._settings.pace_s, self._progress, daemon)
+
+    def _stage(self, text: str) -> None:
+        self._progress.stage(f"Driving, {text}", len(self._town.route))
+
+
+def _processes(count: int) -> str:
+    return f"{count} process" + ("es" if count > 1 else "")
 
 
 def _resident_now(daemon: DaemonProcess) -> list[CellRow]:
@@ -209,61 +223,3 @@ def _resident_now(daemon: DaemonProcess) -> list[CellRow]:
         if found.beat_age_s < time.monotonic() - asked_s or found.state != "healthy":
             return found.cells
         time.sleep(0.02)
-
-
-def _median(values: Sequence[float]) -> float:
-    return statistics.median(values) if values else math.nan
-
-
-class _WatchedDaemon:
-    """A daemon, and a client that reads its counters; what that itself costs is left out."""
-
-    def __init__(self, process: DaemonProcess, client: Client) -> None:
-        self.process = process
-        self._client = client
-        self._own = Traffic(0, 0, 0, 0)
-        self.counters = self._first = self._ask()
-
-    def _ask(self) -> dict[str, int]:
-        reply = self._client.stats()
-        # a reply's own bytes are in the next one's counters
-        asked, answered = len(encode(Stats(reply.request))), len(encode(reply))
-        own = self._own
-        self._own = Traffic(own.requests + 1, own.request_bytes + asked, own.reply_bytes + answered, 0)
-        return reply.counters
-
-    def loads(self) -> int:
-        """Read the counters; returns how many loads began so far."""
-        self.counters = self._ask()
-        return self.counters["loads_started"]
-
-    def traffic(self) -> Traffic:
-        """Return what others sent and got since the beginning."""
-        start = self._own
-        now = self._ask()
-        grown = {name: now[name] - self._first[name] for name in now}
-        return Traffic(
-            requests=grown["requests"] - start.requests,
-            request_bytes=grown["bytes_received"] - start.request_bytes,
-            reply_bytes=grown["bytes_sent"] - start.reply_bytes,
-            handles=grown["handles_sent"],
-        )
-
-
-def _paced(route: Sequence[Pose], pace_s: float) -> Iterator[tuple[Pose, float]]:
-    """Yield the poses no faster than one per ``pace_s``: the drive is meant to be watched."""
-    due_s = time.perf_counter()
-    for pose in route:
-        time.sleep(max(due_s - time.perf_counter(), 0.0))
-        started_s = time.perf_counter()
-        yield pose, started_s
-        due_s = max(due_s + pace_s, started_s)
-
-
-def _shm_bytes(daemon: DaemonProcess) -> int:
-    """Measure every file of the daemon in the shared-memory directory."""
-    total = 0
-    for entry in os.scandir(daemon.shm_dir):
-        if entry.name.startswith(f"shmmap.{daemon.instance}."):
-            total += entry.stat(follow_symlinks=False).st_blocks * 512
-    return total

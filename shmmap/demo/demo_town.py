@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import time
@@ -29,6 +30,7 @@ _FILL: Final = 0.8  # of what is free, at most
 _STATISTICS_BYTES: Final = 256 << 10
 _CELL_OVERHEAD_BYTES: Final = 12 << 10  # its header, and columns rounded up to pages
 _SPARE: Final = 1.25  # budget over window
+_PROCESS_BYTES: Final = 30 << 20  # of a consumer without its points
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +46,13 @@ class DemoSettings:
     radius
         Of every process's window, metres.
     length, step
-        Of the drive, metres.
+        Of the drive that is measured, metres.
+    onward
+        How far it goes on after that, a metre at a time: the drive without a daemon.
+    scanned
+        Length of the drive with three programs, metres.
     pace_s
-        Least time per step of the drive that is shown.
+        Least time per step.
     seed
         Which town.
     """
@@ -54,15 +60,17 @@ class DemoSettings:
     blocks: tuple[int, int] = (5, 4)
     density: float = 100.0
     radius: float = 110.0
-    length: float = 500.0
+    length: float = 250.0
     step: float = 5.0
-    pace_s: float = 0.05
+    onward: int = 50
+    scanned: float = 160.0
+    pace_s: float = 0.04
     seed: int = 4
 
 
 @dataclass(frozen=True, slots=True)
 class TownMap:
-    """The map on disk, and a picture of it."""
+    """The map on disk, a picture of it, and the way through it: ``route``, then ``onward``."""
 
     path: str
     cells: int
@@ -72,6 +80,7 @@ class TownMap:
     bounds: tuple[float, float, float, float]
     picture_png: bytes
     route: tuple[Pose, ...]
+    onward: tuple[Pose, ...]
     build_s: float
 
 
@@ -84,6 +93,9 @@ class Progress(Protocol):
     def step(self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None) -> None:
         """One step of the stage is done."""
 
+    def event(self, text: str) -> None:
+        """Something happened that a spectator should know."""
+
 
 def free_bytes(directory: str) -> int:
     """Return how much more fits on a file system."""
@@ -91,11 +103,31 @@ def free_bytes(directory: str) -> int:
     return state.f_bavail * state.f_frsize
 
 
-def fit(settings: DemoSettings, *, shm_bytes: int, disk_bytes: int) -> tuple[DemoSettings, int]:
+def free_memory_bytes() -> int:
+    """Return how much memory processes can still have, a container's limit respected."""
+    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
+    free = int(fields["MemAvailable"].split()[0]) << 10
+    group = Path("/sys/fs/cgroup")  # in a container: its own
+    with contextlib.suppress(OSError, ValueError):  # no limit is the word "max", or no file
+        limit = int((group / "memory.max").read_text(encoding="ascii"))
+        free = min(free, limit - int((group / "memory.current").read_text(encoding="ascii")))
+    return free
+
+
+def fit(
+    settings: DemoSettings, *, shm_bytes: int, disk_bytes: int, memory_bytes: int, copies: int
+) -> tuple[DemoSettings, int]:
     """Choose a budget of shared memory, and thin the town out where there is little room.
 
     The budget holds the largest window and a little more, so that cells stay for a while and are evicted
     in the end.  A container has 64 MB of shared memory unless told otherwise.
+
+    Parameters
+    ----------
+    shm_bytes, disk_bytes, memory_bytes
+        What is free.
+    copies
+        Private copies of the window that have to fit in memory at once, each in a process of its own.
 
     Returns
     -------
@@ -117,10 +149,12 @@ def fit(settings: DemoSettings, *, shm_bytes: int, disk_bytes: int) -> tuple[Dem
         settings.density,
         (_FILL * shm_bytes / _SPARE - overhead_bytes) / (window_metres2 * per_metre2),
         _FILL * disk_bytes / (town_metres2 * per_metre2),
+        (_FILL * memory_bytes / copies - _PROCESS_BYTES) / (window_metres2 * per_metre2),
     )
     if density < _SMALLEST_DENSITY:
         raise ConfigError(
-            f"too little room: {shm_bytes >> 20} MiB of shared memory, {disk_bytes >> 20} MiB of disk",
+            f"too little room: {shm_bytes >> 20} MiB of shared memory, {disk_bytes >> 20} MiB of disk,"
+            f" {memory_bytes >> 20} MiB of memory",
             hint="a container gets more shared memory with `--shm-size=512m`; TMPDIR names another disk",
         )
     budget_bytes = _SPARE * (window_metres2 * per_metre2 * density + overhead_bytes)
@@ -139,7 +173,9 @@ def build_town(settings: DemoSettings, map_dir: str, progress: Progress) -> Town
             image.add(columns["xyz"], columns["intensity"])
             progress.step()
         written = writer.finish()
+    measured = int(settings.length / settings.step) * settings.step
     poses = town.route(length=settings.length, step=settings.step)
+    onward = town.route(length=measured + settings.onward, step=1.0)[int(measured) + 1 :]
     files = list(Path(map_dir, "pointcloud_map.pcd").iterdir())
     return TownMap(
         path=map_dir,
@@ -150,6 +186,7 @@ def build_town(settings: DemoSettings, map_dir: str, progress: Progress) -> Town
         bounds=town.bounds,
         picture_png=image.png(town.ground_height),
         route=tuple(Pose(*pose) for pose in poses.tolist()),
+        onward=tuple(Pose(*pose) for pose in onward.tolist()),
         build_s=time.perf_counter() - started_s,
     )
 

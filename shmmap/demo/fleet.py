@@ -4,21 +4,21 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import selectors
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import IO, Final, Literal
 
 from shmmap.demo.consumer import TASKS, Pose
-from shmmap.demo.environment import without_settings
-from shmmap.demo.interrupts import interrupts_later
 from shmmap.errors import InternalError
+from shmmap.processes.interrupts import interrupts_later
+from shmmap.testing.environment import without_settings
 
 __all__ = ["Fleet", "StepReport"]
 
@@ -42,6 +42,12 @@ class StepReport:
         Cells that were new, and bytes of all their columns.
     cells, points, bytes
         What it holds now.
+    current
+        Whether all was there that it needed; when it drives on, for the pose before.
+    counted
+        Points that its control loop has read so far on poses that it drove on from.
+    paused_s
+        Time since its answer before.
     """
 
     answer: str
@@ -52,10 +58,13 @@ class StepReport:
     cells: int
     points: int
     bytes: int
+    current: bool
+    counted: int
+    paused_s: float
 
 
 class Fleet:
-    """Processes of `shmmap.demo.consumer`, one per task.
+    """Processes of `shmmap.demo.consumer`, which take their tasks in turn.
 
     Parameters
     ----------
@@ -63,8 +72,8 @@ class Fleet:
         ``shared`` and the daemon's socket, or ``private`` and the map's directory.
     radius
         Of every consumer's window, metres.
-    tasks
-        What each consumer computes.
+    processes
+        How many.
 
     Used as a context manager: all consumers are ready on entry, and gone on exit.
 
@@ -79,8 +88,9 @@ class Fleet:
         kind: Literal["shared", "private"],
         source: str,
         radius: float,
-        tasks: Sequence[str] = tuple(TASKS),
+        processes: int = len(TASKS),
     ) -> None:
+        tasks = list(itertools.islice(itertools.cycle(TASKS), processes))
         self._commands = [
             [sys.executable, "-m", "shmmap.demo.consumer", kind, source, str(radius), task] for task in tasks
         ]
@@ -119,9 +129,15 @@ class Fleet:
     ) -> None:
         self.stop()
 
-    def move_to(self, pose: Pose) -> list[StepReport]:
-        """Send everybody to a pose, wait for all answers, return them in the order of the tasks."""
-        line = json.dumps(asdict(pose)) + "\n"
+    def move_to(self, pose: Pose, *, drive_on: bool = False) -> list[StepReport]:
+        """Send everybody to a pose, wait for all answers, return them in the order of the tasks.
+
+        Parameters
+        ----------
+        drive_on
+            Whether they answer with the cells they have, instead of waiting until none is missing.
+        """
+        line = json.dumps({**asdict(pose), "drive_on": drive_on}) + "\n"
         for index, process in enumerate(self._processes):
             assert process.stdin is not None  # noqa: S101  it is a pipe, see above
             try:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that end with their parent."""
+"""Child processes: started and ended without leaving any behind."""

@@ -70,13 +70,15 @@ class Lidar:
         self, cloud: NDArray[Any], T_map_sensor: NDArray[np.float64], rng: np.random.Generator
     ) -> LidarReturns:
         """Look at a cloud, (N, 3), metres, map frame."""
-        R = np.ascontiguousarray(T_map_sensor[:3, :3])  # else numpy multiplies a hundred times more slowly
-        local = (cloud.astype(np.float64) - T_map_sensor[:3, 3]) @ R
-        distance = np.sqrt(np.einsum("ij,ij->i", local, local))
+        R = T_map_sensor[:3, :3]
+        away = [cloud[:, axis].astype(np.float64) - T_map_sensor[axis, 3] for axis in range(3)]
+        # column by column: several times faster than a product of matrices as narrow as these
+        x, y, z = (away[0] * R[0, axis] + away[1] * R[1, axis] + away[2] * R[2, axis] for axis in range(3))
+        distance = np.sqrt(x * x + y * y + z * z)
         near = np.flatnonzero((distance > self.nearest) & (distance < self.farthest))
-        local, distance = local[near], distance[near]
-        elevation = np.degrees(np.arcsin(local[:, 2] / distance))
-        azimuth = np.degrees(np.arctan2(local[:, 1], local[:, 0])) + 180.0
+        x, y, z, distance = x[near], y[near], z[near], distance[near]
+        elevation = np.degrees(np.arcsin(z / distance))
+        azimuth = np.degrees(np.arctan2(y, x)) + 180.0
         step = (self.highest_deg - self.lowest_deg) / max(1, self.rings - 1)
         ring = np.rint((elevation - self.lowest_deg) / step).astype(np.int64)
         seen = (ring >= 0) & (ring < self.rings)
@@ -89,5 +91,5 @@ class Lidar:
         hit = hit[np.unique(ray[hit], return_index=True)[1]]  # of equally near ones the first
         hit = hit[seen[hit] & (rng.random(len(hit)) >= self.dropout)]
         scale = 1.0 + self.noise * rng.standard_normal(len(hit)) / distance[hit]
-        xyz = (local[hit] * scale[:, None]).astype(np.float32)
+        xyz = (np.column_stack((x[hit], y[hit], z[hit])) * scale[:, None]).astype(np.float32)
         return LidarReturns(xyz, ring[hit].astype(np.uint8), near[hit])

@@ -32,8 +32,8 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.trajectory import Trajectory, read_trajectory
 
 from shmmap import read_cloud
-from shmmap.demo.daemon_process import DaemonProcess
 from shmmap.demo.process_memory import process_memory
+from shmmap.testing.daemon_process import DaemonProcess
 from tests.benchmarks.ndt_clouds import data_dir, sampled
 from tests.benchmarks.tile_map import tile_map
 

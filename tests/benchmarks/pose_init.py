@@ -29,7 +29,7 @@ from shmmap_clients.scans.thinning import thinned
 from shmmap_clients.scans.trajectory import read_trajectory
 
 from shmmap import connect
-from shmmap.demo.daemon_process import DaemonProcess
+from shmmap.testing.daemon_process import DaemonProcess
 from tests.benchmarks.ndt_clouds import data_dir
 from tests.benchmarks.tile_map import tile_map
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import gc
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.daemon_process import DaemonProcess, open_files
+from shmmap.testing.fixtures import judged_daemons
+from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.raw_client import RawClient
 
@@ -43,41 +43,11 @@ def private_tmpfs(tmp_path: Path) -> Iterator[Callable[[str], str]]:
 
 @pytest.fixture
 def daemon(private_tmpfs: Callable[[str], str]) -> Iterator[DaemonFactory]:
-    """Start daemons: ``daemon(map_path, *flags, environment=..., shm_dir=..., start=True)``.
+    """Start daemons, ``daemon(map_path, *flags, environment=..., shm_dir=..., start=True)``.
 
-    At the end of the test each one still running gets SIGTERM and must exit 0 and leave no name, no
-    socket, no process, no temporary file (one that the test killed and did not start again is
-    judged by its processes alone); and this process must have no more open files than before.
+    What they may leave behind: `shmmap.testing.isolation`.
     """
-    before = open_files()
-    started: list[DaemonProcess] = []
-
-    def factory(map_path: Path | str, *flags: str, start: bool = True, **options: Any) -> DaemonProcess:
-        one = DaemonProcess(map_path, *flags, **options)
-        started.append(one)
-        return one.start() if start else one
-
-    yield factory
-    problems: list[str] = []
-    for one in reversed(started):  # a later one may live in an earlier one's directory
-        try:
-            if one.process is not None:
-                code = one.stop()
-                if code != 0:
-                    problems.append(f"the daemon's exit code is {code}")
-            problems += one.leftovers()
-            if problems:
-                problems.append(one.log)
-        finally:
-            one.dispose()
-    gc.collect()
-    problems += [
-        f"descriptor {fd} -> {target}"
-        for fd, target in open_files().items()
-        if fd not in before and not target.startswith("/dev/null")
-    ]
-    if problems:
-        pytest.fail("left behind:\n" + "\n".join(problems))
+    yield from judged_daemons(DaemonProcess)
 
 
 @pytest.fixture

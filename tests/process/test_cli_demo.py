@@ -14,6 +14,11 @@ from xml.etree import ElementTree
 
 import pytest
 
+from shmmap.cli.screens.demo_progress import QuietProgress
+from shmmap.cli.screens.demo_report import print_report
+from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo_town import DemoSettings
+from shmmap.errors import BadRequest
 from tests.support.daemon_process import ROOT, processes_marked, wait_ended
 
 
@@ -41,7 +46,7 @@ class Demo:
         """Processes, segments, sockets and files that should not be there any more."""
         found = [f"process {pid}" for pid in processes_marked(self.mark)]
         found += [f"segment {n}" for n in os.listdir("/dev/shm") if f"test-{self.process.pid}-" in n]
-        found += [f"/tmp/{n}" for n in os.listdir("/tmp") if n.startswith(f"shmmap-{self.process.pid}-")]
+        found += [f"/tmp/{n}" for n in os.listdir("/tmp") if f"-test-{self.process.pid}-" in n]
         return found + [str(path) for path in self.scratch.iterdir()]
 
 
@@ -50,24 +55,36 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     out, err = demo.process.communicate()
     assert (demo.process.returncode, err) == (0, "")
     told = json.loads(out)
-    assert sorted(told) == ["private", "seconds", "shared", "svg", "town", "wire"]
+    assert sorted(told) == [
+        "localization", "one_more_bytes", "outage", "private", "rounds", "seconds", "shared", "svg", "town",
+        "wire",
+    ]  # fmt: skip
     town, shared, private = told["town"], told["shared"], told["private"]
     files = list((tmp_path / "town" / "pointcloud_map.pcd").glob("*.pcd"))
     assert town["cells"] == len(files) == 320
     assert town["file_bytes"] == sum(file.stat().st_size for file in files)
-    # both drives saw the same map
-    for name in ("cells", "points", "map_bytes", "handed_bytes", "updates"):
-        assert shared[name] == private[name] > 0
-    assert private["processes"] == 4
-    assert shared["processes"] >= 6
-    assert shared["total_bytes"] == shared["process_bytes"] + shared["shm_bytes"]
-    # every private copy is private memory; the shared one is there once, with little beside it
-    assert private["private_bytes"] > 4 * private["map_bytes"]
-    assert shared["map_bytes"] < shared["shm_bytes"] < 1.6 * shared["map_bytes"] + (1 << 20)
+    assert [each["consumers"] for each in told["rounds"]] == [1, 8]
+    assert told["rounds"][1] == {"consumers": 8, "shared": shared, "private": private}
+    for each in told["rounds"]:
+        _check_round(each["consumers"], each["shared"], each["private"])
+    # one process more costs a copy, or no copy
+    more = told["one_more_bytes"]
+    assert more["private"] > more["shared"] + private["map_bytes"] / 2
     # handles travel, points do not
     wire = told["wire"]
     assert wire["reply_bytes"] < 250 * wire["handles"]
     assert wire["request_bytes"] + wire["reply_bytes"] < shared["handed_bytes"] / 20
+    # nobody stopped when the daemon did, and it came back with all it had
+    outage = told["outage"]
+    assert len(outage["counted"]) == outage["consumers"] == 8
+    assert min(outage["counted"]) > 0
+    assert outage["poses"] >= 10
+    assert outage["adopted"] == outage["segments"] >= shared["cells"]
+    assert outage["down_s"] >= outage["poses"] * outage["pace_s"] / 2
+    # the positions are those of the truth
+    found = told["localization"]
+    assert found["scans"] == found["trustworthy"] == found["ndt"]["frames"] == 41
+    assert 0.0 < found["error_m"] <= found["error_max_m"] < 0.1
     assert told["svg"] == str(tmp_path / "picture.svg")
     picture = ElementTree.parse(told["svg"]).getroot()
     squares = [e.get("class") or "" for e in picture.iter("{http://www.w3.org/2000/svg}rect")]
@@ -77,14 +94,46 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["picture.svg", "tmp", "town"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("stage", ["Building", "Driving", "The same drive"])
-def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, stage: str, number: signal.Signals) -> None:
-    demo = Demo(tmp_path)
+def _check_round(count: int, shared: dict[str, float], private: dict[str, float]) -> None:
+    """Both drives saw the same map; the memory is where it should be."""
+    for name in ("cells", "points", "map_bytes", "handed_bytes", "updates"):
+        assert shared[name] == private[name] > 0
+    assert private["processes"] == count
+    assert shared["processes"] >= count + 2
+    assert min(shared["cpu_s"], private["cpu_s"]) > 0
+    assert shared["total_bytes"] == shared["process_bytes"] + shared["shm_bytes"]
+    # every private copy is private memory; the shared one is there once, with little beside it
+    assert private["private_bytes"] > count * private["map_bytes"]
+    assert shared["map_bytes"] < shared["shm_bytes"] < 1.6 * shared["map_bytes"] + (1 << 20)
+
+
+STAGES = (
+    "Building a town",
+    "Simulating",
+    "Driving, 1 process, private copy",
+    "Driving, 8 processes on the copy",
+    "  The daemon is killed",
+    "  The daemon starts again",
+    "Localizing",
+)
+
+
+def until(demo: Demo, stage: str) -> None:
+    """Read what the demonstration says until a stage or an event begins."""
     assert demo.process.stdout is not None
     for line in demo.process.stdout:
         if line.startswith(stage):
-            break
+            return
+    pytest.fail(f"it never said {stage!r}")
+
+
+@pytest.mark.parametrize(
+    ("stage", "number"),
+    [*((stage, signal.SIGINT) for stage in STAGES), (STAGES[1], signal.SIGTERM), (STAGES[2], signal.SIGHUP)],
+)
+def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, stage: str, number: signal.Signals) -> None:
+    demo = Demo(tmp_path)
+    until(demo, stage)
     demo.process.send_signal(number)
     assert wait_ended(demo.process.pid)
     _, err = demo.process.communicate()
@@ -95,10 +144,7 @@ def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, stage: str, number: 
 
 def test_a_demo_whose_daemon_dies_says_so_and_leaves_nothing(tmp_path: Path) -> None:
     demo = Demo(tmp_path)
-    assert demo.process.stdout is not None
-    for line in demo.process.stdout:
-        if line.startswith("Driving"):
-            break
+    until(demo, "Driving, 1 process on the copy")
     for pid in processes_marked(demo.mark):
         if b"shmmap.daemon\0" in Path(f"/proc/{pid}/cmdline").read_bytes():
             os.kill(pid, signal.SIGKILL)
@@ -108,17 +154,32 @@ def test_a_demo_whose_daemon_dies_says_so_and_leaves_nothing(tmp_path: Path) -> 
     assert demo.leftovers() == []
 
 
-def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Path) -> None:
-    from shmmap.demo.demo import run_demo
-    from shmmap.demo.demo_town import DemoSettings
-    from shmmap.errors import BadRequest
+def test_without_numba_the_demo_says_what_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A client-only install has no compiler, and so no localization; all else is shown."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    settings = DemoSettings(blocks=(3, 2), density=4.0, radius=60.0, length=20.0, onward=12)
+    result = run_demo(settings, QuietProgress(), counts=(1, MANY))
+    assert (result.localization, result.missing) == (None, "numba")
+    print_report(result, "town.svg", 1.0)
+    lines = capsys.readouterr().out.splitlines()[-8:]
+    assert [line.split("  ")[0] for line in lines] == [
+        "town", "memory", "one more", "waiting", "CPU", "kill -9", "position", "all of it",
+    ]  # fmt: skip
+    assert "the package numba is not installed" in lines[6]
 
+
+def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Path) -> None:
     class NothingMayBegin:
         def stage(self, text: str, total: int) -> None:
             pytest.fail(f"{text}, {total} steps")
 
         def step(self, *args: object) -> None:
             pytest.fail(f"a step: {args}")
+
+        def event(self, text: str) -> None:
+            pytest.fail(f"an event: {text}")
 
     (tmp_path / "town").mkdir()
     (tmp_path / "town" / "mine").touch()

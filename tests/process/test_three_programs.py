@@ -8,14 +8,13 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import pytest
-from shmmap_clients.demo.full_demo import run_full_demo
 from shmmap_clients.demo.three_programs import run_three_programs, table
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
 from shmmap.cli.screens.demo_progress import QuietProgress
+from shmmap.demo.demo import MANY, run_demo
 from shmmap.demo.demo_town import DemoSettings
 from tests.support.daemon_process import DaemonProcess
 from tests.support.town_drive import make_town_drive
@@ -75,17 +74,26 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
     assert one.segments() == []
 
 
-def test_the_full_demonstration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("shmmap_clients.demo.full_demo._BLOCKS", (3, 2))
+def test_the_full_demonstration(tmp_path: Path) -> None:
     before = set(os.listdir("/dev/shm"))
-    result = run_full_demo(
-        DemoSettings(density=8.0), QuietProgress(), map_dir=str(tmp_path / "town"), length=12.0
-    )
+    settings = DemoSettings(blocks=(3, 2), density=8.0, radius=90.0, length=20.0, onward=12, scanned=12.0)
+    result = run_demo(settings, QuietProgress(), map_dir=str(tmp_path / "town"), counts=(2, MANY), full=True)
     assert (tmp_path / "town" / "pointcloud_map_metadata.yaml").exists()
-    documents = {name: run.document for name, run in result.programs.programs.items()}
-    assert result.programs.scans == documents["ndt"]["frames"] == documents["compare"]["scans"] == 7
-    assert documents["compare"]["incomplete_scans"] == 0
-    assert documents["elevation"]["cells"] == result.town.cells == 96
-    assert result.picture_svg.startswith("<svg")
-    mine = f"shmmap.test-{os.getpid()}-"
+    assert [each.shared.consumers for each in result.rounds.values()] == [2, MANY]
+    assert result.localization is None
+    programs = result.programs
+    assert programs is not None
+    document = programs.document
+    ran = document["programs"]
+    assert document["scans"] == ran["ndt"]["frames"] == ran["compare"]["scans"] == 7
+    assert ran["compare"]["incomplete_scans"] == 0
+    assert ran["elevation"]["cells"] == result.town.cells == 96
+    # each was measured against what the town knows
+    errors = document["errors"]
+    assert 0.0 < errors["ndt"]["mean_m"] <= errors["ndt"]["max_m"] < 0.2
+    assert errors["compare"]["still_kept"] < 0.2 < errors["compare"]["moving_kept"]
+    assert 5 <= errors["elevation"]["places"] <= 7
+    assert errors["elevation"]["max_m"] < 0.1
+    assert programs.picture_svg.startswith("<svg")
+    mine = f"shmmap-test-{os.getpid()}-"
     assert not [name for name in set(os.listdir("/dev/shm")) - before if name.startswith(mine)]

@@ -166,7 +166,7 @@ def test_programs_use_public_names_alone(module: str) -> None:
             if module == "shmmap_clients.command_line" and node.module == "shmmap.cli.programs":
                 continue
             if module.startswith("shmmap_clients.demo.") and (node.module or "").startswith(
-                ("shmmap.demo.", "shmmap.simulation.", "shmmap.segment.directory")
+                ("shmmap.demo.", "shmmap.simulation.")
             ):
                 continue
             assert node.module == "shmmap", f"{module} imports {node.module}"

@@ -9,11 +9,8 @@ third reads the whole map again and again.  Nothing here waits for a time to pas
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -26,7 +23,7 @@ import zmq
 from numpy.typing import NDArray
 
 from shmmap import InternalError
-from shmmap.demo.environment import without_settings
+from shmmap.demo.program import Program
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher, decode_scan
 from shmmap_clients.scans.trajectory import tum_line
@@ -37,7 +34,6 @@ _ON_THEIR_WAY: Final = 6  # scans
 _PATIENCE_S: Final = 120.0  # for an answer
 _LAST_RUN_S: Final = 900.0  # for a program's end: the elevation map may just have begun a large map
 _POLL_MS: Final = 1000
-_LAST_WORDS: Final = 2000
 
 
 @dataclass(slots=True)
@@ -84,8 +80,11 @@ class ThreePrograms:
     ----------
     scans, seconds
         Scans sent, and how long it took.
-    kept
-        Points that the compare filter gave back, summed.
+    kept, kept_moving
+        Points that the compare filter gave back, summed, and those among them that belong to what moves
+        (column ``moving``, where scans have one).
+    sent, sent_moving
+        The same of the scans that were sent.
     acknowledged
         Scans that came back from ``ndt`` and from ``compare``.
     segment_bytes
@@ -99,37 +98,28 @@ class ThreePrograms:
     scans: int = 0
     seconds: float = 0.0
     kept: int = 0
+    kept_moving: int = 0
+    sent: int = 0
+    sent_moving: int = 0
     acknowledged: dict[str, int] = field(default_factory=dict)
     segment_bytes: list[int] = field(default_factory=list)
     segments_seen: set[str] = field(default_factory=set)
     programs: dict[str, ProgramRun] = field(default_factory=dict)
 
 
-class _Program:
-    """A process, its output in files, and what it says as JSON in the end."""
+class _Started:
+    """A program that runs, its memory, and what it says as JSON in the end."""
 
     def __init__(self, run: ProgramRun, module: str, words: list[str], work: Path) -> None:
         self.run = run
-        self._command = [sys.executable, "-m", module, *words]
-        self._out, self._err = work / f"{run.name}.out", work / f"{run.name}.err"
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        with open(self._out, "wb") as out, open(self._err, "wb") as err:
-            self._process = subprocess.Popen(
-                self._command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=without_settings()
-            )
-
-    @property
-    def running(self) -> bool:
-        return self._process is not None and self._process.poll() is None
+        self.program = Program(run.name, module, words, work, own_session=False)
 
     def sample(self) -> None:
         """Look at its memory."""
-        if self._process is None:
+        if self.program.pid is None:
             return
         try:
-            status = Path(f"/proc/{self._process.pid}/status").read_text()
+            status = Path(f"/proc/{self.program.pid}/status").read_text(encoding="utf-8")
         except OSError:
             return
         found = dict(re.findall(r"^(RssAnon|RssShmem):\s+(\d+) kB$", status, re.MULTILINE))
@@ -139,24 +129,8 @@ class _Program:
 
     def finish(self) -> None:
         """Wait for its end and read what it said."""
-        if self._process is None:
-            return
-        self.run.exit_code = self._process.wait(_LAST_RUN_S)
+        self.run.document, self.run.exit_code = self.program.document(_LAST_RUN_S)
         self.run.runs += 1
-        text = self._out.read_text(encoding="utf-8")
-        if not text.strip():
-            raise InternalError(f"{self.run.name} ended with {self.run.exit_code}: {self.last_words()}")
-        self.run.document = json.loads(text)
-        self._process = None
-
-    def last_words(self) -> str:
-        return self._err.read_text(encoding="utf-8", errors="replace")[-_LAST_WORDS:]
-
-    def kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
 
 
 def run_three_programs(
@@ -164,7 +138,7 @@ def run_three_programs(
     shm_dir: str,
     instance: str,
     scans: Iterable[Scan],
-    poses: Iterable[tuple[float, NDArray[np.float64]]],
+    odometry: Iterable[tuple[float, NDArray[np.float64]]],
     work: Path,
     *,
     ndt: Iterable[str] = (),
@@ -180,8 +154,8 @@ def run_three_programs(
         The daemon's.
     scans
         With poses and names of their own.
-    poses
-        Odometry for the localization: time and T_map_sensor of every scan to come.
+    odometry
+        For the localization: time and pose of every scan to come, in any frame.
     work
         Directory for sockets, caches and outputs; ``ndt.svg`` and ``compare.svg`` are the drives' pictures.
     ndt, compare, elevation
@@ -194,14 +168,14 @@ def run_three_programs(
     InternalError
         A program ended before its time, or did not answer.
     """
-    odometry = work / "odometry.txt"
-    odometry.write_text("\n".join(tum_line(stamp, T) for stamp, T in poses) + "\n", encoding="utf-8")
+    way = work / "odometry.txt"
+    way.write_text("\n".join(tum_line(stamp, T) for stamp, T in odometry) + "\n", encoding="utf-8")
     result = ThreePrograms()
     address = {name: f"ipc://{work}/{name}" for name in ("to-ndt", "to-compare", "poses", "kept")}
     words = {
         "ndt": [
             "follow", "--scans", address["to-ndt"], "--publish", address["poses"],
-            "--odometry", str(odometry), "--plot", str(work / "ndt.svg"), *ndt,
+            "--odometry", str(way), "--plot", str(work / "ndt.svg"), *ndt,
         ],
         "compare": [
             "follow", "--scans", address["to-compare"], "--out", address["kept"], "--quiet", "--wait", "60",
@@ -213,7 +187,7 @@ def run_three_programs(
     programs = {}
     for name, module in modules.items():
         run = result.programs[name] = ProgramRun(name)
-        programs[name] = _Program(
+        programs[name] = _Started(
             run, f"shmmap_clients.{module}", [*words[name], "--endpoint", endpoint, "--json"], work
         )
     began_s = time.monotonic()
@@ -221,24 +195,27 @@ def run_three_programs(
         outputs = [stack.enter_context(ScanPublisher(address[name])) for name in ("to-ndt", "to-compare")]
         answers = stack.enter_context(_Answers(address["poses"], address["kept"], result))
         for program in programs.values():
-            stack.callback(program.kill)
-            program.start()
+            stack.enter_context(program.program)
         for output in outputs:
             if not output.wait_for_listener(_PATIENCE_S):
-                raise InternalError(f"nobody listens to {output.endpoint}: {programs['ndt'].last_words()}")
+                raise InternalError(
+                    f"nobody listens to {output.endpoint}: {programs['ndt'].program.last_words()}"
+                )
         for scan in scans:
             answers.wait(result.scans - _ON_THEIR_WAY, programs)
             for output in outputs:
                 output.send(scan)
             result.scans += 1
+            result.sent += len(scan.xyz)
+            result.sent_moving += _moving(scan)
             answers.expect(scan.name)
             _sample(result, programs, Path(shm_dir), instance)
-            if not programs["elevation"].running:
+            if not programs["elevation"].program.running:
                 programs["elevation"].finish()
                 shutil.rmtree(
                     work / "elevation", ignore_errors=True
                 )  # from the map again, not from its cache
-                programs["elevation"].start()
+                programs["elevation"].program.start()
             if after_scan is not None:
                 after_scan(result)
         for output in outputs:
@@ -248,6 +225,11 @@ def run_three_programs(
             program.finish()
     result.seconds = time.monotonic() - began_s
     return result
+
+
+def _moving(scan: Scan) -> int:
+    """How many of its points belong to what moves, as far as it tells."""
+    return int(np.count_nonzero(scan.columns["moving"])) if "moving" in scan.columns else 0
 
 
 class _Answers:
@@ -281,7 +263,7 @@ class _Answers:
         """A scan of this name was sent."""
         self._numbers[name] = len(self._numbers)
 
-    def wait(self, count: int, programs: dict[str, _Program]) -> None:
+    def wait(self, count: int, programs: dict[str, _Started]) -> None:
         """Wait until both have answered the first ``count`` scans, or a later one."""
         quiet_s = time.monotonic()
         while min(self._heard.values()) < count - 1:
@@ -292,8 +274,8 @@ class _Answers:
                 quiet_s = time.monotonic()
                 continue
             for name, heard in self._heard.items():
-                if heard < count - 1 and not programs[name].running:
-                    raise InternalError(f"{name} ended: {programs[name].last_words()}")
+                if heard < count - 1 and not programs[name].program.running:
+                    raise InternalError(f"{name} ended: {programs[name].program.last_words()}")
             if time.monotonic() - quiet_s > _PATIENCE_S:
                 raise InternalError(f"no answer for {_PATIENCE_S:g} s; heard {self._heard}")
 
@@ -308,11 +290,12 @@ class _Answers:
                 return
             name = scan.name
             self._result.kept += len(scan.xyz)
+            self._result.kept_moving += _moving(scan)
         self._heard[program] = max(self._heard[program], self._numbers[name])
         self._result.acknowledged[program] += 1
 
 
-def _sample(result: ThreePrograms, programs: dict[str, _Program], shm_dir: Path, instance: str) -> None:
+def _sample(result: ThreePrograms, programs: dict[str, _Started], shm_dir: Path, instance: str) -> None:
     """Look at the memory of the programs, and at the daemon's segments."""
     for program in programs.values():
         program.sample()

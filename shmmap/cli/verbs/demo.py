@@ -8,37 +8,49 @@ import math
 import os
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
-from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_json, print_table
+from shmmap.cli.screens.output import print_json
 from shmmap.errors import CannotWrite
 
 if TYPE_CHECKING:
-    from shmmap_clients.demo.full_demo import FullDemoResult
-
-    from shmmap.demo.demo import DemoResult, DriveResult
+    from shmmap.demo.demo import DemoResult
+    from shmmap.demo.drive import DriveResult
 
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"town": {"cells", "points", "file_bytes", "build_s"},
-   "shared": DRIVE, "private": DRIVE,
+   "shared": DRIVE, "private": DRIVE: those of 8 processes,
+   "rounds": [{"consumers", "shared": DRIVE, "private": DRIVE}],
+   "one_more_bytes": {"shared", "private"}: what one process more costs in memory,
+   "outage": {"consumers", "down_s": from SIGKILL until the daemon was ready again,
+              "poses": answered in this time, "counted": [points that each process read in it],
+              "follow_max_s", "longest_pause_s": of a control loop, until all was as before,
+              "pace_s": between poses, "current_s": from ready until all had all their cells,
+              "segments": in shared memory before, "adopted": taken over},
+   "localization": {"scans", "trustworthy", "error_m", "error_max_m": from the truth, mean and
+                    largest, "scan_s": per scan, median, "layers", "layers_cpu_s": that the daemon
+                    computed for it, and its CPU time, "ndt": what shmmap-ndt says} or null,
    "wire": {"requests", "request_bytes", "reply_bytes", "handles"}, "svg": path, "seconds"}
-  DRIVE: {"processes", "cells", "points", "map_bytes": of one consumer's window,
+  DRIVE: {"consumers", "processes": with the daemon and its workers,
+          "cells", "points", "map_bytes": of one consumer's window,
           "start_s": until all have their first window,
           "updates": how often a consumer got new cells after that; these are about updates only:
           "follow_s", "follow_max_s": how long its control loop waited, median and longest,
           "complete_s": until the new cells were there, median,
           "warm_updates", "warm_complete_s": those with all cells in memory already (null: none),
           "handed_bytes": columns that all consumers got,
+          "cpu_s": user and system time of all processes,
           "process_bytes": memory of the processes without shared memory,
           "shm_bytes": shared memory, counted once, "total_bytes": both,
           "pss_bytes", "private_bytes": as the kernel counts them}
-  With --full: {"town": {"cells", "points"}, "scans", "seconds", "shm_bytes", "programs":
-  {"ndt", "compare", "elevation": what each printed}, "memory": {...: {"own_bytes",
-  "growth_bytes": more in the last third of the drive than in the middle one,
-  "shared_bytes": of the map, mapped}}, "svg"}; exit code 1 where a scan was lost or not trusted"""
+  With --full also: {"scans", "shm_bytes", "programs": {"ndt", "compare", "elevation": what each
+  printed}, "memory": {...: {"own_bytes", "growth_bytes": more in the last third of the drive than
+  in the middle one, "shared_bytes": of the map, mapped}}, "errors": {"ndt": {"mean_m", "max_m"},
+  "compare": {"moving_kept", "still_kept": shares of points}, "elevation": {"mean_m", "max_m",
+  "places"}}}; exit code 1 where a scan was lost or not trusted"""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -48,11 +60,16 @@ def add_parser(subparsers: Subparsers) -> None:
         "demo",
         run,
         help="see it work: no map needed, under a minute",
-        description="Build a town, start a daemon, drive through it with four processes, and "
-        "compare that with four private copies.",
+        description="Build a town and drive through it with one process, then with eight: each with a private"
+        " copy of the map, then all on one copy that shmmap shares.  Kill the daemon, and see the processes"
+        " drive on.  Localize simulated LiDAR scans, and compare with the truth.",
         json=_JSON,
     )
-    parser.add_argument("--svg", metavar="FILE", help="where the picture goes (default: ./shmmap-demo.svg)")
+    parser.add_argument(
+        "--svg",
+        metavar="FILE",
+        help="where the picture goes (default: ./shmmap-demo.svg, with --full ./shmmap-demo-full.svg)",
+    )
     parser.add_argument("--keep-map", metavar="DIR", help="build the map in DIR, and leave it there")
     parser.add_argument(
         "--density",
@@ -63,8 +80,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--full",
         action="store_true",
-        help="drive with the real programs instead: localization, compare filter and elevation map"
-        " beside one another, on simulated scans among moving cars (a minute or two)",
+        help="1, 2, 4, 8 and 16 processes, and three programs beside one another: localization, compare"
+        " filter and elevation map, with their errors (a few minutes)",
     )
     add_json_option(parser)
 
@@ -83,79 +100,43 @@ def run(args: argparse.Namespace) -> int:
     """Run the demonstration and print what it measured."""
     import time
 
-    from shmmap_clients.demo.full_demo import FullDemoResult, run_full_demo
-
     from shmmap.cli.screens.demo_progress import progress_for
-    from shmmap.demo.demo import run_demo
+    from shmmap.cli.screens.demo_report import draw, print_report
+    from shmmap.demo.demo import COUNTS, FULL_COUNTS, run_demo
     from shmmap.demo.demo_town import DemoSettings
-    from shmmap.demo.interrupts import signals_interrupt
+    from shmmap.processes.interrupts import signals_interrupt
 
-    picture = _picture_path(args.svg)
+    picture = _picture_path(args.svg, "shmmap-demo-full.svg" if args.full else "shmmap-demo.svg")
     started_s = time.monotonic()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
         settings = DemoSettings() if args.density is None else DemoSettings(density=args.density)
-        result: DemoResult | FullDemoResult
-        result = (run_full_demo if args.full else run_demo)(settings, progress, map_dir=args.keep_map)
+        counts = FULL_COUNTS if args.full else COUNTS
+        result = run_demo(settings, progress, map_dir=args.keep_map, counts=counts, full=args.full)
     duration_s = time.monotonic() - started_s
-    if isinstance(result, FullDemoResult):
-        return _report_full(result, picture, duration_s, args)
-    picture.write_text(_draw(result), encoding="utf-8")
+    picture.write_text(result.programs.picture_svg if result.programs else draw(result), encoding="utf-8")
     if args.json:
         print_json(_as_json(result, str(picture), duration_s))
     else:
-        _print_text(result)
-        print(f"{format_duration(duration_s)} in all.  Picture of town, route and resident cells: {picture}")
-        _tell_kept_map(args)
-    return 0
+        print_report(result, str(picture), duration_s)
+        if args.keep_map:
+            print(f"Serve the town yourself: shmmap serve {args.keep_map}")
+    return 0 if _complete(result) else 1
 
 
-def _report_full(result: FullDemoResult, picture: Path, duration_s: float, args: argparse.Namespace) -> int:
-    """Print what the three programs did; exit code 1 where a scan was lost or could not be trusted."""
-    from shmmap_clients.demo.three_programs import table
-
-    picture.write_text(result.picture_svg, encoding="utf-8")
-    runs = result.programs.programs
-    documents = {name: run.document for name, run in runs.items()}
-    scans = result.programs.scans
-    if args.json:
-        memory = {
-            name: {
-                "own_bytes": max(run.own_bytes, default=0),
-                "growth_bytes": run.growth_bytes,
-                "shared_bytes": run.shared_bytes,
-            }
-            for name, run in runs.items()
-        }
-        print_json(
-            {
-                "town": {"cells": result.town.cells, "points": result.town.points},
-                "scans": scans,
-                "seconds": round(result.programs.seconds, 3),
-                "shm_bytes": max(result.programs.segment_bytes, default=0),
-                "programs": documents,
-                "memory": memory,
-                "svg": str(picture),
-            }
-        )
-    else:
-        print()
-        print("\n".join(table(result.programs)))
-        print(
-            f"{format_duration(duration_s)} in all.  Kept by the compare filter (red) and removed: {picture}"
-        )
-        _tell_kept_map(args)
-    good = documents["ndt"]["trustworthy"] == documents["compare"]["scans"] == scans
-    return 0 if good and not documents["compare"]["incomplete_scans"] else 1
+def _complete(result: DemoResult) -> bool:
+    """Whether no scan was lost, and all could be trusted."""
+    if result.programs is not None:
+        document = result.programs.document
+        ndt, compare = document["programs"]["ndt"], document["programs"]["compare"]
+        good = ndt["trustworthy"] == compare["scans"] == document["scans"]
+        return bool(good and not compare["incomplete_scans"])
+    found = result.localization
+    return found is None or found.trustworthy == found.scans
 
 
-def _tell_kept_map(args: argparse.Namespace) -> None:
-    if args.keep_map:
-        print(f"Serve the town yourself: shmmap serve {args.keep_map}")
-
-
-def _picture_path(named: str | None) -> Path:
+def _picture_path(named: str | None, usual: str) -> Path:
     """Find out before the work begins where the picture can be written."""
-    path = Path(named or "shmmap-demo.svg").absolute()
+    path = Path(named or usual).absolute()
     if (
         path.parent.is_dir()
         and not path.is_dir()
@@ -168,6 +149,20 @@ def _picture_path(named: str | None) -> Path:
 
 
 def _as_json(result: DemoResult, picture: str, duration_s: float) -> dict[str, object]:
+    out, found = result.outage, result.localization
+    more_shared, more_private = result.one_more_bytes
+    localization: dict[str, Any] | None = None
+    if found is not None:
+        localization = {
+            "scans": found.scans,
+            "trustworthy": found.trustworthy,
+            "error_m": found.error_m,
+            "error_max_m": found.error_max_m,
+            "scan_s": round(found.scan_s, 6),
+            "layers": found.layers,
+            "layers_cpu_s": round(found.layers_cpu_s, 3),
+            "ndt": found.document,
+        }
     return {
         "town": {
             "cells": result.town.cells,
@@ -175,14 +170,37 @@ def _as_json(result: DemoResult, picture: str, duration_s: float) -> dict[str, o
             "file_bytes": result.town.file_bytes,
             "build_s": round(result.town.build_s, 3),
         },
-        "shared": _drive_as_json(result.shared),
-        "private": _drive_as_json(result.private),
+        "shared": _drive_as_json(result.many.shared),
+        "private": _drive_as_json(result.many.private),
+        "rounds": [
+            {
+                "consumers": count,
+                "shared": _drive_as_json(each.shared),
+                "private": _drive_as_json(each.private),
+            }
+            for count, each in result.rounds.items()
+        ],
+        "one_more_bytes": {"shared": round(more_shared), "private": round(more_private)},
+        "outage": {
+            "consumers": out.consumers,
+            "down_s": round(out.down_s, 6),
+            "poses": out.poses,
+            "counted": list(out.counted),
+            "follow_max_s": round(out.follow_max_s, 6),
+            "longest_pause_s": round(out.longest_pause_s, 6),
+            "pace_s": out.pace_s,
+            "current_s": round(out.current_s, 6),
+            "segments": out.segments,
+            "adopted": out.adopted,
+        },
+        "localization": localization,
         "wire": {
             "requests": result.traffic.requests,
             "request_bytes": result.traffic.request_bytes,
             "reply_bytes": result.traffic.reply_bytes,
             "handles": result.traffic.handles,
         },
+        **(result.programs.document if result.programs is not None else {}),
         "svg": picture,
         "seconds": round(duration_s, 3),
     }
@@ -190,6 +208,7 @@ def _as_json(result: DemoResult, picture: str, duration_s: float) -> dict[str, o
 
 def _drive_as_json(drive: DriveResult) -> dict[str, object]:
     return {
+        "consumers": drive.consumers,
         "processes": drive.processes,
         "cells": drive.cells,
         "points": drive.points,
@@ -202,6 +221,7 @@ def _drive_as_json(drive: DriveResult) -> dict[str, object]:
         "warm_updates": drive.warm_updates,
         "warm_complete_s": _seconds(drive.warm_complete_s),
         "handed_bytes": drive.handed_bytes,
+        "cpu_s": round(drive.cpu_s, 3),
         "process_bytes": drive.memory.own_bytes,
         "shm_bytes": drive.shm_bytes,
         "total_bytes": drive.total_bytes,
@@ -212,73 +232,3 @@ def _drive_as_json(drive: DriveResult) -> dict[str, object]:
 
 def _seconds(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 6)
-
-
-def _print_text(result: DemoResult) -> None:
-    shared, private = result.shared, result.private
-    wire_bytes = result.traffic.request_bytes + result.traffic.reply_bytes
-    rows = [
-        ["processes", f"4 and {shared.processes - 4} of the daemon", "4"],
-        ["cells around the vehicle", f"{shared.cells}", f"{private.cells}"],
-        ["points in them", f"{shared.points / 1e6:.1f} million", f"{private.points / 1e6:.1f} million"],
-        ["shared memory, window and spare", format_bytes(shared.shm_bytes), "none"],
-        [
-            "memory of the processes",
-            format_bytes(shared.memory.own_bytes),
-            format_bytes(private.memory.own_bytes),
-        ],
-        ["all memory", format_bytes(shared.total_bytes), format_bytes(private.total_bytes)],
-        ["until all four have a window", format_duration(shared.start_s), format_duration(private.start_s)],
-        [
-            "an update holds the vehicle up",
-            format_duration(shared.follow_s),
-            format_duration(private.follow_s),
-        ],
-        ["... at most", format_duration(shared.follow_max_s), format_duration(private.follow_max_s)],
-        [
-            "new cells are there after",
-            format_duration(shared.complete_s),
-            format_duration(private.complete_s),
-        ],
-    ]
-    if shared.warm_updates:
-        rows.append(["... if in shared memory already", format_duration(shared.warm_complete_s), "-"])
-    rows.append(["messages, all together", format_bytes(wire_bytes), "-"])
-    print()
-    print_table(
-        (Column(""), Column("ONE SHARED COPY", "right"), Column("FOUR PRIVATE COPIES", "right")), rows
-    )
-    print(
-        f"In {len(result.town.route)} poses four processes got {format_bytes(shared.handed_bytes)} of points"
-        f" through {format_bytes(wire_bytes)} of messages."
-    )
-    each_bytes = shared.memory.own_bytes / shared.processes
-    print(
-        f"One process more takes about {format_bytes(each_bytes)}, with a copy of its own"
-        f" {format_bytes(private.total_bytes / 4)}."
-    )
-    print("Memory as the kernel counts it (/proc/PID/smaps_rollup), the daemon and its workers included.")
-
-
-def _draw(result: DemoResult) -> str:
-    from shmmap.cli.screens.picture import CellSquare, Raster, Vehicle, top_view_svg
-
-    town = result.town
-    states = {row.box: row for row in result.resident}
-    cells = []
-    for box in town.boxes:
-        row = states.get(box)
-        title = f"{box[0]:g}, {box[1]:g}" + (f": {row.points:,} points, {row.state}" if row else "")
-        cells.append(CellSquare(box, row.state if row else "", title))
-    last = town.route[-1]
-    resident = sum(1 for cell in cells if cell.state == "resident")
-    return top_view_svg(
-        town.bounds,
-        cells,
-        title=f"A generated town: {town.cells} cells, {town.points / 1e6:.1f} million points",
-        note=f"At the end of the drive {resident} cells are in shared memory, once for all processes:"
-        f" {format_bytes(result.shared.shm_bytes)}.",
-        raster=Raster(town.bounds, town.picture_png),
-        driven=[(pose.x, pose.y) for pose in town.route],
-        vehicle=Vehicle(last.x, last.y, last.heading, result.settings.radius),
-    )

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``shmmap demo`` says in the end: a table of what was measured, and eight lines of what it means."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_pairs, print_table
+
+if TYPE_CHECKING:
+    from shmmap.demo.demo import DemoResult
+    from shmmap.demo.drive import DriveResult
+
+__all__ = ["draw", "print_report"]
+
+
+def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
+    """Print the table and the lines."""
+    print()
+    _print_table(result)
+    print()
+    print_pairs([*_lines(result), ("all of it", f"{format_duration(duration_s)}; picture: {picture}")])
+
+
+def _print_table(result: DemoResult) -> None:
+    rows = []
+    for count, each in result.rounds.items():
+        copies = "private copies" if count > 1 else "private copy"
+        rows += [_row(f"{count} {copies}", each.private), _row(f"{count} with shmmap", each.shared)]
+    columns = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP", "NEW CELLS")
+    print_table([Column(name, "right" if number else "left") for number, name in enumerate(columns)], rows)
+
+
+def _row(name: str, drive: DriveResult) -> list[str]:
+    return [
+        name,
+        format_bytes(drive.total_bytes),
+        format_duration(drive.cpu_s),
+        format_duration(drive.start_s),
+        format_duration(drive.follow_max_s),
+        format_duration(drive.complete_s),
+    ]
+
+
+def _lines(result: DemoResult) -> list[tuple[str, str]]:
+    lines = [
+        ("town", _town(result)),
+        ("memory", _memory(result)),
+        ("one more", _one_more(result)),
+        ("waiting", _waiting(result)),
+        ("CPU", _cpu(result)),
+        ("kill -9", _outage(result)),
+    ]
+    if result.programs is None:
+        return [*lines, ("position", _position(result))]
+    document = result.programs.document
+    return [
+        *lines,
+        ("position", _all_positions(document)),
+        ("moving", _moving(document["errors"]["compare"])),
+        ("ground", _ground(document["errors"]["elevation"])),
+    ]
+
+
+def _town(result: DemoResult) -> str:
+    town, one = result.town, result.many.shared
+    return (
+        f"{town.cells} cells, {town.points / 1e6:.0f} million points; each process keeps the {one.cells}"
+        f" cells around the vehicle, {format_bytes(one.map_bytes)}."
+    )
+
+
+def _memory(result: DemoResult) -> str:
+    count = max(result.rounds)
+    last = result.rounds[count]
+    return (
+        f"{count} processes with a private copy each: {format_bytes(last.private.total_bytes)}; with shmmap:"
+        f" {format_bytes(last.shared.total_bytes)}."
+    )
+
+
+def _one_more(result: DemoResult) -> str:
+    shared_bytes, private_bytes = result.one_more_bytes
+    return (
+        f"Each further process costs {format_bytes(private_bytes)} with a private copy,"
+        f" {format_bytes(shared_bytes)} with shmmap."
+    )
+
+
+def _waiting(result: DemoResult) -> str:
+    shared, private = result.many.shared, result.many.private
+    return (
+        f"New cells held a control loop up for {format_duration(private.follow_max_s)} with private copies,"
+        f" {format_duration(shared.follow_max_s)} with shmmap, at worst."
+    )
+
+
+def _cpu(result: DemoResult) -> str:
+    count = max(result.rounds)
+    last, found = result.rounds[count], result.localization
+    text = (
+        f"{count} private copies: {format_duration(last.private.cpu_s)}; with shmmap:"
+        f" {format_duration(last.shared.cpu_s)}, its daemon and loaders included."
+    )
+    if found is None:
+        return text
+    return (
+        f"{text} The NDT voxels of {found.layers} cells: {format_duration(found.layers_cpu_s)}, once for"
+        " all programs."
+    )
+
+
+def _outage(result: DemoResult) -> str:
+    out = result.outage
+    return (
+        f"Without a daemon for {format_duration(out.down_s)}, {out.consumers} processes read on:"
+        f" {sum(out.counted) / 1e6:.0f} million points, {1 / out.pace_s:.0f} times a second, at most"
+        f" {format_duration(out.longest_pause_s)} apart. The new daemon took over {out.adopted} of"
+        f" {out.segments} segments."
+    )
+
+
+def _position(result: DemoResult) -> str:
+    found = result.localization
+    if found is None:
+        return f"shmmap-ndt was left out: the package {result.missing} is not installed."
+    return (
+        f"shmmap-ndt found where {found.scans} simulated LiDAR scans were taken: {_cm(found.error_m)} from"
+        f" the truth on average, {_cm(found.error_max_m)} at most."
+    )
+
+
+def _all_positions(document: dict[str, Any]) -> str:
+    errors = document["errors"]["ndt"]
+    return (
+        f"shmmap-ndt found where {document['programs']['ndt']['frames']} of {document['scans']} scans were"
+        f" taken: {_cm(errors['mean_m'])} from the truth on average, {_cm(errors['max_m'])} at most."
+    )
+
+
+def _moving(errors: dict[str, float]) -> str:
+    return (
+        f"shmmap-compare kept {errors['moving_kept']:.0%} of the points on moving cars and people, and"
+        f" {errors['still_kept']:.1%} of all others."
+    )
+
+
+def _ground(errors: dict[str, Any]) -> str:
+    return (
+        f"shmmap-elevation's height of the road is {_cm(errors['mean_m'])} from the truth on average,"
+        f" {_cm(errors['max_m'])} at most."
+    )
+
+
+def _cm(metres: float | None) -> str:
+    return "unknown" if metres is None else f"{metres * 100:.1f} cm"
+
+
+def draw(result: DemoResult) -> str:
+    """Draw the town from above, with the way and the cells in shared memory, as SVG."""
+    from shmmap.cli.screens.picture import CellSquare, Raster, Vehicle, top_view_svg
+
+    town = result.town
+    states = {row.box: row for row in result.resident}
+    cells = []
+    for box in town.boxes:
+        row = states.get(box)
+        title = f"{box[0]:g}, {box[1]:g}" + (f": {row.points:,} points, {row.state}" if row else "")
+        cells.append(CellSquare(box, row.state if row else "", title))
+    last = town.route[-1]
+    resident = sum(1 for cell in cells if cell.state == "resident")
+    return top_view_svg(
+        town.bounds,
+        cells,
+        title=f"A generated town: {town.cells} cells, {town.points / 1e6:.1f} million points",
+        note=f"At the end of the drive {resident} cells are in shared memory, once for all"
+        f" {result.many.shared.consumers} processes: {format_bytes(result.many.shared.shm_bytes)}.",
+        raster=Raster(town.bounds, town.picture_png),
+        driven=[(pose.x, pose.y) for pose in town.route],
+        vehicle=Vehicle(last.x, last.y, last.heading, result.settings.radius),
+    )

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A program beside the demonstration, in a process of its own that cannot be left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+from shmmap.errors import InternalError
+from shmmap.processes.interrupts import interrupts_later
+from shmmap.testing.environment import without_settings
+
+__all__ = ["Program"]
+
+_LAST_WORDS: Final = 2000
+
+
+class Program:
+    """``python -m MODULE WORD...``, and what it says.
+
+    Parameters
+    ----------
+    name
+        What it is called where it fails.
+    module, words
+        What is started.
+    work
+        Directory for what it writes.
+    piped
+        Whether stdout is read while it runs, see `lines`, and not in the end, see `document`.
+    own_session
+        Whether a Ctrl-C is kept from it, and it is ended with all that it has started.
+
+    Used as a context manager it is started on entry; on exit it is killed, with all it has started, if it
+    has not ended.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        module: str,
+        words: Sequence[str],
+        work: Path,
+        *,
+        piped: bool = False,
+        own_session: bool = True,
+    ) -> None:
+        self.name = name
+        self._command = [sys.executable, "-m", module, *words]
+        self._piped, self._own_session = piped, own_session
+        self._out, self._err = work / f"{name}.out", work / f"{name}.err"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Program:
+        try:
+            self.start()
+        except BaseException:
+            self.kill()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.kill()
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id, None when it does not run."""
+        return self._process.pid if self._process is not None else None
+
+    @property
+    def running(self) -> bool:
+        """Whether it was started and has not ended."""
+        return self._process is not None and self._process.poll() is None
+
+    def start(self) -> None:
+        """Start it, maybe once more."""
+        with open(self._out, "wb") as out, open(self._err, "wb") as err, interrupts_later():
+            self._process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE if self._piped else out,
+                stderr=err,
+                env=without_settings(),
+                start_new_session=self._own_session,
+            )
+
+    def lines(self) -> Iterator[str]:
+        """What a ``piped`` one writes to stdout, line by line, until it ends."""
+        if self._process is None or self._process.stdout is None:
+            raise InternalError(f"nobody listens to {self.name}")
+        with self._process.stdout as out:
+            for line in out:
+                yield line.decode()
+
+    def wait(self, timeout_s: float) -> int:
+        """Wait for its end; returns its exit code.
+
+        Raises
+        ------
+        InternalError
+            It takes longer.
+        """
+        if self._process is None:
+            raise InternalError(f"{self.name} was not started")
+        try:
+            code = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise InternalError(
+                f"{self.name} takes longer than {timeout_s:g} s: {self.last_words()}"
+            ) from None
+        self._process = None
+        return code
+
+    def document(self, timeout_s: float) -> tuple[dict[str, Any], int]:
+        """Wait for its end; returns the JSON document that it printed, and its exit code.
+
+        Raises
+        ------
+        InternalError
+            It takes longer, or printed none.
+        """
+        code = self.wait(timeout_s)
+        try:
+            found = json.loads(self._out.read_text(encoding="utf-8"))
+        except ValueError:
+            found = None
+        if not isinstance(found, dict):
+            raise InternalError(f"{self.name} ended with {code}: {self.last_words()}")
+        return found, code
+
+    def last_words(self) -> str:
+        """The end of what it wrote to stderr."""
+        return self._err.read_text(encoding="utf-8", errors="replace")[-_LAST_WORDS:].strip()
+
+    def kill(self) -> None:
+        """End it with all that it has started."""
+        with interrupts_later():
+            if self._process is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    (os.killpg if self._own_session else os.kill)(self._process.pid, signal.SIGKILL)
+                self._process.wait()
+                if self._process.stdout is not None:
+                    self._process.stdout.close()
+                self._process = None

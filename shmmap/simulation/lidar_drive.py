@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LiDAR scans of a drive through a generated town, among moving cars and people, with the true poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.town import Town
+from shmmap.simulation.town_ground import BLOCK_METRES
+from shmmap.simulation.town_traffic import Traffic
+
+__all__ = ["LidarDrive", "LidarScan"]
+
+_SENSOR_METRES: Final = 1.8  # above the ground
+_LIDAR: Final = Lidar(rings=40, azimuth_deg=0.4, farthest=60.0)
+_ODOMETRY_WAY: Final = 1.01
+_ODOMETRY_TURN: Final = 1.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarScan:
+    """One scan and the truth about it.
+
+    Attributes
+    ----------
+    stamp_s
+        Since the start of the drive.
+    T_map_sensor
+        (4, 4) float64, metres.
+    xyz
+        (N, 3) float32, sensor frame, metres.
+    ring
+        (N,) uint8: 0 is the lowest.
+    moving
+        (N,) uint8: 1 for a point of what moves.
+    """
+
+    stamp_s: float
+    T_map_sensor: NDArray[np.float64]
+    xyz: NDArray[np.float32]
+    ring: NDArray[np.uint8]
+    moving: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class LidarDrive:
+    """A drive, and what the LiDAR on the roof is like.
+
+    Attributes
+    ----------
+    town
+        Where.
+    length, step
+        Of the drive, and between scans, metres.
+    speed
+        Metres per second.
+    lidar
+        Its ``farthest`` bounds what is simulated at all.
+    density
+        Of the surfaces that the LiDAR sees, points per square metre.  They are the map's, but other
+        points of them: no scan holds the map's own.
+    seed
+        Of the traffic and of the LiDAR's noise.
+    """
+
+    town: Town
+    length: float
+    step: float = 2.0
+    speed: float = 10.0
+    lidar: Lidar = _LIDAR
+    density: float = 40.0
+    seed: int = 0
+
+    def poses(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
+        """Time (seconds) and T_map_sensor of every scan."""
+        route = self.town.route(length=self.length, step=self.step)
+        heights = self.town.ground_height(route[:, 0], route[:, 1]) + _SENSOR_METRES
+        for number, ((x, y, heading), z) in enumerate(zip(route.tolist(), heights.tolist(), strict=True)):
+            T = np.eye(4)
+            T[:2, :2] = [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
+            T[:3, 3] = x, y, z
+            yield number * self.step / self.speed, T
+
+    def odometry(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
+        """Time and pose of every scan as wheels would tell it, from the first scan's, which is unit.
+
+        Ways are 1 % too long, turns 2 % too wide.
+        """
+        before, T_odom = np.eye(4), np.eye(4)
+        for number, (stamp_s, T) in enumerate(self.poses()):
+            if number:
+                step = np.linalg.inv(before) @ T
+                turn = math.atan2(step[1, 0], step[0, 0]) * _ODOMETRY_TURN
+                moved = np.eye(4)
+                moved[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+                moved[:3, 3] = step[:3, 3] * _ODOMETRY_WAY
+                T_odom = T_odom @ moved
+            before = T
+            yield stamp_s, T_odom
+
+    def scans(self) -> Iterator[LidarScan]:
+        """Take one scan after the other."""
+        reach, town = self.lidar.farthest, self.town
+        traffic = Traffic(town, town.route(length=self.length + reach, step=self.step), seed=self.seed)
+        seen = Town(seed=town.seed, blocks=town.blocks, origin=town.origin, density=self.density)
+        tile = lru_cache(maxsize=9)(lambda bx, by: seen.tile(bx, by)["xyz"])
+        rng = np.random.Generator(np.random.PCG64([self.seed, 11]))
+        for stamp_s, T in self.poses():
+            x, y = T[:2, 3].tolist()
+            parts: list[NDArray[np.floating]] = []
+            for block in self._blocks(x, y):
+                part = tile(*block)
+                parts.append(part[(np.abs(part[:, :2] - (x, y)) < reach).all(axis=1)])
+            still = sum(len(part) for part in parts)
+            returns = self.lidar.scan(np.concatenate([*parts, traffic.points(stamp_s)]), T, rng)
+            moving = (returns.source >= still).astype(np.uint8)
+            yield LidarScan(stamp_s, T, returns.xyz, returns.ring, moving)
+
+    def _blocks(self, x: float, y: float) -> list[tuple[int, int]]:
+        """Blocks that the LiDAR reaches from a place."""
+        reach = self.lidar.farthest
+        spans = [
+            range(
+                max(0, math.floor((at - reach - start) / BLOCK_METRES)),
+                min(count, math.floor((at + reach - start) / BLOCK_METRES) + 1),
+            )
+            for at, start, count in zip((x, y), self.town.origin, self.town.blocks, strict=True)
+        ]
+        return [(bx, by) for by in spans[1] for bx in spans[0]]

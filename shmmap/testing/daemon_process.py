@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real daemon for a test or a demonstration: with names of its own, judged from outside when it ends.
+
+::
+
+    with DaemonProcess("/path/to/map") as daemon, shmmap.connect(daemon.endpoint) as client:
+        ...
+    assert not daemon.leftovers()
+
+With pytest the fixture of `shmmap.testing.fixtures` does all of that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import weakref
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, TypeVar
+
+from shmmap.errors import InternalError
+from shmmap.processes.interrupts import interrupts_later
+from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.testing.environment import without_settings
+from shmmap.testing.process_watch import processes_marked, wait_ended, wait_readable
+
+__all__ = ["READY_S", "STOP_S", "DaemonProcess"]
+
+READY_S: Final = 60.0
+STOP_S: Final = 30.0
+_MARK: Final = "SHMMAP_TEST_DAEMON"
+
+_Self = TypeVar("_Self", bound="DaemonProcess")
+
+
+class DaemonProcess:
+    """One instance of the daemon: a name, its directories, and a process that comes and goes.
+
+    Nothing of the machine's real daemon matters to it: name, socket, segments, temporary files and log are
+    its own, and ``SHMMAP_*`` variables are kept from it (but for ``SHMMAP_TEST_*``).
+
+    Parameters
+    ----------
+    map_path
+        The map to serve.
+    *arguments
+        More options of ``shmmap serve``.
+    environment
+        More variables, over this process's.
+    shm_dir
+        Directory of the segments; by default one of its own inside ``/dev/shm``.
+    command
+        In front of the daemon's own command, for example ``["taskset", "-c", "1"]``.
+    pass_fds
+        Descriptors that it inherits.
+
+    Attributes
+    ----------
+    instance, endpoint, runtime_dir, shm_dir, log_path
+        Its name, and where its socket, segments and log are.
+    cache_dir
+        ``XDG_CACHE_HOME`` of the daemon.
+    process
+        Of its present life; None when it does not run.
+    killed
+        Whether its last life ended without cleaning up, by `kill` or `leave`.
+
+    Used as a context manager it is ready on entry; on exit it is stopped and its directories are removed.
+    Without one: `start`, `stop` and, in the end, `dispose`.
+
+    Raises
+    ------
+    InternalError
+        From starting or stopping: the daemon ended, was not ready in a minute, or did not end within
+        half a minute; the message holds its last words.
+    """
+
+    def __init__(
+        self,
+        map_path: str | os.PathLike[str],
+        *arguments: str,
+        environment: Mapping[str, str] | None = None,
+        shm_dir: str | None = None,
+        command: Sequence[str] = (),
+        pass_fds: Sequence[int] = (),
+    ) -> None:
+        self.map_path = os.path.abspath(map_path) if os.path.exists(map_path) else os.fspath(map_path)
+        self.arguments = list(arguments)
+        self.command = list(command)
+        self.pass_fds = tuple(pass_fds)
+        self.instance = f"test-{os.getpid()}-{secrets.token_hex(4)}"
+        self.process: subprocess.Popen[bytes] | None = None
+        self.killed = False
+        self._ready: socket.socket | None = None
+        self._own_shm_dir = shm_dir is None
+        self._leftovers: list[str] | None = None
+        self._directories: list[str] = []
+        # also when the constructor is interrupted, or nobody calls dispose()
+        self._finalizer = weakref.finalize(self, _remove, self._directories, os.getpid())
+        with interrupts_later():
+            # under /tmp whatever TMPDIR says: a socket's path holds 107 bytes
+            self.runtime_dir = self._directory("/tmp")  # noqa: S108
+            self.scratch_dir = self._directory("/tmp")  # noqa: S108
+            self.shm_dir = shm_dir or self._directory(DEFAULT_SHM_DIR)
+        self.endpoint = f"{self.runtime_dir}/{self.instance}.sock"
+        self.log_path = Path(self.runtime_dir, "log.txt")
+        self.cache_dir = Path(self.scratch_dir, "cache")
+        self._temporary_dir = Path(self.scratch_dir, "temporary")
+        for directory in (self.cache_dir, self._temporary_dir):
+            directory.mkdir()
+        self.environment = {
+            **without_settings(),
+            # compiled kernels are everybody's: they cost seconds, and depend on their source alone
+            "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR") or _kernels_dir(),
+            "TMPDIR": str(self._temporary_dir),
+            "XDG_CACHE_HOME": str(self.cache_dir),
+            _MARK: self.instance,
+            **(environment or {}),
+        }
+
+    def _directory(self, parent: str) -> str:
+        path = tempfile.mkdtemp(prefix=f"shmmap-{self.instance}-", dir=parent)
+        self._directories.append(path)
+        return path
+
+    def __enter__(self: _Self) -> _Self:
+        try:
+            return self.start()
+        except BaseException:
+            self.dispose()
+            raise
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with interrupts_later():
+            try:
+                if self.process is not None:
+                    self.stop()
+                self._leftovers = self.leftovers()
+            finally:
+                self.dispose()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the daemon."""
+        if self.process is None:
+            raise InternalError("the daemon is not running")
+        return self.process.pid
+
+    @property
+    def log(self) -> str:
+        """What the daemon wrote to stderr in all its lives."""
+        return self.log_path.read_text(errors="replace") if self.log_path.exists() else ""
+
+    # --- its lives ----------------------------------------------------------------------------------
+
+    def spawn(self, *, arguments: Sequence[str] | None = None, notify: str = "") -> subprocess.Popen[bytes]:
+        """Start the process without waiting for it to be ready."""
+        environment = dict(self.environment)
+        environment.pop("NOTIFY_SOCKET", None)
+        if notify:
+            environment["NOTIFY_SOCKET"] = notify
+        command = [
+            *self.command, sys.executable, "-m", "shmmap.daemon", self.map_path,
+            "--instance", self.instance, "--runtime-dir", self.runtime_dir, "--shm-dir", self.shm_dir,
+            *(self.arguments if arguments is None else arguments),
+        ]  # fmt: skip
+        with self.log_path.open("ab") as log:
+            return subprocess.Popen(
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd="/",
+                pass_fds=self.pass_fds,
+                start_new_session=True,  # a Ctrl-C is for whoever started it, who ends it in order
+            )
+
+    def start(self: _Self, timeout_s: float = READY_S) -> _Self:
+        """Start the daemon and wait until it says that it is ready."""
+        self.launch()
+        if not self.wait_ready(timeout_s):
+            raise InternalError(f"the daemon is not ready after {timeout_s:g} s:\n{self._last_words()}")
+        return self
+
+    def launch(self) -> None:
+        """Start the daemon; `wait_ready` says when it is."""
+        path = f"{self.runtime_dir}/notify"
+        self._forget_ready()
+        self._ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._ready.bind(path)
+        os.chmod(path, 0o777)  # noqa: S103  the daemon may run as another user
+        with interrupts_later():
+            self.process = self.spawn(notify=path)
+
+    def wait_ready(self, timeout_s: float = READY_S) -> bool:
+        """Wait until the daemon that was launched says that it is ready (sd_notify); True if it does."""
+        if self._ready is None:
+            return True
+        deadline_s = time.monotonic() + timeout_s
+        end = os.pidfd_open(self.pid)
+        try:
+            while True:
+                found = wait_readable([self._ready.fileno(), end], deadline_s - time.monotonic())
+                if self._ready.fileno() in found:
+                    if b"READY=1" in self._ready.recv(4096).splitlines():
+                        self.killed = False
+                        self._forget_ready()
+                        return True
+                elif found:
+                    code = self.process.wait() if self.process is not None else 0
+                    raise InternalError(f"the daemon ended with {code}:\n{self._last_words()}")
+                else:
+                    return False
+        finally:
+            os.close(end)
+
+    def send(self, number: signal.Signals) -> None:
+        """Send the daemon a signal."""
+        os.kill(self.pid, number)
+
+    def stop(self) -> int:
+        """End the daemon with SIGTERM, which empties the cache; returns its exit code."""
+        return self._end(signal.SIGTERM)
+
+    def leave(self) -> int:
+        """End the daemon with SIGUSR1, which leaves the segments to its next life; returns its exit code."""
+        code = self._end(signal.SIGUSR1)
+        self.killed = True
+        return code
+
+    def kill(self) -> None:
+        """End the daemon with SIGKILL: it can clean up nothing, and `start` finds what it left."""
+        self._end(signal.SIGKILL)
+        self.killed = True
+
+    def _end(self, number: signal.Signals) -> int:
+        pid = self.pid
+        assert self.process is not None  # noqa: S101  `pid` has looked
+        process, self.process = self.process, None
+        if process.poll() is None:
+            process.send_signal(signal.SIGCONT)
+            process.send_signal(number)
+        try:
+            return process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise InternalError(
+                f"the daemon, process {pid}, did not end within {STOP_S:g} s:\n{self._last_words()}"
+            ) from None
+
+    def _forget_ready(self) -> None:
+        if self._ready is not None:
+            self._ready.close()
+            self._ready = None
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(f"{self.runtime_dir}/notify")
+
+    def _last_words(self) -> str:
+        return "\n".join(self.log.splitlines()[-20:])
+
+    # --- what there is of it ------------------------------------------------------------------------
+
+    def children(self) -> list[int]:
+        """Ids of the daemon's living descendants, wherever they were reparented to."""
+        own = self.process.pid if self.process is not None else 0
+        return sorted(pid for pid in processes_marked(self.instance, _MARK) if pid != own)
+
+    def segments(self) -> list[str]:
+        """Published and retired segments, sorted; statistics and lock are not among them."""
+        own = re.compile(rf"shmmap\.{self.instance}\.[0-9a-f]{{16}}(\.zombie)?")
+        return sorted(name for name in os.listdir(self.shm_dir) if own.fullmatch(name))
+
+    def segment_bytes(self) -> int:
+        """Memory that the segments occupy, by their blocks."""
+        return self._measured(self.segments())
+
+    def shm_bytes(self) -> int:
+        """Memory of everything that it has in the shared-memory directory, statistics included."""
+        prefix = f"shmmap.{self.instance}."
+        return self._measured(name for name in os.listdir(self.shm_dir) if name.startswith(prefix))
+
+    def _measured(self, names: Iterable[str]) -> int:
+        total = 0
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                total += os.stat(f"{self.shm_dir}/{name}").st_blocks * 512
+        return total
+
+    def leftovers(self) -> list[str]:
+        """Everything that a daemon which ended in order must not leave: names, sockets, processes, files.
+
+        After the context manager: what there was at its end.
+        """
+        if self._leftovers is not None:
+            return self._leftovers
+        prefix = f"shmmap.{self.instance}."
+        found = [f"process {pid}" for pid in self.children() if not wait_ended(pid, 10.0)]
+        if self.killed:
+            return found  # names are left behind for the next life to adopt
+        found += [f"segment {name}" for name in os.listdir(self.shm_dir) if name.startswith(prefix)]
+        if self._own_shm_dir:
+            found += [
+                f"file {n} in the shm directory" for n in os.listdir(self.shm_dir) if not n.startswith(prefix)
+            ]
+        found += [f"socket {name}" for name in os.listdir(self.runtime_dir) if name.endswith(".sock")]
+        found += [f"temporary file {name}" for name in os.listdir(self._temporary_dir)]
+        return found
+
+    def dispose(self) -> None:
+        """Kill what is left and remove all directories; no judgement."""
+        with interrupts_later():
+            if self.process is not None:
+                self.kill()
+            self._forget_ready()
+            for pid in self.children():
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                wait_ended(pid)
+            for name in os.listdir(self.shm_dir):
+                if name.startswith(f"shmmap.{self.instance}."):
+                    os.unlink(f"{self.shm_dir}/{name}")
+            self._finalizer()
+
+
+def _remove(directories: list[str], owner: int) -> None:
+    """Remove directories, unless this is a forked child of who made them."""
+    if os.getpid() == owner:
+        for path in directories:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _kernels_dir() -> str:
+    """Where kernels are kept, see `shmmap.layers.compiling`, which loads numba."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return str(Path(base if base.startswith("/") else os.path.expanduser("~/.cache"), "shmmap", "kernels"))

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures for pytest, which has to be installed; in the `conftest.py` of one's own tests::
+
+    pytest_plugins = ["shmmap.testing.fixtures"]
+
+and in a test::
+
+    def test_my_program(shmmap_daemon, tmp_path):
+        daemon = shmmap_daemon(map_path, "--budget", "64M")
+        with shmmap.connect(daemon.endpoint) as client:
+            ...
+
+The test fails where the daemon leaves anything behind, or the test itself an open file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import pytest
+
+from shmmap.errors import InternalError
+from shmmap.testing.daemon_process import DaemonProcess
+from shmmap.testing.isolation import isolated_daemons
+
+__all__ = ["judged_daemons", "shmmap_daemon"]
+
+_Daemon = TypeVar("_Daemon", bound=DaemonProcess)
+
+
+@pytest.fixture
+def shmmap_daemon() -> Iterator[Callable[..., DaemonProcess]]:
+    """Start daemons, ``shmmap_daemon(map_path, *options)``, see `shmmap.testing.isolation`."""
+    yield from judged_daemons(DaemonProcess)
+
+
+def judged_daemons(kind: type[_Daemon]) -> Iterator[Callable[..., _Daemon]]:
+    """Do the work of `shmmap_daemon`, for a fixture with another class of daemons."""
+    try:
+        with isolated_daemons(kind) as make:
+            yield make
+    except InternalError as error:
+        pytest.fail(str(error), pytrace=False)
