@@ -5,6 +5,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import secrets
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +20,8 @@ import shmmap
 from shmmap.cli.screens.demo_progress import QuietProgress
 from shmmap.demo.demo import MANY, run_demo
 from shmmap.demo.demo_town import DemoSettings
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, processes_marked, wait_ended
+from tests.support.patience import Patience
 from tests.support.town_drive import make_town_drive
 
 Factory = Callable[..., DaemonProcess]
@@ -97,3 +102,49 @@ def test_the_full_demonstration(tmp_path: Path) -> None:
     assert programs.picture_svg.startswith("<svg")
     mine = f"shmmap-test-{os.getpid()}-"
     assert not [name for name in set(os.listdir("/dev/shm")) - before if name.startswith(mine)]
+
+
+INTERRUPTED = """
+from shmmap.cli.screens.demo_progress import PlainProgress
+from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo_town import DemoSettings
+from shmmap.processes.interrupts import signals_interrupt
+
+settings = DemoSettings(blocks=(3, 2), density=8.0, radius=90.0, length=10.0, onward=12, scanned=160.0)
+with signals_interrupt():
+    run_demo(settings, PlainProgress(), counts=(1, MANY), full=True)
+"""
+
+
+def test_an_interrupted_full_demonstration_leaves_nothing(tmp_path: Path) -> None:
+    mark = secrets.token_hex(8)
+    process = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path), "SHMMAP_TEST_RUN": mark},
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("Driving: localization"):
+            break
+    # the three programs and the one that started them are there
+    waiting = Patience()
+    while waiting(not any("shmmap_clients.elevation_map" in _command(pid) for pid in processes_marked(mark))):
+        os.sched_yield()
+    process.send_signal(signal.SIGTERM)
+    assert wait_ended(process.pid)
+    process.communicate()
+    assert process.returncode not in (0, -signal.SIGTERM)
+    assert [_command(pid) for pid in processes_marked(mark)] == []
+    assert list(tmp_path.iterdir()) == []
+    assert not [name for name in os.listdir("/tmp") if f"-test-{process.pid}-" in name]
+
+
+def _command(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8").replace("\0", " ")
+    except OSError:
+        return ""
