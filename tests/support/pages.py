@@ -52,7 +52,7 @@ class Page:
 
 
 def heading_anchor(title: str) -> str:
-    """Return a heading's anchor: lower case, blanks as hyphens, everything else but letters and digits gone."""
+    """Return a heading's anchor: lower case, blanks as hyphens, no other signs."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 

@@ -34,7 +34,7 @@ class Terminal:
         state = shlex.quote(str(self._state))
         return (
             f"[ -e {state} ] && . {state}; set -eu\n"
-            f"trap '{{ export -p; printf \"cd %q\\n\" \"$PWD\"; }} >{state}' EXIT\n{command}\n"
+            f'trap \'{{ export -p; printf "cd %q\\n" "$PWD"; }} >{state}\' EXIT\n{command}\n'
         )
 
     def run(self, command: str) -> str:
