@@ -20,7 +20,14 @@ from shmmap import __version__
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = f"shmmap-{__version__}"
-SOURCE = ("shmmap/", "clients/", "tests/", "systemd/", ".github/", ".ci/")  # folders of the source distribution
+SOURCE = (
+    "shmmap/",
+    "clients/",
+    "tests/",
+    "systemd/",
+    ".github/",
+    ".ci/",
+)  # folders of the source distribution
 TOP = {"README.md", "CHANGELOG.md", "LICENSE", "pyproject.toml", ".gitignore"}
 WHEEL = {"shmmap/": "shmmap/", "clients/shmmap_clients/": "shmmap_clients/", "systemd/": "shmmap/_systemd/"}
 ABOUT = {"METADATA", "WHEEL", "RECORD", "entry_points.txt", "licenses/LICENSE"}
@@ -72,7 +79,11 @@ def wheel_faults(wheel: Path, files: set[str]) -> list[str]:
     for folder, inside in WHEEL.items():
         wanted |= {inside + name.removeprefix(folder) for name in files if name.startswith(folder)}
     faults = compared(wheel.name, found, wanted) + compared(wheel.name, found & NEEDED, NEEDED)
-    if (about["Name"], about["Version"], about["License-Expression"]) != ("shmmap", __version__, "Apache-2.0"):
+    if (about["Name"], about["Version"], about["License-Expression"]) != (
+        "shmmap",
+        __version__,
+        "Apache-2.0",
+    ):
         faults.append(f"{wheel.name}: another name, version or licence in its METADATA")
     if str(about.get_payload()).strip() != (ROOT / "README.md").read_text(encoding="utf-8").strip():
         faults.append(f"{wheel.name}: its description is not the README")
@@ -82,7 +93,9 @@ def wheel_faults(wheel: Path, files: set[str]) -> list[str]:
 def source_faults(source: Path, files: set[str]) -> list[str]:
     """Return what is wrong with the source distribution."""
     with tarfile.open(source) as archive:
-        found = {member.name.removeprefix(f"{NAME}/") for member in archive.getmembers() if not member.isdir()}
+        found = {
+            member.name.removeprefix(f"{NAME}/") for member in archive.getmembers() if not member.isdir()
+        }
     wanted = {name for name in files if name.startswith(SOURCE) or name in TOP} | {"PKG-INFO"}
     return compared(source.name, found, wanted) + compared(source.name, found & TOP, TOP)
 
@@ -98,7 +111,9 @@ def main() -> None:
         faults = wheel_faults(wheel, files) + source_faults(source, files)
     if faults:
         raise SystemExit("\n".join(faults))
-    print(f"{wheel.name} and {source.name}: {wheel.stat().st_size >> 10} and {source.stat().st_size >> 10} KiB")
+    print(
+        f"{wheel.name} and {source.name}: {wheel.stat().st_size >> 10} and {source.stat().st_size >> 10} KiB"
+    )
 
 
 if __name__ == "__main__":
