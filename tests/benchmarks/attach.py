@@ -4,7 +4,7 @@
 Attaching includes the open, the session's lock, the mapping, the header's checksum and the cell object
 with its coordinates and one more column; what it is compared with: ``posix_ipc`` and ``mmap`` bare.
 
-    python tests/benchmarks/attach.py [--cells 500] [--rounds 20] [--points 20000]
+    python -m tests.benchmarks.attach [--cells 500] [--rounds 20] [--points 20000]
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def time_bare(segments: list[tuple[str, Handle]]) -> list[int]:
 
 
 def main() -> None:
-    """Measure and print one JSON object."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--cells", type=int, default=500)
     parser.add_argument("--rounds", type=int, default=20)
@@ -108,20 +108,16 @@ def main() -> None:
         json.loads(subprocess.run([sys.executable, "-c", _IMPORTS], capture_output=True, check=True).stdout)
         for _ in range(9)
     ]
-    json.dump(
-        {
-            "attach_and_wrap_us": {
-                "median": statistics.median(cells) / 1e3,
-                "p99": float(np.percentile(cells, 99)) / 1e3,
-            },
-            "posix_ipc_and_mmap_us": {"median": statistics.median(bare) / 1e3},
-            "import_cpu_ratio": statistics.median(whole / bare_s for bare_s, whole, _ in imports),
-            "import_rss_mb": max(rss for _, _, rss in imports) / 1024,
-        },
-        sys.stdout,
-        indent=2,
+    ours_us, bare_us = statistics.median(cells) / 1e3, statistics.median(bare) / 1e3
+    print(
+        f"attach a cell: median {ours_us:.1f} us, p99 {np.percentile(cells, 99) / 1e3:.1f} us;"
+        f" posix_ipc and mmap alone: median {bare_us:.1f} us; ratio {ours_us / bare_us:.2f}"
     )
-    print()
+    ratio = statistics.median(whole / packages for packages, whole, _ in imports)
+    print(
+        f"import the client: {ratio:.2f} times the CPU time of its four packages;"
+        f" {max(rss for _, _, rss in imports) / 1024:.0f} MiB resident"
+    )
 
 
 if __name__ == "__main__":
