@@ -68,7 +68,7 @@ def summary(took: list[int]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print one JSON object."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--cells", type=int, default=256, help="cells replaced by one jump, at least")
@@ -105,8 +105,8 @@ def main() -> None:
     p99_still = summary(still)["p99"]
     for name, times in (("still", still), ("swap", swap), ("busy", busy)):
         told = summary(times)
-        numbers = "".join(f"  {key} {value:9.1f} us" for key, value in told.items())
-        print(f"{name:6}{numbers}   p99 is {told['p99'] / p99_still:.2f} x still")
+        numbers = "".join(f"  {key} {value:8.1f} us" for key, value in told.items() if key != "turns")
+        print(f"{name:5}{len(times):7} turns{numbers}   p99 is {told['p99'] / p99_still:.2f} x still")
 
 
 if __name__ == "__main__":

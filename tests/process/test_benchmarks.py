@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every benchmark is on the page, every one on the page starts, and a stranger can run those that need data."""
+"""Every benchmark is on the page, every one on the page starts, and anyone can run those that need data."""
 
 from __future__ import annotations
 
