@@ -37,7 +37,7 @@ SLIM_BYTES = 360 << 20
 
 
 def interpreter(name: str) -> Path | None:
-    """Return a Python such as ``python3.10``, from the path or pyenv's directory; None where there is none."""
+    """Return a Python such as ``python3.10``, from the path or of pyenv; None where there is none."""
     on_path = [Path(one) for one in [shutil.which(name)] if one]
     versions = Path.home() / ".pyenv" / "versions"
     for candidate in [*on_path, *sorted(versions.glob(f"{name.removeprefix('python')}.*/bin/python3"))]:
