@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The README is true: its commands and programs run as they stand, and it is short.
 
-The lines that make a virtual environment are run by ``.ci/run``, exactly as they stand, and by
+LAYERS.md's program runs beside the README's daemon, too.  The lines that make a virtual environment are run by ``.ci/run``, exactly as they stand, and by
 ``test_first_steps.py`` from a clone.
 """
 
@@ -88,3 +88,12 @@ def test_following_a_vehicle(user: Terminal) -> None:
     assert numbers is not None
     assert int(numbers[1]) > 50
     assert int(numbers[2]) > 10_000
+
+
+def test_a_layer(user: Terminal) -> None:
+    told = user.python(read_page("shmmap/layers/LAYERS.md").blocks["layers"]).splitlines()
+    assert len(told) >= 4
+    for line in told:
+        found = re.fullmatch(r"\((\d+), 3\) \((\d+), 6\) Lattice\(leaf=\(2.0, 2.0, 2.0\), .*\)", line)
+        assert found is not None, line
+        assert found[1] == found[2]
