@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """First steps of a newcomer, by the pages' own text: each in under ten commands.
 
-On Python 3.10 and 3.13, and in the install without Open3D, they begin with nothing but a clone; that installs
-everything anew, so it is done where ``SHMMAP_TEST_FROM_NOTHING`` is set, as ``.ci/run`` does.  In any
-case they are taken in the environment that runs the tests, where the commands that install do nothing.
+Where ``SHMMAP_TEST_FROM_NOTHING`` is set, as in ``.ci/run``, they begin with nothing but a clone: on Python
+3.10 and 3.13, and with the install without Open3D.  That installs everything anew; elsewhere the steps are
+taken in the environment that runs the tests, where the commands that install do nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,11 @@ INSTALL = read_page("shmmap/INSTALL.md")
 CLONE = README.commands("clone")
 (FULL,) = (line for line in README.text.splitlines() if line.endswith(" && shmmap demo"))
 (SLIM,) = INSTALL.commands("slim")
-FROM_NOTHING = ("python3.10", "python3.13", "without-open3d")
+WHERE = (
+    ["python3.10", "python3.13", "without-open3d"]
+    if os.environ.get("SHMMAP_TEST_FROM_NOTHING")
+    else ["installed"]
+)
 SLIM_BYTES = 360 << 20
 
 
@@ -107,7 +111,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return repository
 
 
-@pytest.fixture(scope="module", params=("installed", *FROM_NOTHING))
+@pytest.fixture(scope="module", params=WHERE)
 def newcomer(
     request: pytest.FixtureRequest, published: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Newcomer]:
@@ -117,12 +121,10 @@ def newcomer(
     programs.mkdir()
     script(programs / "sudo", 'exec "$@"')
     if request.param == "installed":
-        reader = Reader(home, [programs], {"PYTHONPATH": str(ROOT)})
+        reader = Reader(home, [programs], {"PYTHONPATH": f"{ROOT}:{ROOT / 'clients'}"})
         _pretend_installed(home, programs)
         service, install = home / "opt", None
     else:
-        if not os.environ.get("SHMMAP_TEST_FROM_NOTHING"):
-            pytest.skip("SHMMAP_TEST_FROM_NOTHING is not set")
         slim = request.param == "without-open3d"
         python = Path(sys.executable) if slim else interpreter(request.param)
         if python is None:
@@ -165,14 +167,14 @@ def under_ten(newcomer: Newcomer, *blocks: list[str]) -> None:
     assert len(newcomer.typed) + sum(map(len, blocks)) < 10
 
 
-@pytest.mark.parametrize("newcomer", ["python3.10", "python3.13"], indirect=True)
+@pytest.mark.parametrize("newcomer", [one for one in WHERE if one.startswith("python")], indirect=True)
 def test_from_the_clone_to_the_demonstration(newcomer: Newcomer) -> None:
     under_ten(newcomer)
     assert "ONE SHARED COPY" in newcomer.told
     assert (newcomer.clone / "shmmap-demo.svg").is_file()
 
 
-@pytest.mark.parametrize("newcomer", ["without-open3d"], indirect=True)
+@pytest.mark.parametrize("newcomer", [one for one in WHERE if one == "without-open3d"], indirect=True)
 def test_the_install_without_open3d_is_small_and_says_what_it_cannot_read(newcomer: Newcomer) -> None:
     files = [path for path in newcomer.service.rglob("*") if path.is_file() and not path.is_symlink()]
     assert sum(path.stat().st_blocks * 512 for path in files) < SLIM_BYTES
@@ -245,7 +247,7 @@ def test_from_nothing_to_the_first_localized_scan(newcomer: Newcomer) -> None:
     assert np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.1, followed
 
 
-@pytest.mark.parametrize("newcomer", ["installed", "python3.10", "python3.13"], indirect=True)
+@pytest.mark.parametrize("newcomer", [one for one in WHERE if one != "without-open3d"], indirect=True)
 def test_the_service_is_installed_below_a_root_directory(newcomer: Newcomer) -> None:
     page = read_page("systemd/README.md")
     commands = page.commands("environment") + page.commands("image")
