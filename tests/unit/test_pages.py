@@ -99,3 +99,11 @@ def test_lines_and_tables_are_whole(name: str) -> None:
         if cells and head:
             assert cells == head, line
         head = cells
+
+
+def test_nothing_says_that_the_package_is_on_an_index() -> None:
+    """It is installed from its source: `pip install shmmap` would find nothing, or somebody else's package."""
+    sources = [path for folder in ("shmmap", "clients") for path in (ROOT / folder).rglob("*.py")]
+    for path in [*(ROOT / name for name in PAGES), *sources]:
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"pip3? install[^\n&|]*['\" ]shmmap(\[|['\"`\s])", text), path
