@@ -28,6 +28,8 @@ def test_two_lines_do_everything() -> None:
     demo, tests = (line for line in README.text.splitlines() if line.startswith("python3 -m venv "))
     assert demo.endswith(" && shmmap demo")
     assert tests.endswith(" && pytest -q")
+    (everything,) = read_page("shmmap/INSTALL.md").commands("everything")
+    assert demo == f"{everything} && shmmap demo"
 
 
 def test_every_block_is_tested() -> None:
