@@ -102,7 +102,7 @@ def test_lines_and_tables_are_whole(name: str) -> None:
 
 
 def test_nothing_says_that_the_package_is_on_an_index() -> None:
-    """It is installed from its source: `pip install shmmap` would find nothing, or somebody else's package."""
+    """It is installed from its source: `pip install shmmap` would find nothing or another package."""
     sources = [path for folder in ("shmmap", "clients") for path in (ROOT / folder).rglob("*.py")]
     for path in [*(ROOT / name for name in PAGES), *sources]:
         text = path.read_text(encoding="utf-8")
