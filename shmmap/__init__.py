@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     from shmmap.layers.spec import canonical_layer
     from shmmap.protocol.messages import HeldCell, Holder, Intent
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Area",

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compare-map filter against KD-trees over the same window, and over a drive with labelled objects.
 
-A vehicle drives through a generated town with moving cars and people, or, with ``--real``, through a real
-map with its own scans.  A scan of 100 000 points is compared with the window around it, on one thread, by
+A vehicle drives through a generated town with moving cars and people, or, with ``--street``, along the
+street in SHMMAP_TEST_DATA.  A scan of 100 000 points is compared with the window around it, on one thread, by
 shmmap (``search`` layers out of shared memory) and by what a process does that keeps its own copy: a
 KD-tree (scipy's and Open3D's) over the window's points, built anew at each map update.  The voxel rule's
 peer is a tree over the same centroids, by the largest difference along an axis.  All give the same
 answer, which is checked.  Times are CPU times of the process, medians; "a scan with its update" is the
 scan after the window has changed, and "per scan" has one update in ten scans (10 m at 10 m/s and 10 Hz).
 
-    python -m tests.benchmarks.compare_map [--updates 5] [--points 100000] [--real DIRECTORY] [--json]
+    python -m tests.benchmarks.compare_map [--updates 5] [--points 100000] [--street] [--json]
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from shmmap.origin.map_writer import MapWriter
 from shmmap.simulation.lidar import Lidar
 from shmmap.simulation.town import Town
 from shmmap.simulation.town_traffic import Traffic
+from tests.benchmarks.street_data import street
 from tests.support.daemon_process import DaemonProcess
 
 __all__ = ["main"]
@@ -65,16 +66,17 @@ def town_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
     return directory / "town", scans()
 
 
-def real_drive(directory: Path, data: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
-    """Divide the real map; return it and its held-out scans."""
-    cloud = shmmap.read_cloud(data / "kitti0005_map" / "map_static_v005.pcd").xyz
+def street_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
+    """Divide the street's map; return it and the drive's scans."""
+    way = street()
+    cloud = shmmap.read_cloud(way.map_file).xyz
     with MapWriter(directory / "map", durable=False) as writer:
         writer.add({"xyz": cloud}, complete=True)
         writer.finish()
-    trajectory = read_trajectory(data / "kitti0005_scans" / "poses_heldout_tum.txt")
+    trajectory = read_trajectory(way.scan_poses_file)
 
     def scans() -> Iterator[Scene]:
-        for n, scan in enumerate(ScanSequence(data / "kitti0005_scans", trajectory)):
+        for n, scan in enumerate(ScanSequence(way.scan_folder, trajectory)):
             if n < updates and scan.T_map_sensor is not None:
                 yield scan.xyz, scan.T_map_sensor, None
 
@@ -191,13 +193,13 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=5)
     parser.add_argument("--points", type=int, default=100_000)
     parser.add_argument("--radius", type=float, default=150.0)
-    parser.add_argument("--real", metavar="DIRECTORY", help="of kitti0005_map and kitti0005_scans")
+    parser.add_argument("--street", action="store_true", help="drive along the street in SHMMAP_TEST_DATA")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
-        if args.real:
-            path, scans = real_drive(directory, Path(args.real), args.updates)
+        if args.street:
+            path, scans = street_drive(directory, args.updates)
         else:
             path, scans = town_drive(directory, args.updates)
         drive = list(scans)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`shmmap divide` of a large generated cloud against ``cp`` and ``fsync`` of the same bytes.
 
-``python -m tests.benchmarks.divide_large [--points 2e8] [--max-memory 1G] [--fields xyzi|xyzircaedt]
-[--random] [--repeat 3] [--dir DIR]``
+    python -m tests.benchmarks.divide_large [--points 2e8] [--max-memory 1G] [--fields xyzi|xyzircaedt]
+        [--random] [--repeat 3] [--dir DIR]
 
 The cloud is what a mapping drive gives: points around a vehicle on its way, in the order of time;
 ``--random`` shuffles all order out of it, the worst case.  Both programs run in turn, each on the same

@@ -6,7 +6,7 @@ plus 100 MB above what the process has when it starts), so that an allocation th
 justify is a `MemoryError`, hence a finding; so is any other exception, a crash, or a success whose
 counts or digest are wrong.  The input of a finding is kept and its path printed.
 
-    python tests/benchmarks/fuzz_pcd.py --seconds 60
+    python -m tests.benchmarks.fuzz_pcd [--seconds 60] [--seed N]
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ from pathlib import Path
 
 import numpy as np
 import xxhash
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from shmmap.errors import MapDataError
 from shmmap.formats import lzf
@@ -208,7 +206,8 @@ def main() -> int:
     deadline = time.monotonic() + options.seconds
     while (left := deadline - time.monotonic()) > 0:
         folder = Path(tempfile.mkdtemp(prefix="fuzz_pcd."))
-        command = [sys.executable, "-X", "faulthandler", "-W", "error", __file__, "--child", str(folder)]
+        command = [sys.executable, "-X", "faulthandler", "-W", "error", "-m", "tests.benchmarks.fuzz_pcd"]
+        command += ["--child", str(folder)]
         command += ["--seed", str(seed), "--seconds", f"{min(left, 30):.3f}"]
         done = subprocess.run(command, check=False, env=os.environ)
         if done.returncode:

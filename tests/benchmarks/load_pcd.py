@@ -5,9 +5,9 @@ Ours is everything a load is: the header's checks, column split, finite check, b
 file, checksum of every column, and a finished segment in shared memory; the peers only fill their own
 memory.  Rounds are interleaved, and ratios are medians over rounds of the times within one round.
 
-    SHMMAP_TEST_DATA=... python tests/benchmarks/load_pcd.py --repeats 9
+    python -m tests.benchmarks.load_pcd [--repeats 9]
 
-Without SHMMAP_TEST_DATA a cloud of the same kind is generated.
+Where SHMMAP_TEST_DATA names a street, its map is loaded; else a cloud of the same kind is generated.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ import lzf
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from shmmap.formats.cloud import read_pcd
 from shmmap.formats.pcd_writer import write_pcd
 from shmmap.layers.points import build_points
+from tests.benchmarks.street_data import street
 
 SHM = "/dev/shm"
 CELL_M = 20.0
@@ -39,10 +38,10 @@ ENCODINGS = ("binary", "binary_compressed")
 Round = Callable[[list[str]], float]
 
 
-def cloud(data: str) -> dict[str, NDArray[Any]]:
-    """The real map, or a rough ground with walls of the same size and point order."""
-    if data:
-        return read_pcd(Path(data) / "kitti0005_map" / "map_static_v005.pcd").columns
+def cloud() -> dict[str, NDArray[Any]]:
+    """The street's map, or a rough ground of the recorded map's size and point order."""
+    if os.environ.get("SHMMAP_TEST_DATA"):
+        return read_pcd(street().map_file).columns
     rng = np.random.default_rng(5)
     xy = rng.uniform(-80, 80, (3_000_000, 2))
     xy = np.round(xy[np.lexsort((xy[:, 1], np.floor(xy[:, 0])))], 2)
@@ -202,14 +201,11 @@ def peers(folder: Path) -> tuple[dict[str, Round], Pcl | None]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--repeats", type=int, default=7, help="interleaved rounds (default 7)")
-    parser.add_argument(
-        "--data", default=os.environ.get("SHMMAP_TEST_DATA", ""), help="directory of test data"
-    )
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="load_pcd."))
     pcl = None
     try:
-        paths = cut(cloud(options.data), folder)
+        paths = cut(cloud(), folder)
         others, pcl = peers(folder)
         for encoding in ENCODINGS:
             rounds: dict[str, Round] = {"shmmap": kept(ours)}

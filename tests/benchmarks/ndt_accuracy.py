@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How close alignments come: real scans, simulated ones, the generated city, large coordinates.
+"""How close alignments come: scans of a drive, the generated city, large coordinates.
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.ndt_accuracy [--seeds 50] [--threads 1]
         [--disturbance direction|planar|within|gaussian|all]
@@ -29,14 +29,15 @@ from __future__ import annotations
 import argparse
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose, voxel_cell
 from shmmap_clients.scans.scan_file import read_scan
+from shmmap_clients.scans.trajectory import read_trajectory
 
-from tests.benchmarks.ndt_clouds import data_dir, real_pair, sampled, synthetic
+from tests.benchmarks.ndt_clouds import city, scan_pair
+from tests.benchmarks.street_data import data_dir, sampled, street
 
 MODES = {
     "autoware": Settings(),
@@ -44,18 +45,6 @@ MODES = {
     "fine": Settings(mode="coarse_fine"),
 }
 Matrix = NDArray[np.float64]
-
-
-def tum_poses(path: Path) -> Matrix:
-    """Poses of a TUM file, (N, 4, 4)."""
-    rows = np.loadtxt(path)
-    x, y, z, w = rows[:, 4:8].T
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1)
-    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1)
-    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1)
-    poses[:, :3, 3] = rows[:, 1:4]
-    return poses
 
 
 def errors(T: Matrix, truth: Matrix) -> tuple[float, float]:
@@ -141,7 +130,7 @@ def drive(
 def large_coordinates(seeds: int) -> None:
     """Move pair and city to where Autoware's maps lie, in float64, and compare poses."""
     shift = np.array([89570.0, 42300.0, 0.0])
-    for pair in (real_pair(), synthetic()):
+    for pair in (scan_pair(), city()):
         for mode, settings in MODES.items():
             worst = 0.0
             with NdtMatcher(settings) as matcher:
@@ -171,28 +160,27 @@ def main() -> None:
     args = parser.parse_args()
     names = tuple(DISTURBANCES) if args.disturbance == "all" else (args.disturbance,)
     starts = Starts(names, args.seeds, args.threads)
-    folder = data_dir()
-    print(f"load {os.getloadavg()[0]:.2f}; {args.seeds} seeds")
-    street = VoxelMap({"map": voxel_cell(read_scan(folder / "kitti0005_map" / "map_static_v010.pcd"), 2.0)})
-
-    real = sorted((folder / "kitti0005_scans").glob("scan_*.npz"))
-    truth = tum_poses(folder / "kitti0005_scans" / "poses_heldout_tum.txt")
-    raw = [read_scan(path) for path in real]
+    way = street()
+    source = "recorded" if way.recorded else "simulated"
+    print(f"load {os.getloadavg()[0]:.2f}; {args.seeds} seeds; {source} scans")
+    drive_map = VoxelMap({"map": voxel_cell(read_scan(way.thinned_map_file), 2.0)})
+    raw = [read_scan(path) for path in way.scans]
     dense = [sampled(scan, 0.5, 6000) for scan in raw]
-    drive("real scans, 0.5 m, 6000 points", street, dense, truth, starts)
+    drive(f"{source} scans, 0.5 m, 6000 points", drive_map, dense, way.T_map_scans, starts)
     sparse = [sampled(scan, 3.0, 1500) for scan in raw]
-    drive("real scans, 3 m, 1500 points", street, sparse, truth, starts)
+    drive(f"{source} scans, 3 m, 1500 points", drive_map, sparse, way.T_map_scans, starts)
 
-    made = sorted((folder / "kitti0005_sim_scans").glob("scan_*.npz"))
-    exact = tum_poses(folder / "kitti0005_sim_scans" / "poses_tum.txt")
-    simulated = [sampled(read_scan(path), 0.5, 6000) for path in made]
-    fewer = replace(starts, seeds=max(1, args.seeds // 10))
-    drive("simulated scans, 0.5 m, 6000 points", street, simulated, exact, fewer)
+    exact = data_dir() / "kitti0005_sim_scans"
+    if exact.is_dir():
+        made = [sampled(read_scan(path), 0.5, 6000) for path in sorted(exact.glob("scan_*.npz"))]
+        truth = read_trajectory(exact / "poses_tum.txt").T_map_sensor
+        fewer = replace(starts, seeds=max(1, args.seeds // 10))
+        drive("simulated scans on the recorded map, 0.5 m, 6000 points", drive_map, made, truth, fewer)
 
-    city = synthetic()
-    city_truth = matrix_from_pose(np.array([10.4, 5.2, 1.8, 0.0, 0.0, 0.3]))[None]
-    city_map = VoxelMap({"map": voxel_cell(city.target, 2.0)})
-    drive("generated city, 1500 points", city_map, [city.source], city_truth, starts)
+    one = city()
+    assert one.T_truth is not None
+    city_map = VoxelMap({"map": voxel_cell(one.target, one.leaf)})
+    drive("generated city, 1500 points", city_map, [one.source], one.T_truth[None], starts)
     large_coordinates(min(args.seeds, 10))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From how far away alignments arrive, on the real pair and in the generated city.
+"""From how far away alignments arrive: a pair of scans, and a scan in the generated city.
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.ndt_basin [--starts 100]
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose, voxel_cell
 
 from tests.benchmarks.ndt_accuracy import errors
-from tests.benchmarks.ndt_clouds import data_dir, real_pair, synthetic
+from tests.benchmarks.ndt_clouds import city, scan_pair
 
 STARTS = ((0.5, 3.0), (1.0, 3.0), (1.5, 3.0), (2.0, 3.0), (1.0, 6.0))
 
@@ -39,13 +39,12 @@ def main() -> None:
     )
     parser.add_argument("--starts", type=int, default=100)
     args = parser.parse_args()
-    data_dir()
-    pair, city = real_pair(), synthetic()
+    pair, town = scan_pair(), city()
     thinned = pair.source[np.random.default_rng(0).choice(len(pair.source), 2000, replace=False)]
     cases = (
         ("pair, leaf 1.0", pair.target, thinned, 1.0, pair.T_guess),
         ("pair, leaf 2.0", pair.target, thinned, 2.0, pair.T_guess),
-        ("city, leaf 2.0", city.target, city.source, 2.0, city.T_guess),
+        ("city, leaf 2.0", town.target, town.source, 2.0, town.T_guess),
     )
     print(
         f"load {os.getloadavg()[0]:.2f}; {args.starts} starts each; per cent that arrive (median iterations)"

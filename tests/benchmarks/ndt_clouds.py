@@ -1,70 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds that the NDT benchmarks share; ``SHMMAP_TEST_DATA`` names where they lie."""
+"""Clouds to align that the NDT benchmarks share: recorded ones in ``SHMMAP_TEST_DATA``, else generated."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import matrix_from_pose
 
 from shmmap import read_cloud
+from tests.benchmarks.street_data import data_dir, sampled, street
 
 Points = NDArray[np.floating]
+Matrix = NDArray[np.float64]
+
+_CITY_EDGE_M = 0.2  # of the generated city's voxels: about as many points as PCL's example of a city has
+_CITY_GUESS = (-0.4, -0.2, -0.2, 0.0, 0.0, -0.01)  # off the truth, as in the recorded reference alignments
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
-    """A map, a scan, a guess: as in the reference alignments."""
+    """A map, a scan, and where its alignment starts.
+
+    Attributes
+    ----------
+    target, source
+        (N, 3) points of the map, map frame, and of the scan, sensor frame, metres.
+    leaf
+        Edge of a voxel, metres.
+    T_guess
+        (4, 4) pose to start from.
+    T_truth
+        (4, 4) pose of the scan; None where nobody knows it.
+    """
 
     name: str
     target: Points
     source: Points
     leaf: float
-    guess: tuple[float, float, float, float]  # x, y, z, yaw
-
-    @property
-    def T_guess(self) -> NDArray[np.float64]:
-        """The guess as a matrix."""
-        x, y, z, yaw = self.guess
-        return matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw]))
+    T_guess: Matrix
+    T_truth: Matrix | None = None
 
 
-def data_dir() -> Path:
-    """Where the data lies."""
-    path = os.environ.get("SHMMAP_TEST_DATA", "")
-    if not path:
-        raise SystemExit("SHMMAP_TEST_DATA must name the directory of maps and scans")
-    return Path(path)
-
-
-def real_pair() -> Pair:
-    """Two real scans, sampled at 0.1 m, of koide3's benchmark."""
+def scan_pair() -> Pair:
+    """Two scans taken near one another, one point per 0.1 m, to align at the identity."""
     folder = data_dir() / "ndt"
-    with np.load(folder / "target_ds0.1_points.npz") as a, np.load(folder / "source_ds0.1_points.npz") as b:
-        return Pair("pair", a["xyz"], b["xyz"], 1.0, (0.0, 0.0, 0.0, 0.0))
+    if folder.is_dir():
+        files = (folder / "target_ds0.1_points.npz", folder / "source_ds0.1_points.npz")
+    else:
+        files = (data_dir() / "pair" / "target.npz", data_dir() / "pair" / "source.npz")
+    with np.load(files[0]) as target, np.load(files[1]) as source:
+        return Pair("pair", target["xyz"], source["xyz"], 1.0, np.eye(4))
 
 
-def synthetic() -> Pair:
-    """A generated city and a scan of 1500 points; the truth is (10.4, 5.2, 1.8), yaw 0.3."""
+def city() -> Pair:
+    """A generated city and a scan of 1500 points, whose pose is known."""
     folder = data_dir() / "ndt"
-    city = read_cloud(folder / "synthetic_map.pcd").xyz
-    return Pair(
-        "synthetic", city, read_cloud(folder / "synthetic_scan1500.pcd").xyz, 2.0, (10.0, 5.0, 1.6, 0.29)
-    )
-
-
-def sampled(points: Points, edge: float, most: int | None = None, seed: int = 0) -> Points:
-    """Mean of each voxel of ``edge`` metres, and of those a random ``most``."""
-    index = np.floor(points / edge).astype(np.int64)
-    index -= index.min(axis=0)
-    key = np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0) + 1))
-    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = [np.bincount(group, points[:, axis].astype(np.float64)) for axis in range(3)]
-    means = (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
-    if most is None or len(means) <= most:
-        return means
-    return np.asarray(means[np.random.default_rng(seed).choice(len(means), most, replace=False)], np.float32)
+    if folder.is_dir():
+        target = read_cloud(folder / "synthetic_map.pcd").xyz
+        source = read_cloud(folder / "synthetic_scan1500.pcd").xyz
+        T_truth = matrix_from_pose(np.array([10.4, 5.2, 1.8, 0.0, 0.0, 0.3]))
+        T_guess = matrix_from_pose(np.array([10.0, 5.0, 1.6, 0.0, 0.0, 0.29]))
+        return Pair("city", target, source, 2.0, T_guess, T_truth)
+    drive = street()
+    middle = len(drive.scans) // 2
+    source = sampled(drive.scan(middle), 1.0, 1500)
+    T_truth = drive.T_map_scans[middle]
+    off = matrix_from_pose(np.array(_CITY_GUESS))
+    T_guess = T_truth @ off
+    return Pair("city", sampled(read_cloud(drive.map_file).xyz, _CITY_EDGE_M), source, 2.0, T_guess, T_truth)

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A long drive over the tiled real map beside a daemon that loads it: does any scan wait, does memory grow?
+"""A long drive over copies of a street beside a daemon that loads it: does any scan wait, does memory grow?
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.ndt_drive [--frames 2000] [--rate 10] [--copies 10]
 
-The street of the real map is laid out ten times ten; the drive goes along a row, tile after tile, on the
-recorded poses (and straight on from where they end to where the next tile begins).  Every eighth recorded
-pose has its real scan, all others a sample of the map around them with noise.  Bars: at least 50 map updates
-with cells added and removed, no scan waits for one, p99 of the latency at most 3 times its median,
-no growth of memory.
+The street is laid out ten times ten; the drive goes along a row, copy after copy, on the poses of its drive
+(and straight on from where they end to where the next copy begins).  Every eighth pose has its scan, all
+others a sample of the map around them with noise.  Bars: at least 50 map updates with cells added and
+removed, no scan waits for one, p99 of the latency at most 3 times its median, no growth of memory.
 """
 
 from __future__ import annotations
@@ -29,15 +28,14 @@ from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import Odometry
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.scan_sequence import Scan
-from shmmap_clients.scans.trajectory import Trajectory, read_trajectory
+from shmmap_clients.scans.trajectory import Trajectory
 
 from shmmap import read_cloud
 from shmmap.demo.process_memory import process_memory
 from shmmap.testing.daemon_process import DaemonProcess
-from tests.benchmarks.ndt_clouds import data_dir, sampled
+from tests.benchmarks.street_data import TILE_M, Street, sampled, street
 from tests.benchmarks.tile_map import tile_map
 
-PITCH_M = 220.0
 STEP_M = 0.9  # between the poses that lead to the next tile
 REACH_M = 60.0
 POINTS = 6000
@@ -45,24 +43,24 @@ POINTS = 6000
 Matrix = NDArray[np.float64]
 
 
-def one_tile(folder: Path) -> tuple[list[NDArray[np.float32]], Matrix]:
+def one_tile(way: Street) -> tuple[list[NDArray[np.float32]], Matrix]:
     """Scans and poses from a tile's first pose to just before the next tile's first."""
-    recorded = read_trajectory(folder / "kitti0005_scans" / "poses_all_tum.txt").T_map_sensor
-    end, start = recorded[-1], recorded[0].copy()
-    start[0, 3] += PITCH_M
+    driven = way.T_map_frames
+    end, start = driven[-1], driven[0].copy()
+    start[0, 3] += TILE_M
     gap = start[:3, 3] - end[:3, 3]
     steps = max(1, int(np.linalg.norm(gap) / STEP_M))
     between = np.tile(start, (steps - 1, 1, 1))
     between[:, :3, 3] = end[:3, 3] + gap * (np.arange(1, steps) / steps)[:, None]
-    # the heading turns over with the way: no jump where the recorded poses end
-    poses = np.concatenate([recorded, between])
-    street = read_cloud(folder / "kitti0005_map" / "map_static_v010.pcd").xyz
-    cloud = np.concatenate([street, street + np.array([PITCH_M, 0, 0], np.float32)])
+    # the heading turns over with the way: no jump where the driven poses end
+    poses = np.concatenate([driven, between])
+    tile = read_cloud(way.thinned_map_file).xyz
+    cloud = np.concatenate([tile, tile + np.array([TILE_M, 0, 0], np.float32)])
+    taken = dict(zip(way.scan_frames, way.scans, strict=True))
     scans = []
     for number, T in enumerate(poses):
-        real = folder / "kitti0005_scans" / f"scan_{number:04}.npz"
-        if number < len(recorded) and real.exists():
-            scans.append(np.asarray(sampled(read_scan(real), 0.5, POINTS), np.float32))
+        if number in taken:
+            scans.append(sampled(read_scan(taken[number]), 0.5, POINTS))
             continue
         rng = np.random.default_rng(number)
         near = cloud[((cloud - T[:3, 3]) ** 2).sum(axis=1) < REACH_M**2]
@@ -82,27 +80,26 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=10)
     parser.add_argument("--fine", action="store_true")
     args = parser.parse_args()
-    folder = data_dir()
-    scans, poses = one_tile(folder)
+    way = street()
+    scans, poses = one_tile(way)
     frames = min(args.frames, len(poses) * (args.copies - 1))
     warmup_alignment()
     settings = Settings(mode="coarse_fine") if args.fine else Settings(steady=True)
 
     def truth(number: int) -> Matrix:
         T = np.array(poses[number % len(poses)], np.float64)
-        T[0, 3] += PITCH_M * (number // len(poses))
+        T[0, 3] += TILE_M * (number // len(poses))
         return T
 
     # odometry with one per cent of scale error: what a wheel encoder gives
-    way = Trajectory(np.arange(frames) / args.rate, np.array([truth(number) for number in range(frames)]))
-    drift = way.T_map_sensor.copy()
+    line = Trajectory(np.arange(frames) / args.rate, np.array([truth(number) for number in range(frames)]))
+    drift = line.T_map_sensor.copy()
     drift[:, :3, 3] *= 1.01
-    odometry = Trajectory(way.stamps_s, drift)
+    odometry = Trajectory(line.stamps_s, drift)
     statistics = DriveStatistics()
     memory: list[int] = []
     with tempfile.TemporaryDirectory() as scratch:
-        street = folder / "kitti0005_map" / "map_static_v010.pcd"
-        made = tile_map(street, Path(scratch) / "map", copies=args.copies, pitch=PITCH_M)
+        made = tile_map(way.thinned_map_file, Path(scratch) / "map", copies=args.copies, pitch=TILE_M)
         print(f"load {os.getloadavg()[0]:.2f}; {made.cells} cells; {frames} scans at {args.rate} Hz")
         with (
             DaemonProcess(made.path) as daemon,

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, pose_from_matrix, voxel_cell
 
-from tests.benchmarks.ndt_clouds import Pair, data_dir, real_pair, synthetic
+from tests.benchmarks.ndt_clouds import Pair, city, scan_pair
 from tests.support.pcl_ndt import PclNdt, build_pcl_ndt
 
 
@@ -79,8 +79,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=20)
     args = parser.parse_args()
-    data_dir()
-    pair, city = real_pair(), synthetic()
+    pair, town = scan_pair(), city()
     print(f"load {os.getloadavg()[0]:.2f}, {os.cpu_count()} processors")
     for search in ("direct7", "direct1", "radius"):
         settings = Settings("pclomp", search, epsilon=0.1)
@@ -88,7 +87,7 @@ def main() -> None:
     two = align_ms(pair, Settings("pclomp", "direct7", epsilon=0.1), args.repeats, threads=2)
     print(f"pair, direct7  2 threads {two}")
     for backend, threads in (("numba", 1), ("numba", 2), ("numpy", 1)):
-        took = align_ms(city, Settings(), args.repeats, backend=backend, threads=threads)
+        took = align_ms(town, Settings(), args.repeats, backend=backend, threads=threads)
         print(f"working point, {backend}, {threads} thread(s) {took}")
     print(f"first alignment of a fresh process, kernels cached: {first_alignment_s():.2f} s")
     with tempfile.TemporaryDirectory() as folder:
@@ -96,7 +95,7 @@ def main() -> None:
         if program is None:
             print("PCL: not measured, g++ or libpcl-dev is missing")
             return
-        for cloud in (pair, city):
+        for cloud in (pair, town):
             ours, score = evaluation_ms(cloud, args.repeats)
             with PclNdt(program, cloud.target, cloud.source, cloud.leaf) as pcl:
                 theirs = pcl.evaluate(pose_from_matrix(cloud.T_guess), args.repeats)

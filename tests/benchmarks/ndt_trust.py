@@ -24,7 +24,7 @@ from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.thinning import thinned
 from shmmap_clients.scans.trajectory import read_trajectory
 
-from tests.benchmarks.ndt_clouds import data_dir
+from tests.benchmarks.street_data import data_dir
 
 AWAY_M = (0.3, 1.0, 2.0, 4.0, 8.0, 16.0)
 

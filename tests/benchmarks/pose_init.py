@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial poses on the real map: how many are found, how long each takes, and which files that opens.
+"""Initial poses in a large map: how many are found, how long each takes, and which files that opens.
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.pose_init [--poses 50] [--copies 4]
 
-The map is tiled to about 250 MB, the size with which Autoware took 6 to 7 s for every initialization (it
-reads cells anew each time).  Rough poses: true ones of held-out scans, disturbed by 2 m and 10 degrees
-(one standard deviation).  Bars: at least 95% within 0.3 m and 1 degree; the second and later ones at the
-same place under 0.5 s, no file opened and no cell loaded.
+The street's map is laid out several times, to about 250 MB, the size with which Autoware took 6 to 7 s for
+every initialization (it reads cells anew each time).  Rough poses: true ones of scans, disturbed by 2 m and
+10 degrees (one standard deviation).  Bars: at least 95% within 0.3 m and 1 degree; the second and later ones
+at the same place under 0.5 s, no file opened and no cell loaded.
 """
 
 from __future__ import annotations
@@ -26,15 +26,11 @@ from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
 from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.thinning import thinned
-from shmmap_clients.scans.trajectory import read_trajectory
 
 from shmmap import connect
 from shmmap.testing.daemon_process import DaemonProcess
-from tests.benchmarks.ndt_clouds import data_dir
+from tests.benchmarks.street_data import SENSOR_HEIGHT_M, TILE_M, street
 from tests.benchmarks.tile_map import tile_map
-
-HEIGHT_M = 1.73  # of KITTI's scanner
-PITCH_M = 220.0
 
 opened: list[str] = []
 
@@ -54,25 +50,23 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=4)
     parser.add_argument("--thin", type=float, default=1.0)
     args = parser.parse_args()
-    folder = data_dir()
-    files = sorted((folder / "kitti0005_scans").glob("scan_*.npz"))
-    truth = read_trajectory(folder / "kitti0005_scans" / "poses_heldout_tum.txt").T_map_sensor
-    scans = [thinned(read_scan(path), args.thin) for path in files]
-    street = folder / "kitti0005_map" / "map_static_v010.pcd"
+    way = street()
+    truth = way.T_map_scans
+    scans = [thinned(read_scan(path), args.thin) for path in way.scans]
     warmup_alignment()
     sys.addaudithook(watch)
     with tempfile.TemporaryDirectory() as scratch:
         made = tile_map(
-            street,
+            way.thinned_map_file,
             Path(scratch) / "map",
             copies=args.copies,
-            pitch=PITCH_M,
+            pitch=TILE_M,
         )
         size = sum(path.stat().st_size for path in Path(scratch).rglob("*.pcd"))
         print(f"load {os.getloadavg()[0]:.2f}; map of {made.cells} cells, {size / 1e6:.0f} MB")
         with (
             DaemonProcess(made.path) as daemon,
-            PoseInitializer(daemon.endpoint, InitializerRules(height=HEIGHT_M)) as initializer,
+            PoseInitializer(daemon.endpoint, InitializerRules(height=SENSOR_HEIGHT_M)) as initializer,
             connect(daemon.endpoint) as session,
         ):
             times, loads = [], []

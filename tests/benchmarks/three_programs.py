@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NDT matcher, compare filter and elevation map as separate processes on one daemon, over a real drive.
+"""NDT matcher, compare filter and elevation map as separate processes on one daemon, over a drive.
 
-The drive's scans are taken tile after tile on the real map tiled side by side, for so many minutes:
+The drive's scans are taken tile after tile on copies of the street side by side, for so many minutes:
 windows move, jump from tile to tile, and cells come and go in a budget that holds a small part of the
 map.  Printed are each program's times and own memory, how much of that grew in the last third, shared
 memory, and what was lost or left.  A machine of two cores shows mostly how they share them.
 
-    python -m tests.benchmarks.three_programs [DATA] [--minutes 4] [--tiles 4] [--budget-mib 300]
-
-DATA holds ``kitti0005_map`` and ``kitti0005_scans``.
+    SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.three_programs [--minutes 4] [--tiles 4]
+        [--budget-mib 300] [--out DIR]
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
+from tests.benchmarks.street_data import TILE_M, street
 from tests.benchmarks.tile_map import tile_map
 from tests.support.daemon_process import DaemonProcess
 
 __all__ = ["main"]
 
-PITCH = 220.0
 SCAN_S = 0.5
 
 
@@ -49,7 +48,7 @@ def moved(T: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
 
 def tile_corners(tiles: int) -> list[tuple[float, float]]:
     """Where each tile's copy lies, row by row and back."""
-    rows = [[(PITCH * c, PITCH * r) for c in range(tiles)] for r in range(tiles)]
+    rows = [[(TILE_M * c, TILE_M * r) for c in range(tiles)] for r in range(tiles)]
     return [corner for r, row in enumerate(rows) for corner in (row[::-1] if r % 2 else row)]
 
 
@@ -58,16 +57,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="default: SHMMAP_TEST_DATA")
     parser.add_argument("--minutes", type=float, default=4.0)
     parser.add_argument("--tiles", type=int, default=4)
     parser.add_argument("--budget-mib", type=int, default=300)
     parser.add_argument("--out", type=Path, help="where ndt.svg and compare.svg go")
     args = parser.parse_args()
-    if args.data is None:
-        args.data = Path(os.environ["SHMMAP_TEST_DATA"])
-    trajectory = read_trajectory(args.data / "kitti0005_scans" / "poses_heldout_tum.txt")
-    sequence = list(ScanSequence(args.data / "kitti0005_scans", trajectory))
+    way = street()
+    sequence = list(ScanSequence(way.scan_folder, read_trajectory(way.scan_poses_file)))
     corners = tile_corners(args.tiles)
     end_s = 0.0
 
@@ -92,10 +88,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         written = tile_map(
-            args.data / "kitti0005_map" / "map_static_v005.pcd",
+            way.map_file,
             directory / "map",
             copies=args.tiles,
-            pitch=PITCH,
+            pitch=TILE_M,
         )
         points = f"{written.points / 1e6:.0f} million points"
         print(f"map: {written.cells} cells, {points}, load {os.getloadavg()[0]:.1f}")

@@ -6,15 +6,13 @@ whole window of cells is replaced.  Compared are the loop's own times while noth
 ("still") and while cells are attached and unmapped ("swap"), in the same run; and, to tell what part the
 interpreter and the machine have in it, while another thread merely computes ("busy").
 
-    python tests/benchmarks/window_swap.py [--seconds 8] [--cells 256] [--points 2000] [--rate 1000]
+    python -m tests.benchmarks.window_swap [--seconds 8] [--cells 256] [--points 2000] [--rate 1000]
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 import tempfile
 import threading
 import time
@@ -70,7 +68,7 @@ def summary(took: list[int]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print one JSON object."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--cells", type=int, default=256, help="cells replaced by one jump, at least")
@@ -103,16 +101,12 @@ def main() -> None:
         finally:
             daemon.stop()
             daemon.dispose()
-    told = {
-        "cells_replaced": swapped,
-        "still_us": summary(still),
-        "swap_us": summary(swap),
-        "busy_us": summary(busy),
-    }
-    told["p99_swap_to_still"] = summary(swap)["p99"] / summary(still)["p99"]
-    told["p99_busy_to_still"] = summary(busy)["p99"] / summary(still)["p99"]
-    json.dump(told, sys.stdout, indent=2)
-    print()
+    print(f"{swapped} cells replaced by a jump; times of one turn of the loop")
+    p99_still = summary(still)["p99"]
+    for name, times in (("still", still), ("swap", swap), ("busy", busy)):
+        told = summary(times)
+        numbers = "".join(f"  {key} {value:8.1f} us" for key, value in told.items() if key != "turns")
+        print(f"{name:5}{len(times):7} turns{numbers}   p99 is {told['p99'] / p99_still:.2f} x still")
 
 
 if __name__ == "__main__":

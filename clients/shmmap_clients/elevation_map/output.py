@@ -44,9 +44,7 @@ def check_output(path: Path, epsg: int | None = None) -> None:
         raise BadRequest(f"{path.name}: elevation is written as {', '.join(_SUFFIXES)}")
     if suffix in _GEOTIFF:
         if importlib.util.find_spec("tifffile") is None:
-            raise BadRequest(
-                "GeoTIFF needs the package tifffile", hint="pip install 'shmmap[geotiff]', or write .npz"
-            )
+            raise BadRequest("GeoTIFF needs the package tifffile", hint="pip install tifffile, or write .npz")
         if epsg is not None and not 1024 <= epsg <= _USER_DEFINED:
             raise BadRequest(f"EPSG codes of GeoTIFF are 1024 to {_USER_DEFINED}, not {epsg}")
 

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The street that benchmarks of localization drive along: its map, scans and poses.
+
+``SHMMAP_TEST_DATA`` names the directory: of recorded data (BENCHMARKS.md says what that is and where it
+comes from), or of generated data, which ``python -m tests.benchmarks.make_data DIRECTORY`` makes.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from shmmap_clients.scans.scan_file import read_scan
+from shmmap_clients.scans.trajectory import read_trajectory
+
+__all__ = ["SENSOR_HEIGHT_M", "TILE_M", "Street", "data_dir", "sampled", "street"]
+
+SENSOR_HEIGHT_M = 1.73  # above the ground, of KITTI's scanner and of the simulated one
+TILE_M = 220.0  # both maps fit into a square of this side; copies of them are laid out at this distance
+
+Points = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class Street:
+    """A drive along a street of about 140 m.
+
+    Attributes
+    ----------
+    recorded
+        Whether it was driven; else it is generated and simulated.
+    map_file, thinned_map_file
+        PCD: the map as dense as it is (5 cm), and with one point per 10 cm.
+    scan_folder, scan_poses_file
+        Scans that are not part of the map, in the order of their names, and a TUM file of their poses.
+    T_map_frames
+        (F, 4, 4) pose of the sensor in every frame of the drive, 10 in a second.
+    scans
+        File of each scan.
+    scan_frames
+        The frame of each scan.
+    """
+
+    recorded: bool
+    map_file: Path
+    thinned_map_file: Path
+    scan_folder: Path
+    scan_poses_file: Path
+    T_map_frames: NDArray[np.float64]
+    scans: tuple[Path, ...]
+    scan_frames: tuple[int, ...]
+
+    @property
+    def T_map_scans(self) -> NDArray[np.float64]:
+        """(N, 4, 4) pose of the sensor at each scan."""
+        return read_trajectory(self.scan_poses_file).T_map_sensor
+
+    def scan(self, number: int) -> Points:
+        """Points of a scan, (N, 3), sensor frame, metres."""
+        return read_scan(self.scans[number])
+
+
+def data_dir() -> Path:
+    """Return the directory of maps and scans; ends the program where none is named."""
+    path = os.environ.get("SHMMAP_TEST_DATA", "")
+    if not path:
+        raise SystemExit(
+            "SHMMAP_TEST_DATA must name a directory of maps and scans\n"
+            "hint: python -m tests.benchmarks.make_data DIRECTORY makes one"
+        )
+    return Path(path)
+
+
+def street() -> Street:
+    """Return the street in the data directory: the recorded one, where it is there."""
+    folder = data_dir()
+    recorded = (folder / "kitti0005_map").is_dir()
+    if recorded:
+        maps = folder / "kitti0005_map"
+        map_file, thinned = maps / "map_static_v005.pcd", maps / "map_static_v010.pcd"
+        scans = folder / "kitti0005_scans"
+        every, held_out = scans / "poses_all_tum.txt", scans / "poses_heldout_tum.txt"
+    else:
+        maps = folder / "street"
+        map_file, thinned = maps / "map.pcd", maps / "map_thinned.pcd"
+        scans = maps / "scans"
+        every, held_out = maps / "frame_poses.txt", maps / "scan_poses.txt"
+    if not map_file.is_file():
+        raise SystemExit(f"{folder} has neither a folder kitti0005_map nor a folder street with a map.pcd")
+    files = tuple(sorted(scans.glob("scan_*.npz")))
+    frames = tuple(int(path.stem.rpartition("_")[2]) for path in files)
+    poses = read_trajectory(every).T_map_sensor
+    return Street(recorded, map_file, thinned, scans, held_out, poses, files, frames)
+
+
+def sampled(points: Points, edge: float, most: int | None = None, seed: int = 0) -> NDArray[np.float32]:
+    """Mean of each voxel of ``edge`` metres, and of those a random ``most``: (N, 3) float32."""
+    index = np.floor(points / edge).astype(np.int64)
+    index -= index.min(axis=0)
+    key = np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0) + 1))
+    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+    sums = [np.bincount(group, points[:, axis].astype(np.float64)) for axis in range(3)]
+    means = (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
+    if most is None or len(means) <= most:
+        return means
+    return np.asarray(means[np.random.default_rng(seed).choice(len(means), most, replace=False)], np.float32)
