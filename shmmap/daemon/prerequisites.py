@@ -51,7 +51,7 @@ def choose_pins(directory: ShmDirectory) -> PinWatch:
     if support.source is not PinSource.LEASES:
         log.warning("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor")
     source = support.source.value
-    log.info("segments in use are known from", source=source, **support._asdict())
+    log.info("segments in use are detected", by=source, **support._asdict())
     return PinWatch(
         directory, support.source, events=support.close_events and support.source is not PinSource.SESSIONS
     )
