@@ -37,7 +37,8 @@ class PointsAround:
         For each of them, whether its box lies wholly in the circle.
     covered : bool
         Whether these are all the cells that the map has there.  False where the circle reaches beyond what
-        the window's last answer was about, or a cell is missing.
+        the window's last answer was about, touches a cell that has failed, or while cells of the window are
+        being loaded: see `MapWindow.covers`.
     """
 
     __slots__ = ("cells", "covered", "radius", "whole", "x", "y")

@@ -250,8 +250,8 @@ class MapWindow:
     def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
         """Whether all that the map has within a circle is in the window, in all its layers.
 
-        False where the circle reaches beyond what was last answered, or while a cell is missing of which
-        no version is attached: nobody says where that one lies.
+        False where the circle reaches beyond what was last answered, where it touches a cell that has
+        failed, and while any cell of the window is being loaded, of which no older version is attached.
 
         Parameters
         ----------

@@ -14,6 +14,7 @@ from shmmap import geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client
+from shmmap.client.failed_boxes import FailedBoxes
 from shmmap.client.retention import Departed, RetentionPolicy
 from shmmap.client.window_state import EMPTY, LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
@@ -86,6 +87,7 @@ class WindowRefresher:
         self._retention = retention
         self._populate = populate
         self._timeout_s = timeout_s
+        self._failed_boxes = FailedBoxes(client)
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
 
@@ -134,6 +136,9 @@ class WindowRefresher:
             )
         else:
             after = self._apply(state, answer, area, pose, now_s)
+        if answer.failed or state.failed_boxes:
+            boxes = self._failed_boxes.of(answer.failed, area, answer.map_version)
+            after = msgspec.structs.replace(after, failed_boxes=boxes)
         self._retain(pose, now_s)
         return after, progress
 

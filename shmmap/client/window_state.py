@@ -76,6 +76,8 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         By layer, boxes of its cells in the order of ``by_layer``, (N, 4) float64.
     asked
         The pose that was asked about; None before the first answer.
+    failed_boxes
+        Where the cells of ``failed`` lie, by id; of those that are not here nobody could tell.
     area
         What was asked about: all that the map has there is in ``cells``, or named in ``pending`` or
         ``failed``.
@@ -91,6 +93,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     area: geometry.Area | None = None
     epoch: int = 0
     map_version: int = 0
+    failed_boxes: Mapping[str, tuple[float, float, float, float]] = {}
 
     @property
     def settled(self) -> bool:
@@ -104,14 +107,23 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     def covers(self, x: float, y: float, radius: float, layer: str | None = None) -> bool:
         """Whether all that the map has within a circle is in ``cells``, of one layer or of all.
 
-        Of a cell that is missing nobody says where it lies: it counts as if it lay in the circle.  One of
-        which an older version is here is not missing.
+        A cell is missing that is being loaded or has failed, and of which no older version is here.  Where
+        nobody knows where it lies, it counts as if it lay in the circle.
         """
         if self.area is None or not self.area.contains_circle(x, y, radius):
             return False
         missing = [(cell.id, cell.layer) for cell in self.pending]
         missing += [(failure.cell_id, failure.layer) for failure in self.failed]
-        return not any(key not in self.cells and layer in (None, key[1]) for key in missing)
+        return not any(
+            key not in self.cells and layer in (None, key[1]) and self._may_touch(key[0], x, y, radius)
+            for key in missing
+        )
+
+    def _may_touch(self, cell_id: str, x: float, y: float, radius: float) -> bool:
+        box = self.failed_boxes.get(cell_id)
+        if box is None:
+            return True
+        return math.hypot(max(box[0] - x, x - box[2], 0.0), max(box[1] - y, y - box[3], 0.0)) <= radius
 
     @classmethod
     def build(

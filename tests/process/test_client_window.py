@@ -14,11 +14,13 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
 import pytest
 
 import shmmap
+from shmmap.client import map_listing
 from shmmap.client.retention import Departed
 from shmmap.client.window_follower import WindowFollower
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
@@ -230,6 +232,33 @@ def test_a_vehicle_that_outruns_a_dead_daemon_is_told(daemon: Factory, divided_m
             (window.move_to(x, 0).complete, window.covers(x, 0, 30)) for x in (5.0, 9.9, 10.0, 11.0, 60.0)
         ]
     assert told == [(True, True), (True, True), (False, True), (False, False), (False, False)]
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_broken_cell_is_a_hole_where_it_lies(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, background: bool
+) -> None:
+    """And nowhere else; where it lies is asked for once."""
+    listed: list[int] = []
+    list_cells = map_listing.list_cells
+
+    def list_and_count(*arguments: Any) -> shmmap.MapListing:
+        listed.append(1)
+        return list_cells(*arguments)
+
+    monkeypatch.setattr(map_listing, "list_cells", list_and_count)
+    broken = Path(divided_map.id("20_0.pcd"))
+    broken.write_bytes(broken.read_bytes()[:-9])
+    one = daemon(divided_map.root)
+    with shmmap.MapWindow(one.endpoint, 45, update_distance=0, background=background) as window:
+        for x in (0.0, -1.0, -2.0):
+            update = window.move_to(x, 0, wait=LONG_S)
+            assert [Path(failure.cell_id).name for failure in update.failed] == ["20_0.pcd"]
+            assert not update.complete
+            assert window.points_around(-10, 0, 29).covered
+            assert not window.points_around(-10, 0, 31).covered
+            assert not window.covers(30, 10)
+        assert listed == [1]
 
 
 def test_a_daemon_that_ends_is_noticed_at_once(daemon: Factory, divided_map: DividedMap) -> None:

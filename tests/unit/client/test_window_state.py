@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -117,6 +118,14 @@ def test_a_missing_cell_may_lie_anywhere(make_cell: Callable[..., Cell]) -> None
         assert state.covers(0.0, 0.0, 9.0) is covers
         assert state.covers(0.0, 0.0, 9.0, "voxel(leaf=1.0)"), "another layer misses nothing"
         assert state.covers(0.0, 0.0, 9.0, "points") is covers
+
+
+def test_a_failed_cell_is_missing_where_it_lies() -> None:
+    failure = LoadFailed("broken", cell_id="/b", layer="points")
+    state = msgspec.structs.replace(build(failed=(failure,)), failed_boxes={"/b": (20.0, 0.0, 40.0, 20.0)})
+    assert state.covers(0.0, 0.0, 19.0)
+    assert not state.covers(0.0, 0.0, 20.0)
+    assert not state.covers(30.0, 10.0, 0.0)
 
 
 @pytest.mark.parametrize(
