@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec, column_names
-from shmmap.errors import MapDataError, ShmmapError
+from shmmap.errors import MapDataError, PackageMissing
 from shmmap.formats.causes import refusal
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, is_geographic
 from shmmap.formats.source_file import open_regular
@@ -58,7 +58,7 @@ class LasReader:
     ------
     MapDataError
         ``truncated``, ``bad_las`` and the causes of files that cannot be opened.
-    ShmmapError
+    PackageMissing
         laspy is not installed.
     """
 
@@ -167,9 +167,9 @@ def _laspy(path: str) -> Any:
     try:
         import laspy
     except ImportError as error:
-        raise ShmmapError(
+        raise PackageMissing(
             f"{path}: LAS and LAZ need the Python package laspy, which cannot be loaded: {error}",
-            hint="pip install 'laspy[lazrs]'",
+            hint="pip install 'laspy[lazrs]', or convert the file to PCD",
         ) from error
     return laspy
 

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import platform
 from typing import Any
 
-from shmmap.errors import ShmmapError
+from shmmap.errors import PackageMissing, ShmmapError
 
 __all__ = ["load_open3d"]
 
@@ -22,20 +23,21 @@ def load_open3d(purpose: str, *, instead: str = "") -> Any:
 
     Raises
     ------
+    PackageMissing
+        It, or a package that it needs, is not installed; the hint says how to install it.
     ShmmapError
-        It cannot be loaded; the hint says what is missing.
+        It cannot be loaded; the hint says what the system lacks.
     """
     try:
         import open3d
     except ModuleNotFoundError as error:
-        if error.name != "open3d":  # it is there, and lacks something itself
-            raise ShmmapError(
-                f"{purpose} needs the Python package Open3D, which lacks a package itself: {error}",
-                hint=f"pip install {error.name}",
-            ) from error
-        hint = f"pip install open3d{', ' if instead else ''}{instead}"
-        raise ShmmapError(
-            f"{purpose} needs the Python package Open3D, which is not installed", hint=hint
+        cpu_only = "open3d-cpu" if platform.machine() == "x86_64" else "open3d"  # as in pyproject.toml
+        package = cpu_only if error.name == "open3d" else error.name
+        raise PackageMissing(
+            f"{purpose} needs the Python package Open3D, which is not installed"
+            if error.name == "open3d"
+            else f"{purpose} needs the Python package Open3D, which lacks the package {package}",
+            hint=f"pip install {package}{', ' if instead else ''}{instead}",
         ) from error
     except ImportError as error:
         raise ShmmapError(

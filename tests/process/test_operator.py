@@ -140,6 +140,36 @@ def test_tail_follows(shmmap: Shmmap, divided_map: DividedMap) -> None:
         assert tail.returncode == 130, complaint
 
 
+def test_a_client_cannot_write_to_the_terminal_of_who_looks(shmmap: Shmmap, divided_map: DividedMap) -> None:
+    """Its name, and the name of a file of the map, hold codes that terminals obey."""
+    hostile = "\x1b]0;owned\x07\x1b[2J\u202e"
+    corner = divided_map.corners["0_0.pcd"]
+    divided_map.write_cell("0_0\x1b[31m.pcd", corner, divided_map.points("0_0.pcd"))
+    divided_map.remove_cell("0_0.pcd")
+    metadata = divided_map.root / "pointcloud_map_metadata.yaml"
+    divided_map.write_metadata()
+    metadata.write_text(metadata.read_text().replace("0_0\x1b[31m.pcd", '"0_0\\e[31m.pcd"'))
+    shmmap.json("reload")
+    with client_library.connect(shmmap.daemon.endpoint, name=hostile) as client:
+        held = client.around(5.0, 5.0, radius=1.0, wait=20.0)
+        assert [Path(cell.id).name for cell in held] == ["0_0\x1b[31m.pcd"]
+        after(shmmap, lambda told: told["sessions"] == 1 and told["cells_resident"] == 1)
+        both = ("clients", "tail", "top", "ls", "status", "pin")
+        verbs = [[verb] for verb in both] + [[verb, "--json"] for verb in both]
+        verbs += [["query", "--circle", "5,5,1"], ["show", held[0].id], ["map"]]
+        for words in verbs:
+            text = shmmap(*words)
+            assert all(line.isprintable() for line in text.splitlines()), words
+            if words[0] in ("clients", "tail"):
+                assert "owned" in text, words
+            if words[0] in ("ls", "query", "show"):
+                assert "[31m.pcd" in text, words
+        done = shmmap.run("show", hostile)
+        assert done.returncode == 1
+        assert all(line.isprintable() for line in done.stderr.splitlines())
+        del held
+
+
 def test_metrics_and_files(shmmap: Shmmap, divided_map: DividedMap, tmp_path: Path) -> None:
     shmmap("query", "--circle", "0,0,25")
     metrics = shmmap("metrics")
