@@ -9,6 +9,7 @@ cannot be written; 75 busy; 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
 import sys
 import textwrap
@@ -40,8 +41,10 @@ __all__ = [
     "add_verb",
     "at_least",
     "connect",
+    "not_negative",
     "nothing_found",
     "output_file",
+    "positive",
     "print_json",
     "run_command",
     "run_program",
@@ -118,6 +121,32 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
         return code
 
     return exit_code_of(name, run)
+
+
+# --- numbers ------------------------------------------------------------------------------------------------
+
+
+def positive(text: str) -> float:
+    """Read a positive and finite number."""
+    value = _number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a finite number that is not negative."""
+    value = _number(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number, 0 or more, not {text!r}")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 # --- nothing found ----------------------------------------------------------------------------------------
