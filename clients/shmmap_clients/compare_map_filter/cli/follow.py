@@ -14,6 +14,7 @@ from shmmap_clients.command_line import (
     add_json_option,
     add_verb,
     connect,
+    not_negative,
     nothing_found,
     output_file,
     print_json,
@@ -22,12 +23,7 @@ from shmmap_clients.command_line import (
     writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
-from shmmap_clients.shared_options import (
-    add_quiet_option,
-    add_radius_option,
-    add_scans_option,
-    not_negative,
-)
+from shmmap_clients.shared_options import add_quiet_option, add_radius_option, add_scans_option
 
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.statistics import DriveStatistics

@@ -17,13 +17,15 @@ from shmmap_clients.command_line import (
     add_verb,
     at_least,
     connect,
+    not_negative,
     nothing_found,
     output_file,
+    positive,
     print_json,
     seconds,
     writing_errors,
 )
-from shmmap_clients.shared_options import add_quiet_option, not_negative, positive
+from shmmap_clients.shared_options import add_quiet_option
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress

@@ -11,7 +11,9 @@ from shmmap_clients.command_line import (
     add_daemon_options,
     add_json_option,
     at_least,
+    not_negative,
     output_file,
+    positive,
     seconds,
 )
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options
@@ -24,8 +26,6 @@ from shmmap_clients.shared_options import (
     add_scans_option,
     add_sigma_options,
     add_thin_option,
-    not_negative,
-    positive,
 )
 
 __all__ = ["EPILOG", "add_options"]
