@@ -7,7 +7,7 @@ import argparse
 from typing import Final
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_daemon_options,
     add_json_option,
     at_least,
@@ -157,5 +157,5 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
         "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
     )
     add_quiet_option(out)
-    add_allow_empty_option(out)
+    add_allow_empty(parser)
     add_json_option(parser)
