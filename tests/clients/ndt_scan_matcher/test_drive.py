@@ -283,8 +283,10 @@ def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.Captur
         report.frame(named, client, TrustLimits(nvtl=2.3), 1, None)
     said = capsys.readouterr().err
     assert said.splitlines() == [
-        "shmmap-ndt: no map at scan \\x1b[2Jscan\\n: the map spans x 0 .. 20 m, y -1.5 .. 30.25 m,"
-        " the pose is at (0.000, 0.000)",
+        (
+            "shmmap-ndt: no map at scan \\x1b[2Jscan\\n: the map spans x 0 .. 20 m, y -1.5 .. 30.25 m,"
+            " the pose is at (0.000, 0.000)"
+        ),
         "shmmap-ndt: the map did not keep up with the vehicle: scan \\x1b[2Jscan\\n waited for it",
         "shmmap-ndt: lost at scan \\x1b[2Jscan\\n: no map",
     ]
