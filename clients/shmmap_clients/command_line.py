@@ -9,6 +9,7 @@ cannot be written; 75 busy; 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
 import sys
 import textwrap
@@ -18,15 +19,20 @@ from typing import Any, Protocol
 from shmmap import needed_packages
 from shmmap.cli.programs import (
     Parser,
+    add_allow_empty,
     add_daemon_options,
     add_json_option,
     add_verb,
     at_least,
+    complain,
     connect,
     exit_code_of,
     join_negative_values,
+    nothing_found,
     output_file,
     print_json,
+    print_line,
+    printable,
     seconds,
     write_text,
     writing_errors,
@@ -34,15 +40,20 @@ from shmmap.cli.programs import (
 
 __all__ = [
     "Verb",
-    "add_allow_empty_option",
+    "add_allow_empty",
     "add_daemon_options",
     "add_json_option",
     "add_verb",
     "at_least",
+    "complain",
     "connect",
+    "not_negative",
     "nothing_found",
     "output_file",
+    "positive",
     "print_json",
+    "print_line",
+    "printable",
     "run_command",
     "run_program",
     "seconds",
@@ -120,19 +131,24 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
     return exit_code_of(name, run)
 
 
-# --- nothing found ----------------------------------------------------------------------------------------
+def positive(text: str) -> float:
+    """Read a positive and finite number."""
+    value = _number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
+    return value
 
 
-def add_allow_empty_option(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add ``--allow-empty``; see `nothing_found`."""
-    parser.add_argument("--allow-empty", action="store_true", help="exit with 0 also when nothing is found")
+def not_negative(text: str) -> float:
+    """Read a finite number that is not negative."""
+    value = _number(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number, 0 or more, not {text!r}")
+    return value
 
 
-def nothing_found(args: argparse.Namespace, name: str, message: str) -> int:
-    """Say on stderr that there is nothing of what was asked for; returns the exit code.
-
-    A script that goes on with nothing would take it for an answer: so it is 1, unless ``--allow-empty`` was
-    given.
-    """
-    sys.stderr.write(f"{name}: {message}\n")
-    return 0 if args.allow_empty else 1
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

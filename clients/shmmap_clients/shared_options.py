@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import argparse
-import math
+
+from shmmap_clients.command_line import not_negative, positive
 
 __all__ = [
     "add_backend_option",
@@ -17,34 +18,9 @@ __all__ = [
     "add_sigma_options",
     "add_thin_option",
     "add_threads_option",
-    "not_negative",
-    "positive",
 ]
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
-
-
-def positive(text: str) -> float:
-    """Read a positive and finite number."""
-    value = _number(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Read a finite number that is not negative."""
-    value = _number(text)
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a number, 0 or more, not {text!r}")
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 def add_scan_option(parser: Parser) -> None:

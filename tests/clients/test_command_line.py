@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shmmap_clients.command_line import at_least, output_file, write_text
+from shmmap_clients.command_line import at_least, output_file, positive, write_text
 from shmmap_clients.compare_map_filter.cli import main as compare
 from shmmap_clients.elevation_map.cli import main as elevation
 from shmmap_clients.ndt_scan_matcher.cli import main as ndt
 from shmmap_clients.pose_initializer.cli import main as pose_init
-from shmmap_clients.shared_options import positive
 
 from shmmap import CannotWrite
 

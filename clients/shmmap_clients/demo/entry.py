@@ -15,8 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmmap_clients.command_line import at_least, run_command
-from shmmap_clients.shared_options import positive
+from shmmap_clients.command_line import at_least, positive, run_command
 
 __all__ = ["main"]
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import math
@@ -10,6 +11,7 @@ import pickle
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -18,6 +20,7 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.decimation import KEPT
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
@@ -269,3 +272,21 @@ def test_addresses_that_make_no_sense_are_refused() -> None:
         PosePublisher("nonsense")
     with pytest.raises(shmmap.BadRequest, match="cannot connect"):
         OdometryListener("nonsense")
+
+
+def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    args = argparse.Namespace(tum=None, json_lines=None, quiet=False, allow_empty=False)
+    client: Any = SimpleNamespace(welcome=SimpleNamespace(bounds=(0.0, -1.5, 20.0, 30.25)))
+    named = dataclasses.replace(frame(0, np.eye(4), None), name="\x1b[2Jscan\n")
+    with FollowReport(args) as report:
+        report.frame(named, client, TrustLimits(nvtl=2.3), 1, None)
+        report.frame(named, client, TrustLimits(nvtl=2.3), 1, None)
+    said = capsys.readouterr().err
+    assert said.splitlines() == [
+        (
+            "shmmap-ndt: no map at scan \\x1b[2Jscan\\n: the map spans x 0 .. 20 m, y -1.5 .. 30.25 m,"
+            " the pose is at (0.000, 0.000)"
+        ),
+        "shmmap-ndt: the map did not keep up with the vehicle: scan \\x1b[2Jscan\\n waited for it",
+        "shmmap-ndt: lost at scan \\x1b[2Jscan\\n: no map",
+    ]

@@ -7,7 +7,7 @@ import argparse
 from typing import Any, Final
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_json_option,
     add_verb,
     nothing_found,
@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
     out.add_argument(
         "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
     )
-    add_allow_empty_option(out)
+    add_allow_empty(parser)
     add_json_option(parser)
 
 
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     if comparison.no_map:
         x, y = T[:2, 3]
         where = f"{extent_text(compare.bounds)}, the pose is at ({x:.3f}, {y:.3f})"
-        return nothing_found(args, "shmmap-compare", f"no map around the scan: {where}")
+        return nothing_found(args, f"no map around the scan: {where}", name="shmmap-compare")
     if not kept:
-        return nothing_found(args, "shmmap-compare", "no point is kept: the map explains all of them")
+        return nothing_found(args, "no point is kept: the map explains all of them", name="shmmap-compare")
     return 0

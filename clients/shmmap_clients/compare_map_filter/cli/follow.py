@@ -9,25 +9,22 @@ import sys
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_daemon_options,
     add_json_option,
     add_verb,
     connect,
+    not_negative,
     nothing_found,
     output_file,
     print_json,
+    print_line,
     seconds,
     write_text,
     writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
-from shmmap_clients.shared_options import (
-    add_quiet_option,
-    add_radius_option,
-    add_scans_option,
-    not_negative,
-)
+from shmmap_clients.shared_options import add_quiet_option, add_radius_option, add_scans_option
 
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.statistics import DriveStatistics
@@ -98,7 +95,7 @@ def add_parser(subparsers: Any) -> None:
         "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
     )
     add_quiet_option(out)
-    add_allow_empty_option(out)
+    add_allow_empty(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
 
@@ -153,9 +150,9 @@ def run(args: argparse.Namespace) -> int:
             if compared.comparison.no_map and statistics.no_map == 1 and T is not None:
                 x, y = T[:2, 3]
                 where = f"{map_extent(client)}, the pose is at ({x:.3f}, {y:.3f})"
-                code = nothing_found(args, _NAME, f"no map around scan {compared.scan.name}: {where}")
+                code = nothing_found(args, f"no map around scan {compared.scan.name}: {where}", name=_NAME)
             if not args.quiet:
-                print(statistics.line(compared), file=sys.stderr)
+                print_line(statistics.line(compared), file=sys.stderr)
         compare.use_cells(())
     if args.picture:
         note = (
@@ -182,8 +179,8 @@ def _print(statistics: DriveStatistics) -> None:
 def _exit_code(args: argparse.Namespace, statistics: DriveStatistics) -> int:
     code = 1 if statistics.incomplete else 0
     if not statistics.scans:
-        return nothing_found(args, _NAME, f"no scan came from {args.scans}")
+        return nothing_found(args, f"no scan came from {args.scans}", name=_NAME)
     if not statistics.kept:
         explained = f"the map explains all {statistics.points} points"
-        return max(code, nothing_found(args, _NAME, f"no point was kept: {explained}"))
+        return max(code, nothing_found(args, f"no point was kept: {explained}", name=_NAME))
     return code

@@ -6,7 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap_clients.shared_options import add_backend_option, positive
+from shmmap_clients.command_line import positive
+from shmmap_clients.shared_options import add_backend_option
 
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.rule import CompareRule

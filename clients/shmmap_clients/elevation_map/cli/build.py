@@ -11,19 +11,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_daemon_options,
     add_json_option,
     add_verb,
     at_least,
+    complain,
     connect,
+    not_negative,
     nothing_found,
     output_file,
+    positive,
     print_json,
+    print_line,
     seconds,
     writing_errors,
 )
-from shmmap_clients.shared_options import add_quiet_option, not_negative, positive
+from shmmap_clients.shared_options import add_quiet_option
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress
@@ -124,7 +128,7 @@ def add_parser(subparsers: Any) -> None:
         help="how long to wait for one cell (default: 60)",
     )
     add_quiet_option(parser)
-    add_allow_empty_option(parser)
+    add_allow_empty(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
 
@@ -209,13 +213,13 @@ def run(args: argparse.Namespace) -> int:
         )
         print(f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out")
         for error in built.failed:
-            print(f"missing: {error}", file=sys.stderr)
+            print_line(f"missing: {error}", file=sys.stderr)
     code = 1 if built.failed else 0
     if not measured:
         why = "no cell has a point" if not built.occupied else _sparse(rule, measured, built.occupied)
-        return max(code, nothing_found(args, _NAME, f"no column has a height: {why}; {extent}"))
+        return max(code, nothing_found(args, f"no column has a height: {why}; {extent}", name=_NAME))
     if share is not None and share < _FEW:
-        print(f"{_NAME}: warning: {_sparse(rule, measured, built.occupied)}", file=sys.stderr)
+        complain(_NAME, f"warning: {_sparse(rule, measured, built.occupied)}")
     return code
 
 

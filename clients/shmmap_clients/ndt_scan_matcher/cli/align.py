@@ -7,7 +7,7 @@ import argparse
 from typing import Any
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_json_option,
     add_verb,
     nothing_found,
@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
     add_leaf_option(parser)
     add_thin_option(parser, default=0.0)
     add_alignment_options(parser)
-    add_allow_empty_option(parser)
+    add_allow_empty(parser)
     add_json_option(parser)
 
 
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
         bounds = [*cloud[:, :2].min(axis=0), *cloud[:, :2].max(axis=0)] if len(cloud) else None
         where = f"the pose is at ({x:.3f}, {y:.3f}, {z:.3f})"
         found = f"no voxel of the map near any point of the scan: {extent_text(bounds)}, {where}"
-        return nothing_found(args, "shmmap-ndt", found)
+        return nothing_found(args, found, name="shmmap-ndt")
     return 0 if result.converged else 1
 
 

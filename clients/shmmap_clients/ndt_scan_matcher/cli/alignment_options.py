@@ -6,8 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap_clients.command_line import at_least
-from shmmap_clients.shared_options import add_backend_option, add_threads_option, not_negative, positive
+from shmmap_clients.command_line import at_least, not_negative, positive
+from shmmap_clients.shared_options import add_backend_option, add_threads_option
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher

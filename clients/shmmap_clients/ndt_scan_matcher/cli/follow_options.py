@@ -7,11 +7,13 @@ import argparse
 from typing import Final
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_daemon_options,
     add_json_option,
     at_least,
+    not_negative,
     output_file,
+    positive,
     seconds,
 )
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options
@@ -24,8 +26,6 @@ from shmmap_clients.shared_options import (
     add_scans_option,
     add_sigma_options,
     add_thin_option,
-    not_negative,
-    positive,
 )
 
 __all__ = ["EPILOG", "add_options"]
@@ -157,5 +157,5 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
         "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
     )
     add_quiet_option(out)
-    add_allow_empty_option(out)
+    add_allow_empty(parser)
     add_json_option(parser)

@@ -10,7 +10,7 @@ import sys
 from types import TracebackType
 from typing import TYPE_CHECKING, TextIO
 
-from shmmap_clients.command_line import nothing_found, writing_errors
+from shmmap_clients.command_line import complain, nothing_found, printable, writing_errors
 
 if TYPE_CHECKING:
     from shmmap import Client
@@ -66,7 +66,7 @@ class FollowReport:
 
     def no_scans(self) -> int:
         """Say that there was no scan; returns the exit code."""
-        return nothing_found(self._args, _NAME, f"no scan came from {self._args.scans}")
+        return nothing_found(self._args, f"no scan came from {self._args.scans}", name=_NAME)
 
     def frame(
         self,
@@ -119,14 +119,17 @@ class FollowReport:
         self._error_told = error
 
     def _say(self, text: str) -> None:
-        print(("\n" if self._terminal and self._frames > 1 else "") + f"{_NAME}: {text}", file=sys.stderr)
+        if self._terminal and self._frames > 1:
+            print(file=sys.stderr)  # the progress stands there
+        complain(_NAME, text)
 
     def _progress(self, frame: Frame) -> None:
         if self._terminal:
             x, y = frame.result.T_map_base[:2, 3]
             line = (
-                f"\r{self._frames:6} {frame.name:20.20} ({x:9.2f}, {y:9.2f}) NVTL {frame.result.nvtl:5.2f}"
-                f" {frame.result.iterations:3} it {frame.latency_s * 1e3:7.1f} ms {frame.state:9}"
+                f"\r{self._frames:6} {printable(frame.name):20.20} ({x:9.2f}, {y:9.2f})"
+                f" NVTL {frame.result.nvtl:5.2f} {frame.result.iterations:3} it {frame.latency_s * 1e3:7.1f} ms"
+                f" {frame.state:9}"
             )
             print(line, end="", file=sys.stderr, flush=True)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
-    add_allow_empty_option,
+    add_allow_empty,
     add_daemon_options,
     add_json_option,
     at_least,
@@ -80,7 +80,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_radius_option(parser)
     add_backend_option(parser)
     add_threads_option(parser)
-    add_allow_empty_option(parser)
+    add_allow_empty(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
 
@@ -111,7 +111,7 @@ def _run(args: argparse.Namespace) -> int:
         except NoMapHere as error:
             if args.json:
                 print_json(_document(None))
-            return nothing_found(args, _NAME, error.message)
+            return nothing_found(args, error.message, name=_NAME)
     if args.json:
         print_json(_document(found))
     else:
