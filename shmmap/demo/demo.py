@@ -170,9 +170,7 @@ def run_demo(
             elif localization.missing:
                 result.missing = localization.missing
             else:
-                progress.stage("Localizing simulated LiDAR scans with shmmap-ndt", 1)
-                result.localization = localization.run(watched)
-                progress.step()
+                result.localization = localization.run(watched, progress)
         return result
 
 

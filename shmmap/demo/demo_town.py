@@ -90,8 +90,10 @@ class Progress(Protocol):
     def stage(self, text: str, total: int) -> None:
         """A new stage of ``total`` steps begins."""
 
-    def step(self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None) -> None:
-        """One step of the stage is done."""
+    def step(
+        self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None, note: str = ""
+    ) -> None:
+        """One step of the stage is done; what consumers did in it, the daemon's counters, and words to it."""
 
     def event(self, text: str) -> None:
         """Something happened that a spectator should know."""

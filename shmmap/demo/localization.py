@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
-from shmmap.demo.demo_town import DemoSettings
+from shmmap.demo.demo_town import DemoSettings, Progress
 from shmmap.demo.drive import WatchedDaemon
 from shmmap.demo.process_cpu import cpu_seconds
 from shmmap.demo.program import Program
@@ -104,7 +105,7 @@ class Localization:
             if code := maker.wait(_PATIENCE_S):
                 raise InternalError(f"{maker.name} ended with {code}: {maker.last_words()}")
 
-    def run(self, daemon: WatchedDaemon) -> LocalizationResult:
+    def run(self, daemon: WatchedDaemon, progress: Progress) -> LocalizationResult:
         """Localize all scans on the daemon's map.
 
         Raises
@@ -115,12 +116,23 @@ class Localization:
         words = [
             "follow", "--scans", str(self._work / "scans"), "--truth", str(self._work / "truth.txt"),
             "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.process.endpoint, "--json",
+            "--json-lines", "/dev/stdout", "--quiet",
             "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(SEEN_METRES),
             "--update-distance", "10",
         ]  # fmt: skip
         computed, cpu_s = daemon.layers_computed(), cpu_seconds(daemon.pids())
-        with Program("shmmap-ndt", _PROGRAM, words, self._work) as program:
-            document, _ = program.document(_PATIENCE_S)
+        scans = sorted((self._work / "scans").iterdir())
+        progress.stage("Localizing simulated LiDAR scans with shmmap-ndt", len(scans))
+        with Program("shmmap-ndt", _PROGRAM, words, self._work, piped=True) as program:
+            document: dict[str, Any] = {}
+            for line in program.lines():
+                document = json.loads(line)
+                if "error_m" in document:
+                    progress.step(
+                        note=f"{document['name']}: {document['error_m'] * 100:.1f} cm from the truth"
+                    )
+            if "frames" not in document:
+                raise InternalError(f"shmmap-ndt ended early: {program.last_words()}")
         errors_m = document["errors"]["ate_m"]
         return LocalizationResult(
             scans=document["frames"],

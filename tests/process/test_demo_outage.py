@@ -25,8 +25,10 @@ class Witness(QuietProgress):
         self.alone: list[list[int]] = []
         self.reports: Sequence[StepReport] = ()
 
-    def step(self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None) -> None:
-        del counters
+    def step(
+        self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None, note: str = ""
+    ) -> None:
+        del counters, note
         self.reports = reports
         # by the kernel's word: neither the daemon nor one of its loaders is alive
         if not processes_marked(self._daemon.instance, "SHMMAP_TEST_DAEMON"):

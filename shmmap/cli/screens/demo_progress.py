@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.screens.output import format_bytes, format_duration, print_line
 from shmmap.demo.consumer import TASKS
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ class QuietProgress:
     def stage(self, text: str, total: int) -> None:
         """A new stage begins."""
 
-    def step(self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None) -> None:
+    def step(
+        self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None, note: str = ""
+    ) -> None:
         """One step is done."""
 
     def event(self, text: str) -> None:
@@ -51,20 +53,22 @@ class PlainProgress(QuietProgress):
     def stage(self, text: str, total: int) -> None:
         """A new stage begins."""
         self._total, self._done, self._told_s = total, 0, time.monotonic()
-        print(f"{text} ...", flush=True)
+        print_line(f"{text} ...", flush=True)
 
-    def step(self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None) -> None:
+    def step(
+        self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None, note: str = ""
+    ) -> None:
         """One step is done."""
-        del reports, counters
+        del reports, counters, note
         self._done += 1
         now_s = time.monotonic()
         if now_s - self._told_s >= _PLAIN_EVERY_S and self._done < self._total:
             self._told_s = now_s
-            print(f"  {self._done} of {self._total}", flush=True)
+            print_line(f"  {self._done} of {self._total}", flush=True)
 
     def event(self, text: str) -> None:
         """Something happened."""
-        print(f"  {text}", flush=True)
+        print_line(f"  {text}", flush=True)
 
 
 class LiveProgress(QuietProgress):
@@ -88,10 +92,13 @@ class LiveProgress(QuietProgress):
         self._begin(text, total)
         self._draw()
 
-    def step(self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None) -> None:
+    def step(
+        self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None, note: str = ""
+    ) -> None:
         """One step is done."""
         self._done += 1
         self._reports, self._counters = reports, counters
+        self._event = note or self._event
         self._draw()
 
     def event(self, text: str) -> None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_pairs, print_table
+from shmmap.cli.screens.output import (
+    Column,
+    format_bytes,
+    format_duration,
+    print_line,
+    print_pairs,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from shmmap.demo.demo import DemoResult
@@ -16,9 +23,9 @@ __all__ = ["draw", "print_report"]
 
 def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
     """Print the table and the lines."""
-    print()
+    print_line()
     _print_table(result)
-    print()
+    print_line()
     print_pairs([*_lines(result), ("all of it", f"{format_duration(duration_s)}; picture: {picture}")])
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
-from shmmap.cli.screens.output import print_json
+from shmmap.cli.screens.output import print_json, print_line
 from shmmap.errors import CannotWrite
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_report(result, str(picture), duration_s)
         if args.keep_map:
-            print(f"Serve the town yourself: shmmap serve {args.keep_map}")
+            print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
     return 0 if _complete(result) else 1
 
 
