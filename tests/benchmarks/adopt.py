@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a warm start costs: taking over the segments of an earlier life, and proving their bytes.
 
-Bar: header and stamp check of 1000 segments under 40 ms.  Beside it, as the least that any check
+Limit: header and stamp check of 1000 segments under 40 ms.  Beside it, as the least that any check
 could cost, the same files opened, read up to their header's end and closed; and for the proof of the
 bytes, done later in a worker, reading the same bytes without looking at them.
 

@@ -5,7 +5,7 @@
 
 256 cells of 20 m.  Timed in fresh processes: `client.area` to the last attached cell, then the first
 access to every column of every cell; beside it what Autoware does instead, the statistics from points.
-Private memory is what the process's pages that nobody shares grew by.  Bars: 10 ms, 1 MB.
+Private memory is what the process's pages that nobody shares grew by.  Limits: 10 ms, 1 MB.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def main() -> None:
                 f"load {os.getloadavg()[0]:.1f}; {rows[0][0]} cells; request and attach"
                 f" {statistics.median(r[1] for r in rows):.2f} ms (least {min(r[1] for r in rows):.2f}),"
                 f" with every column {statistics.median(r[2] for r in rows):.2f} ms"
-                f" (least {min(r[2] for r in rows):.2f}, bar 10);"
-                f" private memory {statistics.median(r[3] for r in rows):.0f} kB (bar 1000)"
+                f" (least {min(r[2] for r in rows):.2f}, limit 10);"
+                f" private memory {statistics.median(r[3] for r in rows):.0f} kB (limit 1000)"
             )
         finally:
             daemon.stop()

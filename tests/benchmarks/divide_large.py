@@ -122,7 +122,7 @@ def main() -> None:
         ratio = statistics.median(divisions) / statistics.median(copies)
         print(
             f"median: cp+fsync {statistics.median(copies):.2f} s, divide {statistics.median(divisions):.2f} s"
-            f", ratio {ratio:.2f} (bar: 3), load {os.getloadavg()[0]:.1f}"
+            f", ratio {ratio:.2f} (limit: 3), load {os.getloadavg()[0]:.1f}"
         )
     finally:
         shutil.rmtree(work)

@@ -7,7 +7,7 @@ The client sends a warm differential request every 5 ms.  Beside it, in turns: n
 processes that only compute; three clients that do all they can to the daemon: one floods it with
 requests and reads no reply, one sends garbage of all sizes up to frames that are too large, one
 connects and disconnects, asks for the whole map and for statistics without end.  All of them run all
-the time and are stopped (SIGSTOP) while it is not their turn.  The bar is at most 3.
+the time and are stopped (SIGSTOP) while it is not their turn.  The limit is at most 3.
 """
 
 from __future__ import annotations

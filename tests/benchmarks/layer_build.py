@@ -4,7 +4,7 @@
     python -m tests.benchmarks.layer_build [--rounds 5] [--points 2000000]
 
 One thread, CPU time, the minimum over rounds; both programs take turns.  Ours includes the inverse
-covariances and the lookup table, PCL's has its statistics without the search tree.  Bars: 0.25 for the one
+covariances and the lookup table, PCL's has its statistics without the search tree.  Limits: 0.25 for the one
 grid, 0.7 for the cells.  PCL's part needs g++ and libpcl-dev, and is left out where they are missing.
 """
 
@@ -94,7 +94,7 @@ def main() -> None:
         print(f"load {os.getloadavg()[0]:.1f}; CPU ms, minimum of {args.rounds} rounds")
         if pcl is None:
             print("PCL: not measured, g++ or libpcl-dev is missing")
-        for name, clouds, bar in (("one grid", [whole], 0.25), ("256 cells", cells, 0.7)):
+        for name, clouds, limit in (("one grid", [whole], 0.25), ("256 cells", cells, 0.7)):
             paths = []
             for number, cloud in enumerate(clouds):
                 paths.append(Path(folder) / f"{number}.xyz")
@@ -105,13 +105,12 @@ def main() -> None:
                     mine.append(ours(leaf, clouds))
                     if pcl:
                         theirs.append(pcl.seconds(leaf, paths))
-                line = (
-                    f"{name:10} {sum(map(len, clouds)):9,} points, leaf {leaf:g}: ours {min(mine) * 1e3:6.1f}"
-                )
+                points, took = sum(map(len, clouds)), min(mine)
+                line = f"{name:10} {points:9,} points, leaf {leaf:g}: ours {took * 1e3:6.1f}"
                 if theirs:
-                    took, voxels = min(theirs)
-                    ratio = min(mine) / took
-                    line += f", PCL {took * 1e3:7.1f}, ratio {ratio:.3f} (bar {bar}); {voxels:,} voxels"
+                    pcl_took, voxels = min(theirs)
+                    line += f", PCL {pcl_took * 1e3:7.1f}, ratio {took / pcl_took:.3f} (limit {limit})"
+                    line += f"; {voxels:,} voxels"
                 print(line)
         if pcl:
             pcl.close()

@@ -4,7 +4,7 @@
     python -m tests.benchmarks.layers_beside_requests [--cells 400] [--points 20000]
 
 One client asks again and again for a warm window (differential, nothing new); another has asked for
-``ndt`` and ``voxel`` layers of the whole map.  Bar: p99 at most 3 times that of the idle daemon, whose
+``ndt`` and ``voxel`` layers of the whole map.  Limit: p99 at most 3 times that of the idle daemon, whose
 requests are timed before and after: where these two differ the machine is busy with something else.
 """
 
@@ -66,7 +66,7 @@ def main() -> None:
             ratio = np.percentile(busy, 99) / np.percentile(np.concatenate([idle, after]), 99)
             print(
                 f"load {os.getloadavg()[0]:.1f}; {len(reply.cells)} layers built,"
-                f" {len(reply.failed)} failed; p99 ratio {ratio:.2f} (bar 3)"
+                f" {len(reply.failed)} failed; p99 ratio {ratio:.2f} (limit 3)"
             )
             client.close()
             other.close()

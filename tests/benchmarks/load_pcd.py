@@ -231,12 +231,12 @@ def main() -> int:
 def report(encoding: str, paths: list[str], times: dict[str, list[float]]) -> None:
     size = sum(os.path.getsize(path) for path in paths)
     print(f"\n{encoding}: {len(paths)} cells, {size / 1e6:.1f} MB, medians of {len(times['shmmap'])} rounds")
-    bars = {"pread + pwrite": 2.0, "bare lzf.decompress": 1.75}
+    limits = {"pread + pwrite": 2.0, "bare lzf.decompress": 1.75}
     for name, values in times.items():
         ratios = [mine / other for mine, other in zip(times["shmmap"], values, strict=True)]
         ratio = float(np.median(ratios))
-        bar = bars.get(name, 1.0)
-        verdict = "" if name == "shmmap" else f"   bar {bar:.2f}: {'met' if ratio <= bar else 'MISSED'}"
+        limit = limits.get(name, 1.0)
+        verdict = "" if name == "shmmap" else f"   limit {limit:.2f}: {'met' if ratio <= limit else 'MISSED'}"
         print(f"  {name:22s} {np.median(values) * 1e3:8.1f} ms   shmmap takes {ratio:5.2f} of it{verdict}")
 
 

@@ -5,7 +5,7 @@
         [--disturbance direction|planar|within|gaussian|all]
 
 Scans are each started from the true pose disturbed by 0.3 m and 1 degree, once per seed, in all four readings
-of that or in one of them (`DISTURBANCES`).  Bars: at least 99% within 0.1 m and 0.2 degrees, median at most
+of that or in one of them (`DISTURBANCES`).  Limits: at least 99% within 0.1 m and 0.2 degrees, median at most
 3 cm in Autoware's mode and 2 cm in fine mode, at 0.5 m and 6000 points; the city: fine at most half of
 Autoware's error; simulated scans: not worse.
 
@@ -89,7 +89,7 @@ DISTURBANCES = {
 
 
 def report(name: str, found: NDArray[np.float64], trusted: NDArray[np.bool_]) -> None:
-    """Print the share within the bar and the spread of (N, 2) metres and degrees."""
+    """Print the share within the limit and the spread of (N, 2) metres and degrees."""
     good = (found[:, 0] <= 0.1) & (found[:, 1] <= 0.2)
     m, deg = np.median(found, axis=0)
     worst = found.max(axis=0)

@@ -5,7 +5,7 @@
 
 Each start lies at the stated distance in a random direction (three dimensions) and is turned by up to the
 stated angle about the vertical.  It succeeds within 0.15 m and 0.5 degrees of the result from an undisturbed
-start.  Radius search, no line search; bar: at least 95% at 1 m and 3 degrees.
+start.  Radius search, no line search; limit: at least 95% at 1 m and 3 degrees.
 """
 
 from __future__ import annotations

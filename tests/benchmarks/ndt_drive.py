@@ -5,7 +5,7 @@
 
 The street is laid out ten times ten; the drive goes along a row, copy after copy, on the poses of its drive
 (and straight on from where they end to where the next copy begins).  Every eighth pose has its scan, all
-others a sample of the map around them with noise.  Bars: at least 50 map updates with cells added and
+others a sample of the map around them with noise.  Limits: at least 50 map updates with cells added and
 removed, no scan waits for one, p99 of the latency at most 3 times its median, no growth of memory.
 """
 

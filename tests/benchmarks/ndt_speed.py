@@ -3,7 +3,7 @@
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.ndt_speed [--repeats 20]
 
-CPU time, the minimum over repeats, one thread unless said.  PCL's part needs g++ and libpcl-dev.  Bars
+CPU time, the minimum over repeats, one thread unless said.  PCL's part needs g++ and libpcl-dev.  Limits
 on this class of machine: DIRECT7 pair 15 ms (ndt_omp: 67-78), working point 4 ms (Autoware: 22.7), an
 evaluation at most 0.3 of PCL's, numpy at most 20 times numba at the working point, the first alignment of a
 fresh process within 1 s once the kernels are cached.

@@ -3,16 +3,15 @@
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.ndt_trust [--seeds 12]
 
-Recorded scans of a street, thinned to one point per 1 m and per 3 m (Autoware's sampling), are started 0.3 m
+Scans of a street, thinned to one point per 1 m and per 3 m (Autoware's sampling), are started 0.3 m
 to 16 m from the true pose, in steady steps.  Right is a result within 0.3 m, wrong one beyond 1 m.  Shares
-are of the highest NVTL that a leaf size allows.  Bars: at
+are of the highest NVTL that a leaf size allows.  Limits: at
 most 0.5 % of the wrong results are trusted, at most 2 % of the right ones refused for their NVTL.
 """
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,8 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import gauss_for
 from shmmap_clients.ndt_scan_matcher.matching.trust import default_nvtl
 from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.thinning import thinned
-from shmmap_clients.scans.trajectory import read_trajectory
 
-from tests.benchmarks.street_data import data_dir
+from tests.benchmarks.street_data import street
 
 AWAY_M = (0.3, 1.0, 2.0, 4.0, 8.0, 16.0)
 
@@ -50,17 +48,15 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, default=12)
     args = parser.parse_args()
-    folder: Path = data_dir()
-    cloud = read_scan(folder / "kitti0005_map" / "map_static_v010.pcd")
-    files = sorted((folder / "kitti0005_scans").glob("scan_*.npz"))
-    truth = read_trajectory(folder / "kitti0005_scans" / "poses_heldout_tum.txt").T_map_sensor
+    way = street()
+    cloud, truth = read_scan(way.thinned_map_file), way.T_map_scans
     print("shares of NVTL are the lowest, those of 1 % and 99 %, and the highest")
     print("leaf thin mode         limit share   right: refused of, shares   wrong: trusted of, shares")
     for leaf in (1.0, 2.0, 3.0):
         voxel_map = VoxelMap({"map": voxel_cell(cloud, leaf)})
         highest = -gauss_for(leaf).d1
         for thin in (1.0, 3.0):
-            scans = [thinned(read_scan(path), thin) for path in files]
+            scans = [thinned(read_scan(path), thin) for path in way.scans]
             for mode in ("single", "coarse_fine"):
                 limit = default_nvtl(leaf, fine=mode == "coarse_fine")
                 rows = []

@@ -5,8 +5,8 @@
 
 The street's map is laid out several times, to about 250 MB, the size with which Autoware took 6 to 7 s for
 every initialization (it reads cells anew each time).  Rough poses: true ones of scans, disturbed by 2 m and
-10 degrees (one standard deviation).  Bars: at least 95% within 0.3 m and 1 degree; the second and later ones
-at the same place under 0.5 s, no file opened and no cell loaded.
+10 degrees (one standard deviation).  Limits: at least 95% within 0.3 m and 1 degree; the second and later
+ones at the same place under 0.5 s, no file opened and no cell loaded.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
 A map is prepared with ``points`` and ``ndt(leaf=2.0)``.  A daemon whose loaders have started already (on
 cells elsewhere) is asked for a window of 64 cells in both layers: first request to last handle, against
 ``cp`` of the segments' bytes into the same shared-memory directory (4 KiB pages).  Rounds take turns; the
-window is evicted after each.  Bar: 1.6.
+window is evicted after each.  Limit: 1.6.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def main() -> None:
                 print(
                     f"{name:5} median {statistics.median(times) * 1e3:5.0f} ms, least {min(times) * 1e3:5.0f}"
                 )
-            print(f"ratio {ratio:.2f}, of the least {min(ours) / min(theirs):.2f} (bar 1.6)")
+            print(f"ratio {ratio:.2f}, of the least {min(ours) / min(theirs):.2f} (limit 1.6)")
             client.close()
         finally:
             daemon.stop()

@@ -3,12 +3,12 @@
 
     python -m tests.benchmarks.statistics_snapshot [--cells 10000] [--seconds 20]
 
-1. A snapshot of the statistics of a live daemon, with the segment open (bar: 15 us) and with opening
-   it (bar: 50 us), beside the same numbers asked for by a `stats` request, and beside the least a
+1. A snapshot of the statistics of a live daemon, with the segment open (limit: 15 us) and with opening
+   it (limit: 50 us), beside the same numbers asked for by a `stats` request, and beside the least a
    program can do (open, read 8 kB, close).
 2. The daemon's CPU time while it is idle and while ``shmmap top`` looks five times a second, in
-   percent of one processor (bar: what `top` adds stays below 1 %).
-3. The time that ``status --help``, ``status`` and ``ls`` take from start to end (bar: 150 ms), beside
+   percent of one processor (limit: what `top` adds stays below 1 %).
+3. The time that ``status --help``, ``status`` and ``ls`` take from start to end (limit: 150 ms), beside
    ``python -c pass``.
 """
 
@@ -88,9 +88,9 @@ def snapshots(daemon: DaemonProcess) -> None:
             rows.append(("the same by a request", *timed_us(client.stats, 30)))
     for name, median, least_us in rows:
         print(f"{name:42} median {median:10.1f} us   min {least_us:10.1f} us")
-    bars = {"open": (rows[1][1], 15.0), "with opening": (rows[2][1], 50.0)}
-    for name, (found, bar) in bars.items():
-        print(f"  {name}: {found:.1f} us, bar {bar:.0f} us: {'holds' if found < bar else 'MISSED'}")
+    limits = {"open": (rows[1][1], 15.0), "with opening": (rows[2][1], 50.0)}
+    for name, (found, limit) in limits.items():
+        print(f"  {name}: {found:.1f} us, limit {limit:.0f} us: {'holds' if found < limit else 'MISSED'}")
 
 
 def watching(daemon: DaemonProcess, environment: dict[str, str], seconds: float) -> None:
@@ -113,8 +113,8 @@ def watching(daemon: DaemonProcess, environment: dict[str, str], seconds: float)
     rest = statistics.mean(idle)
     print(f"daemon idle {rest:.2f} %, while top looks {watched:.2f} %; top itself {own:.1f} % of a processor")
     added = watched - rest
-    print(f"  top at 5 Hz adds {added:+.2f} % to the daemon, bar 1 %: {'holds' if added < 1 else 'MISSED'}")
-    print(f"  the daemon altogether, bar 1 %: {'holds' if watched < 1 else 'MISSED'}")
+    print(f"  top at 5 Hz adds {added:+.2f} % to the daemon, limit 1 %: {'holds' if added < 1 else 'MISSED'}")
+    print(f"  the daemon altogether, limit 1 %: {'holds' if watched < 1 else 'MISSED'}")
 
 
 def _drain(fd: int) -> None:
@@ -152,7 +152,7 @@ def starts(environment: dict[str, str]) -> None:
             f" CPU {statistics.median(cpu):4.0f} ms"
         )
         if not name.startswith("python"):
-            print(f"  bar 150 ms: {'holds' if median < 150 else 'MISSED'}")
+            print(f"  limit 150 ms: {'holds' if median < 150 else 'MISSED'}")
 
 
 def main() -> None:
