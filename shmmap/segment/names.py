@@ -18,15 +18,15 @@ from shmmap.errors import ConfigError
 __all__ = [
     "another_name",
     "check_instance",
-    "is_zombie",
+    "is_retired",
     "new_segment_name",
+    "retired_name",
     "segment_prefix",
     "statistics_name",
-    "zombie_name",
 ]
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_ZOMBIE: Final = ".zombie"
+_RETIRED: Final = ".zombie"
 
 
 def check_instance(instance: str) -> str:
@@ -60,11 +60,11 @@ def another_name(name: str) -> str:
     return f"{name.rpartition('.')[0]}.{os.urandom(8).hex()}"
 
 
-def zombie_name(name: str) -> str:
+def retired_name(name: str) -> str:
     """Return the name a segment gets when it is retired."""
-    return name + _ZOMBIE
+    return name + _RETIRED
 
 
-def is_zombie(name: str) -> bool:
+def is_retired(name: str) -> bool:
     """Whether ``name`` is that of a retired segment."""
-    return name.endswith(_ZOMBIE)
+    return name.endswith(_RETIRED)

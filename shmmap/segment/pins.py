@@ -19,7 +19,7 @@ from typing import Final
 
 from shmmap.failpoints import step
 
-__all__ = ["LOADER_SLOT", "MAX_SLOT", "holders", "is_pinned", "lock_slot", "prepare_process"]
+__all__ = ["LOADER_SLOT", "MAX_SLOT", "holders", "in_use", "lock_slot", "prepare_process"]
 
 MAX_SLOT: Final = (1 << 62) - 1
 MOST_RANGES: Final = 32
@@ -45,7 +45,7 @@ def lock_slot(fd: int, slot: int) -> None:
     fcntl.fcntl(fd, _OFD_SETLK, _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, slot, 1, 0))
 
 
-def is_pinned(fd: int) -> bool:
+def in_use(fd: int) -> bool:
     """Whether anybody but this descriptor has the file open or mapped.
 
     That counts as in use, whoever it is; an operator's pins are another thing.  The caller must own the

@@ -136,7 +136,7 @@ def _idle_s(row: CellRow, now_ns: int) -> float | None:
 
 
 def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[str, object]:
-    from shmmap.segment.names import segment_prefix, zombie_name
+    from shmmap.segment.names import retired_name, segment_prefix
 
     idle_s = _idle_s(row, now_ns)
     segment = segment_prefix(instance) + row.segment
@@ -145,7 +145,7 @@ def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[s
         "version": f"{row.version:016x}",
         "layer": row.layer,
         "state": row.state,
-        "segment": zombie_name(segment) if row.state == "zombie" else segment,
+        "segment": retired_name(segment) if row.state == "zombie" else segment,
         "bytes": row.bytes,
         "points": row.points,
         "box": list(row.box),

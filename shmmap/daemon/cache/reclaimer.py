@@ -22,7 +22,7 @@ from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.names import another_name, zombie_name
+from shmmap.segment.names import another_name, retired_name
 
 __all__ = ["Observer", "Outcome", "Reclaimer"]
 
@@ -104,7 +104,7 @@ class Reclaimer:
 
     def name_on_disk(self, resident: Resident) -> str:
         """The name of a segment's file: a retired one has another."""
-        return zombie_name(resident.name) if resident.name in self.ledger.retired else resident.name
+        return retired_name(resident.name) if resident.name in self.ledger.retired else resident.name
 
     def is_pinned(self, resident: Resident) -> bool | None:
         """The kernel's word on a segment; None if its name is gone."""
@@ -128,11 +128,11 @@ class Reclaimer:
         Where everybody may make files somebody may have taken that name: then it is a name nobody knows.
         """
         try:
-            return self._directory.rename(resident.name, zombie_name(resident.name))
+            return self._directory.rename(resident.name, retired_name(resident.name))
         except OSError as error:
             old, new = resident.name, another_name(resident.name)
-            log.warning("segment not renamed", old=old, new=zombie_name(old), error=error.strerror)
-            found = self._directory.rename(old, zombie_name(new))
+            log.warning("segment not renamed", old=old, new=retired_name(old), error=error.strerror)
+            found = self._directory.rename(old, retired_name(new))
             self.ledger.rename(resident, new)
             self.observer.renamed(old)
             return found
@@ -146,7 +146,7 @@ class Reclaimer:
             return True
         if resident.checked:
             self._by_key[resident.key] = retired
-        self.pins.keep(zombie_name(resident.name))
+        self.pins.keep(retired_name(resident.name))
         retired.condemned = self.is_pinned(resident) is False
         retired.probe_after_s = now_s + TICK_S
         return retired.condemned
@@ -154,7 +154,7 @@ class Reclaimer:
     def adopt(self, resident: Resident, now_s: float) -> None:
         """Watch a retired segment of an earlier life of the daemon."""
         self.ledger.add_retired(resident).probe_after_s = now_s + TICK_S
-        self.pins.keep(zombie_name(resident.name))
+        self.pins.keep(retired_name(resident.name))
 
     def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
         """Put a retired but still existing segment of exactly this version back into service."""
@@ -163,15 +163,15 @@ class Reclaimer:
             return None
         name = retired.resident.name
         try:
-            found = self._directory.rename(zombie_name(name), name)
+            found = self._directory.rename(retired_name(name), name)
         except OSError as error:  # somebody else has taken its name: the cell is loaded anew
-            log.warning("segment not renamed", old=zombie_name(name), new=name, error=error.strerror)
+            log.warning("segment not renamed", old=retired_name(name), new=name, error=error.strerror)
             self.never_revive(key)
             return None
         if not found:
             self._forget(retired)
             return None
-        self.pins.release(zombie_name(name))
+        self.pins.release(retired_name(name))
         del self._by_key[key]
         old = self.ledger.revive(retired)
         if old is not None:
@@ -184,7 +184,7 @@ class Reclaimer:
 
     def _forget(self, retired: Retired) -> int:
         resident = retired.resident
-        self.pins.release(zombie_name(resident.name))
+        self.pins.release(retired_name(resident.name))
         if self._by_key.get(resident.key) is retired:
             del self._by_key[resident.key]
         for slot in list(resident.sessions):
@@ -220,12 +220,12 @@ class Reclaimer:
         if used is False and now_s < retired.probe_after_s:
             retired.condemned = True  # its tick is not over yet
             return 0
-        self._directory.unlink(zombie_name(retired.resident.name))
+        self._directory.unlink(retired_name(retired.resident.name))
         return self._forget(retired)
 
     def _interval_s(self, retired: Retired) -> float:
         """When to look again at a segment that was found in use."""
-        if self.pins.keeps(zombie_name(retired.resident.name)):
+        if self.pins.keeps(retired_name(retired.resident.name)):
             retired.interval_s = min(max(TICK_S, 2 * retired.interval_s), WATCHED_INTERVAL_S)
             return retired.interval_s
         return max(RETIRED_INTERVAL_S, RETIRED_SHARE_S * len(self.ledger.retired))
@@ -235,10 +235,10 @@ class Reclaimer:
         names = self.pins.closed()
         if names is None:
             self._pinned_until_s.clear()
-            names = {zombie_name(name) for name in self.ledger.retired}
+            names = {retired_name(name) for name in self.ledger.retired}
         changed = False
         for name in names:
-            retired = self.ledger.retired.get(name.removesuffix(zombie_name("")))
+            retired = self.ledger.retired.get(name.removesuffix(retired_name("")))
             if retired is not None:
                 retired.interval_s = 0.0
                 changed |= self._probe(retired, now_s) > 0

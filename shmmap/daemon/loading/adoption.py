@@ -29,7 +29,7 @@ from shmmap.layers.spec import layer_spec
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.layout import SegmentHeader
-from shmmap.segment.names import another_name, is_zombie, segment_prefix, statistics_name, zombie_name
+from shmmap.segment.names import another_name, is_retired, retired_name, segment_prefix, statistics_name
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.verify import read_header
 
@@ -106,7 +106,7 @@ class Adoption:
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, block: PublishBlock) -> str:
         """Why a whole segment cannot serve; empty if it can."""
         cache, catalogue = self.cache, self.cache.catalogue
-        if is_zombie(name):
+        if is_retired(name):
             return "it was retired"
         if status.st_mode & 0o222 or status.st_nlink != 1:
             return "others may have changed it"
@@ -153,19 +153,19 @@ class Adoption:
         if not used:
             self._remove(name, found.why_not)
             return False
-        if not is_zombie(name):
-            hidden = zombie_name(name)
+        if not is_retired(name):
+            hidden = retired_name(name)
             try:
                 self.directory.rename(name, hidden)
             except OSError:  # somebody else has taken that name
-                hidden = zombie_name(another_name(name))
+                hidden = retired_name(another_name(name))
                 self.directory.rename(name, hidden)
             name = hidden
         self.cache.reclaimer.adopt(self._resident(fd, name, found, now_s), now_s)
         return True
 
     def _resident(self, fd: int, name: str, found: _Found, now_s: float) -> Resident:
-        live_name = name.removesuffix(zombie_name(""))
+        live_name = name.removesuffix(retired_name(""))
         nbytes, used_s = measured_bytes(fd), now_s - HAND_OUT_GRACE_S
         header, block = found.header, found.block
         if header is None or block is None:

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 
 from shmmap.daemon.host.inotify import CLOSED, Inotify
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import holders, is_pinned, lock_slot
+from shmmap.segment.pins import holders, in_use, lock_slot
 
 __all__ = ["PinSource", "PinSupport", "probe_pins"]
 
@@ -86,10 +86,10 @@ def _works(way: Callable[..., bool], *arguments: object) -> bool:
 
 
 def _leases_tell(fd: int, path: str) -> bool:
-    before = is_pinned(fd)
+    before = in_use(fd)
     with _mapped(path):
-        during = is_pinned(fd)
-    return (before, during, is_pinned(fd)) == (False, True, False)
+        during = in_use(fd)
+    return (before, during, in_use(fd)) == (False, True, False)
 
 
 def _locks_tell(fd: int, path: str) -> bool:

@@ -17,7 +17,7 @@ from typing import Final
 from shmmap.daemon.host.inotify import CLOSED, OVERFLOW, Inotify
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import holders, is_pinned
+from shmmap.segment.pins import holders, in_use
 
 __all__ = ["PinWatch"]
 
@@ -81,7 +81,7 @@ class PinWatch:
     def told(self, fd: int) -> bool:
         """Whether anybody else uses an open segment, by the kernel's word; False where it gives none."""
         if self.source is PinSource.LEASES:
-            return is_pinned(fd)
+            return in_use(fd)
         return self.source is PinSource.LOCKS and bool(holders(fd, limit=1))
 
     def is_used(self, name: str) -> bool | None:

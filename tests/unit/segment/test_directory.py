@@ -13,11 +13,11 @@ from shmmap.errors import ConfigError
 from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import (
     check_instance,
-    is_zombie,
+    is_retired,
     new_segment_name,
+    retired_name,
     segment_prefix,
     statistics_name,
-    zombie_name,
 )
 from tests.unit.segment.conftest import Publish
 
@@ -52,11 +52,11 @@ def test_rename_unlink_and_list(shm: ShmDirectory, publish: Publish) -> None:
     names = sorted(publish(seed=i) for i in range(3))
     Path(shm.path, "shmmap.unity.0011").touch()
     assert shm.names(segment_prefix("unit")) == names
-    assert shm.rename(names[0], zombie_name(names[0]))
+    assert shm.rename(names[0], retired_name(names[0]))
     assert not shm.rename(names[0], "/elsewhere")
-    assert [is_zombie(n) for n in shm.names(segment_prefix("unit"))] == [True, False, False]
-    assert shm.unlink(zombie_name(names[0]))
-    assert not shm.unlink(zombie_name(names[0]))
+    assert [is_retired(n) for n in shm.names(segment_prefix("unit"))] == [True, False, False]
+    assert shm.unlink(retired_name(names[0]))
+    assert not shm.unlink(retired_name(names[0]))
     assert shm.names(segment_prefix("unit")) == names[1:]
 
 
@@ -92,8 +92,8 @@ def test_names() -> None:
     made = {new_segment_name("x") for _ in range(1000)}
     assert len(made) == 1000
     assert all(len(name) == len("/shmmap.x.") + 16 and name.startswith(segment_prefix("x")) for name in made)
-    assert not any(is_zombie(name) for name in made)
-    assert all(is_zombie(zombie_name(name)) for name in made)
+    assert not any(is_retired(name) for name in made)
+    assert all(is_retired(retired_name(name)) for name in made)
 
 
 @pytest.mark.parametrize("name", ["", "a.b", "a/b", "..", "a b", "ä", "x" * 65, "a\n"])

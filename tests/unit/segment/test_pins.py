@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from shmmap.segment import pins
 from shmmap.segment.attach import AttachedSegment, attach
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import MAX_SLOT, holders, is_pinned, lock_slot, prepare_process
+from shmmap.segment.pins import MAX_SLOT, holders, in_use, lock_slot, prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from tests.support.mapping_process import MappingProcess
 from tests.support.segments import publish_segment
@@ -41,7 +41,7 @@ def sigio() -> Iterator[None]:
 def pinned(shm: ShmDirectory, name: str) -> bool:
     fd = shm.open(name)
     try:
-        return is_pinned(fd)
+        return in_use(fd)
     finally:
         os.close(fd)
 
@@ -114,7 +114,7 @@ def test_looking_does_not_disturb_whoever_opens_meanwhile(monkeypatch: pytest.Mo
                 met.append(fcntl.fcntl(fd, fcntl.F_GETLEASE))
 
             monkeypatch.setattr(pins, "step", hold)
-            assert not is_pinned(fd)
+            assert not in_use(fd)
             assert met == [fcntl.F_RDLCK], "the kernel asks for it back, so that a reader can go on"
             assert reader.stdout.readline() == "1\n"
             assert reader.wait() == 0
@@ -200,8 +200,8 @@ def test_nothing_of_it_needs_the_name(shm: ShmDirectory, publish: Publish) -> No
     keeper = shm.open(name)
     with MappingProcess([f"{shm.path}{name}"]):
         assert shm.unlink(name)
-        assert is_pinned(keeper)
-    assert not is_pinned(keeper)
+        assert in_use(keeper)
+    assert not in_use(keeper)
     os.close(keeper)
     assert not Path(f"{shm.path}{name}").exists()
 

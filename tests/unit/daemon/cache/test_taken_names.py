@@ -13,7 +13,7 @@ from pathlib import Path
 
 from shmmap.daemon.records import Resident
 from shmmap.protocol.messages import Selected
-from shmmap.segment.names import zombie_name
+from shmmap.segment.names import retired_name
 from shmmap.statistics.reader import read_statistics
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import InnerDaemon
@@ -46,10 +46,10 @@ def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> N
     one = inner(small_map.root)
     first = load(one, 1)
     old = first.name
-    with taken(one, zombie_name(old)), open(f"{one.shm_dir}{old}", "rb"):
+    with taken(one, retired_name(old)), open(f"{one.shm_dir}{old}", "rb"):
         one.cache.evict(first, one.now_s())
         assert first.name != old
-        assert Path(f"{one.shm_dir}{zombie_name(first.name)}").exists()
+        assert Path(f"{one.shm_dir}{retired_name(first.name)}").exists()
         assert shown(one) == {first.name.rpartition(".")[2]: "zombie"}
         assert load(one, 2) is first
         assert shown(one) == {first.name.rpartition(".")[2]: "resident"}

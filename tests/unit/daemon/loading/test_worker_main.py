@@ -19,7 +19,7 @@ import pytest
 from shmmap.daemon.loading import worker_messages
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import is_pinned, prepare_process
+from shmmap.segment.pins import in_use, prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from tests.support.daemon_process import wait_ended, wait_readable
 from tests.support.divided_map import random_points
@@ -270,7 +270,7 @@ def test_it_does_not_keep_what_it_passed_on(loader: Loader, tmp_path: Path) -> N
             again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY)
         finally:
             os.close(fd)
-        assert not is_pinned(again)
+        assert not in_use(again)
         os.close(again)
 
 
