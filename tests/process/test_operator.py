@@ -87,7 +87,7 @@ def test_six_questions(tight: Shmmap) -> None:
         told = tight("tail")
         assert re.search(r"^\d\d:\d\d:\d\d\.\d{3}  joined    localization, pid ", told, re.MULTILINE)
         assert re.search(r"loaded    0_0\.pcd points ", told)
-        assert re.search(r"pressure  [\d,]+ cells refused, .* of 1\.0 MiB used, .* in use by clients", told)
+        assert re.search(r"pressure  [\d,]+ cells? refused, .* of 1\.0 MiB used, .* in use by clients", told)
 
         # is the cache too small?
         after(tight, lambda told: told["refused_over_budget_10min"] > 0)
