@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shmmap.errors import NoSocket
@@ -35,7 +34,7 @@ def endpoint(args: argparse.Namespace) -> str | None:
         return endpoint_path(socket_path(directory, name or DEFAULT_INSTANCE))
     if name and (args.instance or name != DEFAULT_INSTANCE):
         places = [socket_path(place, name) for place in runtime_dirs()]
-        return next((place for place in places if Path(place).exists()), places[0])
+        return next((place for place in places if os.path.exists(place)), places[0])
     return None
 
 
@@ -45,7 +44,7 @@ def instance(args: argparse.Namespace) -> str:
     name = args.instance if args.instance or args.endpoint else _setting(args, "instance")
     if name or not named:
         return name or DEFAULT_INSTANCE
-    return Path(endpoint_path(named)).name.removesuffix(".sock")
+    return os.path.basename(endpoint_path(named)).removesuffix(".sock")
 
 
 def _endpoint_setting(args: argparse.Namespace) -> str:

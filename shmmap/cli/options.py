@@ -6,8 +6,8 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from _thread import TIMEOUT_MAX  # of `threading`, which takes 2 ms to import
 from collections.abc import Callable
-from threading import TIMEOUT_MAX
 from typing import TypeAlias
 
 from shmmap.errors import ConfigError

@@ -8,15 +8,10 @@ printed is shown escaped (``\\x1b``), in this one place.
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import os
-import shutil
 import sys
-import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, Literal, TextIO
+from typing import Final, Literal, NamedTuple, TextIO
 
 from shmmap.quantities import counted, format_bytes, format_duration, format_metres
 
@@ -40,8 +35,7 @@ __all__ = [
 _NARROWEST: Final = 20  # columns that text needs to be worth breaking
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
+class Column(NamedTuple):
     """One column of a table; numbers are aligned right.
 
     A terminal too narrow for the table goes without the columns that are ``spare``, highest first.
@@ -72,6 +66,8 @@ def print_line(text: str = "", *, file: TextIO | None = None, flush: bool = Fals
 
 def json_text(value: object, *, indent: int | None = None) -> str:
     """Return one JSON document whose strings hold nothing that a terminal obeys."""
+    import json
+
     text = json.dumps(value, indent=indent, allow_nan=False, ensure_ascii=False)
     if text.replace("\n", "").isprintable():
         return text
@@ -89,7 +85,7 @@ def print_json(value: object) -> None:
 def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under headings: ruled and coloured on a terminal, plain and aligned in a pipe."""
     rows = [[printable(text) for text in row] for row in rows]
-    if wants_style() and importlib.util.find_spec("rich") is not None:  # a client-only install lacks it
+    if wants_style() and _has_rich():
         _print_rich(columns, rows)
         return
     cells = [[column.name for column in columns], *rows]
@@ -105,6 +101,13 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
 def wants_style() -> bool:
     """Whether to print colours: on a terminal that can, unless NO_COLOR says not to."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def _has_rich() -> bool:
+    """Whether rich is installed: a client-only install lacks it."""
+    from importlib.util import find_spec
+
+    return find_spec("rich") is not None
 
 
 def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
@@ -151,8 +154,12 @@ def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
 def print_hanging(head: str, text: str) -> None:
     """Print ``head`` and ``text`` as a line; on a terminal too narrow for it the text goes on below."""
     head, lines = printable(head), [printable(text)]
-    room = shutil.get_terminal_size().columns - len(head) if sys.stdout.isatty() else 0
-    if len(lines[0]) > room >= _NARROWEST:
-        lines = textwrap.wrap(lines[0], room, break_long_words=False, break_on_hyphens=False)
+    if sys.stdout.isatty():
+        import shutil
+        import textwrap
+
+        room = shutil.get_terminal_size().columns - len(head)
+        if len(lines[0]) > room >= _NARROWEST:
+            lines = textwrap.wrap(lines[0], room, break_long_words=False, break_on_hyphens=False)
     for number, line in enumerate(lines):
         print(f"{' ' * len(head) if number else head}{line}".rstrip())
