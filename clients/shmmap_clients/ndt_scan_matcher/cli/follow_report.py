@@ -129,8 +129,7 @@ class FollowReport:
             line = (
                 f"\r{self._frames:6} {printable(frame.name):20.20} ({x:9.2f}, {y:9.2f})"
                 f" NVTL {frame.result.nvtl:5.2f} {frame.result.iterations:3} it"
-                f" {frame.latency_s * 1e3:7.1f} ms"
-                f" {frame.state:9}"
+                f" {frame.latency_s * 1e3:7.1f} ms {frame.state:9}"
             )
             print(line, end="", file=sys.stderr, flush=True)
 
