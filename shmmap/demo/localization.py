@@ -125,7 +125,7 @@ class Localization:
         progress.stage("Localizing simulated LiDAR scans with shmmap-ndt", len(scans))
         with Program("shmmap-ndt", _PROGRAM, words, self._work, piped=True) as program:
             document: dict[str, Any] = {}
-            for line in program.lines():
+            for line in program.lines(_PATIENCE_S):
                 document = json.loads(line)
                 if "error_m" in document:
                     progress.step(

@@ -17,6 +17,7 @@ from typing import Any, Final
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
 from shmmap.testing.environment import without_settings
+from shmmap.testing.process_watch import wait_readable
 
 __all__ = ["Program"]
 
@@ -94,12 +95,26 @@ class Program:
                 start_new_session=self._own_session,
             )
 
-    def lines(self) -> Iterator[str]:
-        """What a ``piped`` one writes to stdout, line by line, until it ends."""
+    def lines(self, patience_s: float) -> Iterator[str]:
+        """What a ``piped`` one writes to stdout, line by line, until it ends.
+
+        Raises
+        ------
+        InternalError
+            It has written nothing for ``patience_s``.
+        """
         if self._process is None or self._process.stdout is None:
             raise InternalError(f"nobody listens to {self.name}")
-        with self._process.stdout as out:
-            for line in out:
+        out = self._process.stdout.fileno()
+        rest = b""
+        while True:
+            if not wait_readable([out], patience_s):
+                raise InternalError(f"{self.name} says nothing for {patience_s:g} s: {self.last_words()}")
+            piece = os.read(out, 1 << 16)
+            if not piece:
+                return
+            *whole, rest = (rest + piece).split(b"\n")
+            for line in whole:
                 yield line.decode()
 
     def wait(self, timeout_s: float) -> int:

@@ -20,6 +20,7 @@ from shmmap.testing.daemon_process import DaemonProcess
 __all__ = ["ThreeProgramsResult", "run_three_programs"]
 
 _STEP_METRES: Final = 2.0
+_PATIENCE_S: Final = 900.0  # the elevation map may just have begun when the last scan was sent
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ def run_three_programs(
         ) as program,
     ):
         last: dict[str, Any] = {}
-        for line in program.lines():
+        for line in program.lines(_PATIENCE_S):
             last = json.loads(line)
             if "programs" not in last:
                 progress.step()

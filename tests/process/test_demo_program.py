@@ -37,7 +37,16 @@ def test_what_it_says_in_the_end(program: str, tmp_path: Path) -> None:
 def test_what_it_says_meanwhile(program: str, tmp_path: Path) -> None:
     words = ["for n in range(3): print(n, flush=True)"]
     with Program("one", program, words, tmp_path, piped=True) as one:
-        assert [json.loads(line) for line in one.lines()] == [0, 1, 2]
+        assert [json.loads(line) for line in one.lines(60.0)] == [0, 1, 2]
+
+
+def test_one_that_says_nothing_is_not_waited_for_forever(program: str, tmp_path: Path) -> None:
+    words = ["import signal; print('begun', flush=True); signal.pause()"]
+    with Program("one", program, words, tmp_path, piped=True) as one:
+        said = one.lines(60.0)
+        assert next(said) == "begun"
+        with pytest.raises(InternalError, match="one says nothing"):
+            next(one.lines(0.01))
 
 
 def test_it_ends_with_all_that_it_has_started(program: str, tmp_path: Path) -> None:
@@ -48,7 +57,7 @@ def test_it_ends_with_all_that_it_has_started(program: str, tmp_path: Path) -> N
         "print(child.pid, flush=True); signal.pause()"
     )
     with Program("one", program, [code], tmp_path, piped=True) as one:
-        child = int(next(one.lines()))
+        child = int(next(one.lines(60.0)))
         os.kill(child, 0)
     assert wait_ended(child)
     assert not one.running
@@ -61,7 +70,7 @@ def test_processor_time_of_a_process_and_of_its_children_that_ended(program: str
         "print('burnt', flush=True); import signal; signal.pause()"
     )
     with Program("one", program, [code], tmp_path, piped=True) as one:
-        assert next(one.lines()) == "burnt\n"
+        assert next(one.lines(60.0)) == "burnt"
         assert one.pid is not None
         assert 0.75 <= cpu_seconds([one.pid]) < 60.0
         assert cpu_seconds([one.pid, os.getpid()]) > cpu_seconds([one.pid])

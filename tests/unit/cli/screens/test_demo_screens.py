@@ -56,7 +56,7 @@ def test_eight_lines_with_what_was_measured(capsys: pytest.CaptureFixture[str]) 
     assert (
         lines["one more"] == "Each further process costs 115 MiB with a private copy, 20.0 MiB with shmmap."
     )
-    assert "78.0 ms with private copies, 2.0 ms with shmmap" in lines["waiting"]
+    assert "78.0 ms at worst with private copies, 2.0 ms with shmmap" in lines["waiting"]
     assert "4.1 s; with shmmap: 6.0 s" in lines["CPU"]
     assert "117 cells: 1.5 s" in lines["CPU"]
     for words in ("for 1.7 s", "8 processes", "12 million", "10 times a second", "104.0 ms", "143 of 144"):
