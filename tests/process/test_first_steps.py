@@ -96,6 +96,8 @@ class Newcomer:
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a repository with one commit: the tree as it stands on disk."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("this tree is no checkout: nothing to clone")
     repository = tmp_path_factory.mktemp("published") / "shmmap.git"
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
@@ -170,7 +172,7 @@ def under_ten(newcomer: Newcomer, *blocks: list[str]) -> None:
 @pytest.mark.parametrize("newcomer", [one for one in WHERE if one.startswith("python")], indirect=True)
 def test_from_the_clone_to_the_demonstration(newcomer: Newcomer) -> None:
     under_ten(newcomer)
-    assert "ONE SHARED COPY" in newcomer.told
+    assert re.search(r"^8 with shmmap  ", newcomer.told, re.MULTILINE)
     assert (newcomer.clone / "shmmap-demo.svg").is_file()
 
 

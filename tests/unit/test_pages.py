@@ -6,12 +6,18 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
+import sys
 
 import pytest
 
 from shmmap.cli.parser import build_parser
 from tests.support.daemon_process import ROOT
 from tests.support.pages import Page, all_pages, read_page
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 PAGES = all_pages()
 GUIDES = [name for name in PAGES if name != "CHANGELOG.md"]  # which tells of the past
@@ -107,3 +113,14 @@ def test_nothing_says_that_the_package_is_on_an_index() -> None:
     for path in [*(ROOT / name for name in PAGES), *sources]:
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"pip3? install[^\n&|]*['\" ]shmmap(\[|['\"`\s])", text), path
+
+
+def test_the_small_installs_name_the_dependencies() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = [re.split(r"[><=;]", one)[0] for one in project["dependencies"] if not one.startswith("open3d")]
+    page = read_page("shmmap/INSTALL.md")
+    for name, packages in (("slim", needed), ("client-only", needed[:4])):
+        (line,) = page.commands(name)
+        first, second = re.findall(r"pip install -q ([^&]+)", line)
+        assert first.split() == packages, name
+        assert second == "--no-deps ."
