@@ -62,10 +62,10 @@ class SearchCell:
         BadRequest
             They are not those of a ``search`` layer.
         """
-        try:
-            xyz, tile, start = columns["xyz"], columns["tile"], columns["start"]
-        except KeyError as error:
-            raise BadRequest(f"not a search layer: {error}") from None
+        missing = [name for name in ("xyz", "tile", "start") if name not in columns]
+        if missing:
+            raise BadRequest(f"not a search layer: it has no column {', '.join(missing)}")
+        xyz, tile, start = columns["xyz"], columns["tile"], columns["start"]
         if xyz.dtype not in (np.dtype("<f4"), np.dtype("<f8")) or not xyz.flags.c_contiguous:
             raise BadRequest(f"xyz of a search layer must be float32 or float64, not {xyz.dtype}")
         return cls(xyz, tile, start, float(lattice.leaf[0]), (lattice.first[0], lattice.first[1]), owner)
