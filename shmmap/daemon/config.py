@@ -244,7 +244,7 @@ def trace_settings(
     attributes = {called: name for name, called in FILE_NAMES.items()}
     for word, value, origin in given:
         name = attributes.get(word, word)
-        if name not in settings:
+        if name not in settings or (word in FILE_NAMES and origin != "command line"):
             raise _unknown(word, origin)
         settings[name] = Setting(_convert(name, value, origin), origin)
     endpoint = settings["endpoint"]

@@ -26,6 +26,17 @@ def test_each_setting_knows_its_origin(tmp_path: Path) -> None:
     assert set(found) == set(DaemonConfig.__dataclass_fields__)
 
 
+@pytest.mark.parametrize("word", ["budget_bytes", "cache_bytes"])
+def test_a_setting_has_one_name(word: str, tmp_path: Path) -> None:
+    """Not that of the attribute in the code."""
+    file = tmp_path / "shmmap.toml"
+    file.write_text(f"{word} = '1G'\n")
+    with pytest.raises(ConfigError, match=word):
+        trace_settings({}, file=str(file), environ={})
+    with pytest.raises(ConfigError, match=word):
+        trace_settings({}, environ={f"SHMMAP_{word.upper()}": "1G"})
+
+
 def test_lines_that_only_look_like_settings(tmp_path: Path) -> None:
     file = tmp_path / "shmmap.toml"
     file.write_text('map_path = """\nworkers = 9\n"""\n"workers"=3\n[budget]\nworkers = 4\n')
