@@ -97,7 +97,7 @@ def _until(one: DaemonProcess, settled: Callable[[dict[str, Any]], bool]) -> dic
     waiting = Patience()
     found: dict[str, Any] = doctor(one)[1]["cells"]
     while waiting(not settled(found)):
-        found: dict[str, Any] = doctor(one)[1]["cells"]
+        found = doctor(one)[1]["cells"]
     return found
 
 
