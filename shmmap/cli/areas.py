@@ -64,7 +64,8 @@ def add_area_options(
             "--z",
             metavar="MIN,MAX",
             type=lambda t: numbers(t, "MIN,MAX"),
-            help="only cells with points between these heights",
+            help="only cells that reach into these heights, metres; also cells never loaded, whose heights "
+            "are unknown",
         )
 
 
@@ -137,7 +138,7 @@ def _at_height(area: Area, cell: CellInfo) -> bool:
 
 
 def area_text(area: Area) -> str:
-    """Return an area as a sentence goes on with it: ``"within 40 m of (10, 20)"``."""
+    """Return an area as a sentence names it: ``"within 40 m of (10, 20)"``."""
     from shmmap.geometry import Box, Circle
 
     if isinstance(area, Box):
@@ -148,7 +149,7 @@ def area_text(area: Area) -> str:
         centre = f"({format_metres(area.x)}, {format_metres(area.y)})"
         text = f"in the square of half-side {format_metres(area.radius)} m about {centre}"
     if area.z is not None:
-        text += f" with points between z = {format_metres(area.z.min)} and {format_metres(area.z.max)} m"
+        text += f", z {format_metres(area.z.min)} .. {format_metres(area.z.max)} m"
     return text
 
 
@@ -194,7 +195,7 @@ def no_cell_there(args: argparse.Namespace, client: Client, area: Area) -> int:
     if (origin := moved_by(welcome.id_prefix)) is not None:
         x, y, z = map(format_metres, origin)
         hint = (
-            "the points were moved near the map's origin when they were divided: subtract"
+            "`divide` shifted the points close to the origin: subtract"
             f" ({x}, {y}, {z}) from coordinates of the cloud"
         )
     return nothing_found(args, f"no cell {area_text(area)}; {spans}", hint)

@@ -72,7 +72,7 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
     if found.identity is None:
         raise NoSocket(
             f"no daemon runs as instance {name!r} with segments in {directory}",
-            hint="start one with `shmmap serve MAP`, or say which with --instance and --shm-dir",
+            hint="start one with `shmmap serve MAP`, or say which: --endpoint, or --instance with --shm-dir",
         )
     return found, found.identity
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
 from shmmap.cli.program import exit_code_of, join_negative_values
+from shmmap.errors import BadRequest
 
 __all__ = ["main", "serve_main"]
 
@@ -28,6 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv), NUMBER_OPTIONS)
 
     def run() -> int:
+        if not words:
+            build_parser().print_help(sys.stderr)
+            return BadRequest.exit_code
         args = build_parser(words).parse_args(words)
         code: int = args.run(args)
         return code

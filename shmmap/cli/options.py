@@ -129,7 +129,12 @@ def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True
     group.add_argument(
         "--instance", metavar="NAME", help="name of the daemon among several (default: default)"
     )
-    group.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
+    group.add_argument(
+        "--endpoint",
+        metavar="PATH",
+        help="request socket, a path or an ipc:// URL (default: SHMMAP_ENDPOINT, unless --instance or "
+        "--runtime-dir is given)",
+    )
     group.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
     group.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
     if json:

@@ -43,6 +43,24 @@ VERBS: Final = {
 }
 """Modules by verb, in the order of the help; one is imported when its verb is used, all for the help."""
 
+_EPILOG: Final = """\
+Try `shmmap demo`: it needs no map.  `shmmap VERB --help` explains a verb and its JSON.
+
+Exit codes, of every verb:
+  0    done
+  1    a negative answer: nothing found, a cell failed, not permitted, a `fail` of doctor
+  2    wrong usage, or the output exists already
+  65   bad data
+  66   no such map or file
+  69   no daemon answers
+  70   internal error: a defect in shmmap
+  73   an output cannot be written
+  75   another process runs this instance, or makes this output
+  76   daemon and client speak different protocol versions
+  78   a mistake in the settings
+  130  interrupted (128 + signal)
+  141  the reader of the output went away"""
+
 _OWN_OPTIONS: Final = frozenset({"--help", "--version"})
 _FLAGS: Final = frozenset({"--json"})  # common options without a value
 NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z", "--origin", "--translate"})
@@ -67,9 +85,10 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     """
     parser = Parser(
         prog="shmmap",
-        description="Serve a vehicle's point-cloud map to every process of the machine from one copy in "
-        "shared memory.",
-        epilog="Try `shmmap demo`: it needs no map.  `shmmap VERB --help` explains a verb and its JSON.",
+        description="Serve a vehicle's point-cloud map to every process of the machine\n"
+        "from one copy in shared memory.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"shmmap {installed_version()}")
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)

@@ -25,15 +25,23 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         # an abbreviation that works today would break with tomorrow's options
         super().__init__(**settings, allow_abbrev=False)
+        self._words: list[str] = []
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse, and let each verb refuse what it does not know itself: so the hint names its help."""
+        self._words = list(sys.argv[1:] if args is None else args)
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self._refuse(f"unrecognized arguments: {' '.join(unknown)}", unknown[0].split("=")[0])
+            self._refuse_unknown(unknown)
         return found, unknown
+
+    def _refuse_unknown(self, unknown: Sequence[str]) -> NoReturn:
+        word = unknown[0].split("=")[0]
+        if word.startswith("-"):
+            self._refuse(f"unknown option {word}", word)
+        self._refuse(f"unexpected argument: {' '.join(unknown)}", word)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
@@ -47,6 +55,11 @@ class Parser(argparse.ArgumentParser):
         self.error(f"{message}; did you mean {near[0]}?" if near else message)
 
     def error(self, message: str) -> NoReturn:
+        words, self._words = self._words, []
+        options = (word for word in words if word.startswith("--") and len(word) > len("--"))
+        unknown = [word for word in options if word.split("=")[0] not in self._option_string_actions]
+        if unknown and message.endswith("required"):  # a misspelt option is why another one is missing
+            self._refuse_unknown(unknown)
         complain(self.prog, message, f"{self.prog} --help")
         sys.exit(2)
 
@@ -112,7 +125,7 @@ def add_allow_empty(parser: argparse.ArgumentParser) -> None:
 def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, name: str = "shmmap") -> int:
     """Say once that there is nothing of what was asked for; returns the exit code.
 
-    A program that goes on with nothing would take it for an answer: so that is 1, unless ``--allow-empty``
+    A program that continues with nothing would take it for an answer: so that is 1, unless ``--allow-empty``
     was given.
     """
     complain(name, message, hint)

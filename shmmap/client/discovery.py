@@ -29,7 +29,10 @@ from shmmap.protocol.endpoint import (
 __all__ = ["candidates", "check_socket", "find_socket"]
 
 _SIGNATURE_BYTES: Final = 10
-_START_HINT: Final = "start one with `shmmap serve MAP`, or name its socket with SHMMAP_ENDPOINT"
+_START_HINT: Final = (
+    "start one with `shmmap serve MAP`, or say which: --endpoint (SHMMAP_ENDPOINT), or --instance with"
+    " --runtime-dir"
+)
 
 
 def candidates(endpoint: str | None = None, environ: Mapping[str, str] = os.environ) -> list[str]:

@@ -53,7 +53,7 @@ class EventStream:
     """What happens in the daemon, in order; not thread-safe.
 
     Iterating waits for ever; `next` waits as long as one likes.  When the daemon is restarted the stream
-    goes on with the new epoch's events from the first one.
+    continues with the new epoch's events from the first one.
 
     Parameters
     ----------

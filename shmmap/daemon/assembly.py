@@ -159,7 +159,7 @@ class Service:
                 log.info(
                         "ready", endpoint=self._socket_path, instance=self._config.instance,
                         map=self._config.map_path, cells=cells, budget_bytes=memory.cache.ledger.budget_bytes,
-                        after_s=time.monotonic() - started_s,
+                        start_s=time.monotonic() - started_s,
                     )  # fmt: skip
                 self._manager.ready(f"serving {cells} cells")
                 _settle_memory()

@@ -110,12 +110,13 @@ def run(config: DaemonConfig) -> int:
         started_s = time.monotonic()
         catalogue = origin.load()
         for problem in catalogue.problems:
-            log.warning("map problem", text=problem)
+            log.warning("problem in the map", what=problem)
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
             stack.callback(lambda: memory.close(keep=signals.keep))
         service = Service(config, memory, Reloader(origin), ServiceManager(), path, gid, signals, activated)
         service.run(started_s)
+    log.info("stopped", instance=config.instance)
     return 0
 
 

@@ -80,6 +80,7 @@ class MapInMemory:
             ) from error
         self.statistics.set("pin_source", list(PinSource).index(pins.source))
         self.statistics.set("last_reload_unix_ns", time.time_ns())
+        self.statistics.set("map_problems", len(catalogue.problems))
         ledger = Ledger(budget)
         ledger.overhead_bytes = self.statistics.size_bytes
         self.statistics.reserve = ledger.add_overhead

@@ -12,7 +12,7 @@ from shmmap.segment.layout import SourceStamp
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired"]
 
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
-"""Failures for want of memory: they pass when somebody lets go."""
+"""Failures for lack of memory: they pass when somebody lets go."""
 
 
 class Key(NamedTuple):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive whose daemon is killed with SIGKILL and starts again, while everybody goes on with what it has."""
+"""A drive whose daemon is killed with SIGKILL and starts again, while all continue with what they have."""
 
 from __future__ import annotations
 

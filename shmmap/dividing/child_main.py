@@ -3,7 +3,7 @@
 
 It says what it does in packets of JSON: ``{"stage", "done", "total"}`` now and then, and
 ``{"error", "message", "hint"}`` before it ends with that error.  It dies with the daemon, and a later one
-goes on where it stopped.
+continues where it stopped.
 """
 
 from __future__ import annotations

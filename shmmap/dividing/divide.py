@@ -268,7 +268,7 @@ class _Run:
         have = os.statvfs(self._space.path)
         free = have.f_bavail * have.f_frsize
         if self._state is not None:
-            return  # much of it is there already
+            return  # much of it exists
         if needed > free:
             raise CannotWrite(
                 f"the map needs about {format_bytes(needed)} in {os.path.dirname(self._space.out)}, "

@@ -96,7 +96,7 @@ def merge(
     if encoding not in MERGED_ENCODINGS:
         raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(MERGED_ENCODINGS)}")
     if os.path.isdir(out) or (os.path.lexists(out) and not force):
-        raise BadRequest(f"{out} is there already", hint="--force replaces a file")
+        raise BadRequest(f"{out} exists", hint="--force replaces a file")
     with contextlib.ExitStack() as stack:
         sources: list[Source] = []
         read: list[InputFile] = []

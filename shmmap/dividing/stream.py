@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All inputs as one stream of rows, with a place to go on from."""
+"""All inputs as one stream of rows, with a place to continue from."""
 
 from __future__ import annotations
 

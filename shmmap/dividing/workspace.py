@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an output is made before it appears, and what a killed run can go on from.
+"""Where an output is made before it appears, and what a killed run can continue from.
 
 The directory lies beside the output, hidden.  Its state file says how far the run came; it is replaced
 in one step and only after the rows it speaks of were handed to the kernel.  What a killed process wrote
@@ -78,7 +78,7 @@ class Workspace:
         os.close(self._lock)
 
     def state(self) -> dict[str, Any] | None:
-        """What `save` wrote last since the machine started; None when there is nothing to go on from."""
+        """What `save` wrote last since the machine started; None when there is nothing to continue from."""
         try:
             state = json.loads(Path(self.path, _STATE).read_bytes())
         except (OSError, ValueError):

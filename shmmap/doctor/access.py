@@ -14,6 +14,7 @@ from typing import Final
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Patient
 from shmmap.errors import DaemonUnreachable, NoAnswer, NoSocket, ProtocolMismatch, SocketPermission
+from shmmap.quantities import counted
 
 __all__ = ["check_group", "check_map_access", "check_socket"]
 
@@ -127,6 +128,13 @@ def check_map_access(patient: Patient) -> Finding:
     if not path:
         return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
     if patient.alive:
+        problems = patient.seen.counters.get("map_problems", 0) if patient.seen is not None else 0
+        if problems:
+            return warn(
+                name,
+                f"{path} is being served, but reading it found {counted(problems, 'problem')}",
+                "the daemon's log names them, and so does `shmmap reload`",
+            )
         return ok(name, f"{path} is being served")
     if not os.path.exists(path):
         try:
@@ -140,7 +148,7 @@ def check_map_access(patient: Patient) -> Finding:
         return fail(
             name,
             f"{path} lies where the service sees nothing (ProtectHome=, PrivateTmp=)",
-            f"sudo shmmap unit install --map {path}, or see drop-ins/maps-in-home.conf",
+            f"sudo shmmap unit install --map {path}, or see `shmmap unit print drop-ins/maps-in-home.conf`",
         )
     shown = uid != patient.uid and _shown_to_service(patient, path)
     closed = _closed_to(uid, path, parents=not shown)

@@ -53,16 +53,18 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
             "raise --budget",
         )
     if evicted:
-        return Verdict(False, f"{evicted:,} evicted in the last 10 min, hardly any asked for again")
+        return Verdict(False, f"{evicted:,} evicted for room in the last 10 min, hardly any asked for again")
     past = [
         f"{count:,} {what}"
         for count, what in (
-            (counters.get("evictions", 0), "evicted"),
+            (counters.get("evictions", 0), "evicted for room"),
             (counters.get("refused_over_budget", 0), "refused"),
         )
         if count
     ]
     if past:
         before = " and ".join(past)
-        return Verdict(False, f"nothing evicted or refused in the last 10 min ({before} since the start)")
-    return Verdict(False, "nothing evicted or refused")
+        return Verdict(
+            False, f"nothing evicted for room or refused in the last 10 min ({before} since the start)"
+        )
+    return Verdict(False, "nothing evicted for room, nothing refused")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from shmmap.doctor.access import check_group, check_map_access, check_socket
+from shmmap.doctor.cells import check_cells
 from shmmap.doctor.finding import Finding
 from shmmap.doctor.kernel import check_descriptors, check_pins
 from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
@@ -27,6 +28,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_group,
     check_map_access,
     check_reload,
+    check_cells,
     check_shared_memory,
     check_cache,
     check_memory_limit,

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-__all__ = ["Finding", "State", "fail", "ok", "warn", "worst"]
+__all__ = ["Finding", "State", "fail", "ok", "skip", "warn", "worst"]
 
 State = Literal["ok", "warn", "fail"]
 _SEVERITY: Final[dict[State, int]] = {"ok": 0, "warn": 1, "fail": 2}
@@ -26,12 +26,20 @@ class Finding:
         What is so.
     advice
         What to do; empty where nothing has to be done.
+    skipped
+        It could not be looked at, and nothing is wrong with that; ``state`` is ``ok`` then.
     """
 
     name: str
     state: State
     fact: str
     advice: str = ""
+    skipped: bool = False
+
+
+def skip(name: str, fact: str) -> Finding:
+    """Return that there was nothing to look at."""
+    return Finding(name, "ok", fact, skipped=True)
 
 
 def ok(name: str, fact: str, advice: str = "") -> Finding:

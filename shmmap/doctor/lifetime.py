@@ -11,7 +11,7 @@ import time
 from typing import Final
 
 import shmmap
-from shmmap.doctor.finding import Finding, fail, ok, warn
+from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes
@@ -38,7 +38,8 @@ def check_daemon(patient: Patient) -> Finding:
         return warn(
             name, f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`"
         )
-    fact = f"instance {instance}, pid {identity.pid}, is {state}"
+    told = {"stopped": "paused (SIGSTOP or a debugger)"}.get(state, state)
+    fact = f"instance {instance}, pid {identity.pid}, is {told}"
     if state == "dead":
         return fail(
             name, f"{fact}: it crashed or was killed", "start it again: it keeps the cells that are in memory"
@@ -140,12 +141,16 @@ def check_reload(patient: Patient) -> Finding:
     """Could the map be read the last time?"""
     name = "reload"
     if not patient.alive or patient.seen is None:
-        return ok(name, "no daemon runs")
+        return skip(name, "no daemon runs")
     count = patient.seen.counters
     at_ns = count.get("last_reload_unix_ns", 0)
-    fact = f"the map was read again {counted(count.get('reloads', 0), 'time')}"
-    if at_ns:
-        fact += f", last at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at_ns * 1e-9))}"
+    at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_ns * 1e-9)) if at_ns else ""
+    if again := count.get("reloads", 0):
+        fact = f"the map was read at the start and {counted(again, 'time')} again" + (
+            at and f", last at {at}"
+        )
+    else:
+        fact = "the map was read once, at the start" + (at and f" ({at})")
     if count.get("last_reload_failed", 0):
         return fail(
             name,

@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
 from shmmap.doctor.cache_size import cache_verdict
-from shmmap.doctor.finding import Finding, fail, ok, warn
+from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.quantities import format_bytes
 
@@ -62,7 +62,7 @@ def check_shared_memory(patient: Patient) -> Finding:
     fact = f"{path}: {format_bytes(size)}, {format_bytes(free)} free"
     if not budget:
         return ok(name, f"{fact}; the budget is chosen at start")
-    fact += f"; budget {format_bytes(budget)}, of which {format_bytes(used)} are in use"
+    fact += f"; budget {format_bytes(budget)}, of which {format_bytes(used)} taken"
     enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={_enough(budget)} {mount.point}`"
     if budget > free + used:
         return fail(name, fact, enlarge)
@@ -79,7 +79,7 @@ def check_cache(patient: Patient) -> Finding:
     """Is the budget enough for what clients ask for?  The verdict of ``status``."""
     name = "cache size"
     if not patient.alive or patient.seen is None:
-        return ok(name, "no daemon runs")
+        return skip(name, "no daemon runs")
     verdict = cache_verdict(patient.seen.counters)
     return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
 
@@ -161,5 +161,6 @@ def check_huge_pages(patient: Patient) -> Finding:
     return ok(
         name,
         f"off for {mount.point}",
-        "cells well above 2 MiB load and read faster with them: see drop-ins/huge-pages.conf",
+        "cells well above 2 MiB load and read faster with them: see"
+        " `shmmap unit print drop-ins/huge-pages.conf`",
     )

@@ -75,7 +75,7 @@ class SourceFile:
             self._unreadable(error)
 
     def start(self, head: bytes) -> None:
-        """Digest ``head``, the first bytes of the file, and go on after it."""
+        """Digest ``head``, the first bytes of the file, and continue after it."""
         self.at = len(head)
         self._hash.reset()
         self._hash.update(head)

@@ -2,7 +2,7 @@
 """Preparing a whole map: every cell to a worker, on all cores, until nothing is missing.
 
 Workers are processes that the kernel ends with this one.  A worker that dies costs the cell it worked
-on; another takes its place.  Stopped at any moment and started again, the run goes on where it was:
+on; another takes its place.  Stopped at any moment and started again, the run continues where it was:
 what is in the cache is only looked at.
 """
 

@@ -45,7 +45,7 @@ def interrupts_later() -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_interrupt() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does; after the first, cleaning up goes on in peace."""
+    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does; after the first, cleaning up is not interrupted."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         del number, frame

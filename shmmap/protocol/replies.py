@@ -98,7 +98,7 @@ class Holder(msgspec.Struct, array_like=True, frozen=True):
     session : int
         Number of the client's session; 0: a process maps segments without one.
     pid, uid : int
-        Process and user by the kernel's word; 0 and -1 where it does not tell.
+        Process and user according to the kernel; 0 and -1 where it does not tell.
     client : str
         What the client calls itself, by default its script's name.
     bytes : int
@@ -190,10 +190,10 @@ class Released(msgspec.Struct, array_like=True, tag="released"):
 
 
 class SessionRow(msgspec.Struct, array_like=True, frozen=True):
-    """One client as the daemon sees it; ``pid`` is the kernel's word, 0 where it gives none.
+    """One client as the daemon sees it; ``pid`` is what the kernel says, 0 where it says nothing.
 
     ``cells`` and ``bytes`` are what it was handed and did not say it dropped; ``mapped_bytes`` what
-    it maps by the kernel's word, ``superseded`` the segments among them that have left service or have a
+    it maps according to the kernel, ``superseded`` the segments among them that have left service or have a
     successor.
     """
 

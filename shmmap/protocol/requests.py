@@ -33,7 +33,7 @@ class Hello(msgspec.Struct, array_like=True, tag="hello"):
     """First message of a session.
 
     ``session`` is the slot of the client's session with an earlier life of the daemon, 0 for none: it
-    keeps it, so that the locks it holds go on naming it.
+    keeps it, so that the locks it holds still name it.
     """
 
     request: int
@@ -152,7 +152,7 @@ class Shutdown(msgspec.Struct, array_like=True, tag="shutdown"):
 
 
 class Bye(msgspec.Struct, array_like=True, tag="bye"):
-    """The session ends; there is no reply.  What it still maps stays in use, by the kernel's word."""
+    """The session ends; there is no reply.  What it still maps stays in use, according to the kernel."""
 
     request: int
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shared-memory directory as the daemon uses it: make, publish, retire, list and remove segments.
 
-Nothing here maps a segment or keeps it open: the kernel's word on who still uses a segment
+Nothing here maps a segment or keeps it open: what the kernel says of who still uses a segment
 (`shmmap.segment.pins`) counts every open file, the daemon's own included.
 """
 

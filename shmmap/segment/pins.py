@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who still uses a segment: the kernel's word, not a timer's.
+"""Who still uses a segment: what the kernel says, not a timer.
 
 A write lease (``F_SETLEASE``) on a file is granted only if nobody else has it open or mapped.  That
 holds through renames, client crashes, SIGSTOP and daemon restarts, and costs 6 us.  Whoever takes

@@ -25,7 +25,7 @@ __all__ = ["SegmentWriter", "write_all"]
 
 
 def write_all(fd: int, data: memoryview, offset: int) -> None:
-    """Write all of ``data`` at ``offset``; a short write goes on where it stopped."""
+    """Write all of ``data`` at ``offset``; a short write is continued where it stopped."""
     while data:
         written = os.pwrite(fd, data, offset)
         data = data[written:]

@@ -46,7 +46,7 @@ class ClientRow(NamedTuple):
     session
         Its number.
     pid, uid
-        By the kernel's word; pid 0 and uid -1 where it gives none.
+        According to the kernel; pid 0 and uid -1 where it gives none.
     cells, bytes
         Versions it holds or was handed, and their memory.
     requests

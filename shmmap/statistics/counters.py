@@ -28,7 +28,7 @@ SPANS: Final = {"10s": 10, "1min": 60, "10min": 600}
 WINDOWED: Final = {
     "hits": "Cells answered from memory",
     "misses": "Cells that had to be loaded first",
-    "evictions": "Segments retired to make room or on request",
+    "evictions": "Segments retired to make room",
     "loads_after_eviction": "Loads of cells that had been evicted to make room",
     "refused_over_budget": "Cells refused because the budget is full",
 }
@@ -61,7 +61,7 @@ COUNTERS: Final = (
     Counter("bytes_pinned", "gauge", "bytes", "Memory somebody maps, as last probed"),
     Counter("bytes_statistics", "gauge", "bytes", "Memory of this statistics segment"),
     Counter("budget_bytes", "gauge", "bytes", "Most memory the segments may occupy"),
-    Counter("evictions", "counter", "", "Segments retired to make room or on request"),
+    Counter("evictions", "counter", "", "Segments retired to make room"),
     Counter("refused_over_budget", "counter", "", "Cells refused because the budget is full"),
     Counter("refused_quota", "counter", "", "Cells refused because the session's quota is full"),
     Counter("hits", "counter", "", "Cells answered from memory"),
@@ -84,6 +84,7 @@ COUNTERS: Final = (
     Counter("layers_computed", "counter", "", "Loads that computed a layer"),
     Counter("loads_from_cache", "counter", "", "Loads that found their layer in the disk cache"),
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
+    Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     *(
         Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")
         for name, text in WINDOWED.items()

@@ -148,7 +148,7 @@ def _process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", 
 class WriterProcess:
     """The process that writes the statistics, watched through one descriptor of ``/proc/PID/stat``.
 
-    The descriptor goes on meaning that very process when its id is used again, and reading it takes a
+    The descriptor still means that very process when its id is used again, and reading it takes a
     third of the time that opening it does.
     """
 

@@ -180,6 +180,15 @@ def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
     assert shmmap.json("evict", "20_0.pcd", "nowhere.pcd", code=1)["unknown"] == ["nowhere.pcd"]
     assert not Path(shmmap.daemon.shm_dir, first["cells"][1]["segment"].lstrip("/")).exists()
     assert shmmap.run("evict").returncode == 2
+    shmmap("pin", "20_0.pcd")
+    shmmap("query", "--id", "20_0.pcd")  # it is in memory from now on
+    assert shmmap("evict", "20_0.pcd").splitlines() == [
+        "0 segments freed",
+        "1 segment kept, pinned by an operator (see `shmmap unpin`):",
+        "  20_0.pcd: points",
+    ]
+    assert re.search(r"evicted cell=\S*20_0\.pcd layer=points bytes=\d+ reason=request", shmmap.daemon.log)
+    shmmap("unpin", "--all")
     assert shmmap.json("evict", "--all")["pinned"] == 0
 
 

@@ -8,11 +8,15 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap
+from tests.support.patience import Patience
 
 
 def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
@@ -67,6 +71,44 @@ def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) ->
     assert "gone" in found["socket"]["fact"]
     one.start()
     assert doctor(one)[0] == 0
+
+
+def test_cells_that_cannot_be_loaded_are_named(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    path = Path(divided_map.id("0_0.pcd"))
+    whole = path.read_bytes()
+    path.write_bytes(b"no point cloud")
+    one = daemon(divided_map.root)
+    assert doctor(one)[1]["cells"]["fact"] == "no load has failed"
+    with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
+        assert client.selected([str(path)], wait=20.0).failed
+        found = _until(one, lambda cells: cells["state"] == "warn")
+        assert found["fact"].startswith("1 cell cannot be loaded: 0_0.pcd (points): ")
+        assert "shmmap inspect" in found["advice"]
+
+        path.write_bytes(whole)
+        client.reload()
+        assert client.selected([str(path)], wait=20.0).complete
+    found = _until(one, lambda cells: cells["state"] == "ok")
+    assert found["fact"].endswith("no cell is known to fail now")
+
+
+def _until(one: DaemonProcess, settled: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """What is found about cells, once the statistics tell it."""
+    waiting = Patience()
+    found: dict[str, Any] = doctor(one)[1]["cells"]
+    while waiting(not settled(found)):
+        found = doctor(one)[1]["cells"]
+    return found
+
+
+def test_entries_without_a_file_are_a_problem_of_the_map(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    Path(divided_map.id("0_0.pcd")).unlink()
+    one = daemon(divided_map.root)
+    found = doctor(one)[1]["map"]
+    assert found["state"] == "warn"
+    assert "reading it found 1 problem" in found["fact"]
 
 
 def test_a_configuration_with_a_mistake(daemon: DaemonFactory, divided_map: DividedMap) -> None:

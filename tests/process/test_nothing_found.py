@@ -42,13 +42,15 @@ def test_an_area_beside_the_map(shmmap: Shmmap) -> None:
         assert done.stderr == f"shmmap: no cell within 5 m of (9000, -70); {MAP}\n", words
         if "--json" in words:
             json.loads(done.stdout)
+        elif words[0] in ("query", "map") and "--held" not in words:
+            assert done.stdout == "", "nothing is drawn or counted where there is nothing"
         assert shmmap.run(*words, "--allow-empty").returncode == 0, words
     assert not (shmmap.cwd / "out.pcd").exists()
     for area, said in (
         (("--square", "900,0,5"), "in the square of half-side 5 m about (900, 0)"),
         (
             ("--box", "900,0,901,2", "--z", "1,2"),
-            "in x 900 .. 901 m, y 0 .. 2 m with points between z = 1 and 2 m",
+            "in x 900 .. 901 m, y 0 .. 2 m, z 1 .. 2 m",
         ),
     ):
         assert f"no cell {said}; {MAP}" in shmmap.run("query", *area).stderr
@@ -57,6 +59,7 @@ def test_an_area_beside_the_map(shmmap: Shmmap) -> None:
 def test_what_is_empty_and_yet_an_answer(shmmap: Shmmap) -> None:
     assert shmmap.json("ls", "--circle", "0,0,5")["cells"] == []  # nothing is in memory at all
     assert shmmap.json("ls")["cells"] == []
+    assert shmmap("ls") == "nothing is in memory: cells are loaded when a client asks for them\n"
     held = shmmap.json("query", "--circle", "0,0,5")["cells"]
     names = [cell["id"] for cell in held]
     assert shmmap.json("query", "--circle", "0,0,5", "--held", *names)["cells"] == []
@@ -135,10 +138,7 @@ def test_a_moved_map_says_so_where_nothing_is_found(daemon: DaemonFactory, tmp_p
     done = shmmap.run("query", "--circle", "512010,5403010,20")
     assert done.returncode == 1
     assert "no cell within 20 m of (512010, 5403010); the map spans x " in done.stderr
-    assert (
-        "hint: the points were moved near the map's origin when they were divided: subtract (512"
-        in done.stderr
-    )
+    assert "hint: `divide` shifted the points close to the origin: subtract (512" in done.stderr
     assert "coordinates of the cloud it was divided from" in shmmap("status")
     assert "moved by (" in shmmap.daemon.log
 
@@ -155,7 +155,7 @@ def test_a_client_that_asks_for_more_than_its_part(daemon: DaemonFactory, tmp_pa
     (quota,) = [line for line in until(shmmap, "quota") if line.startswith("quota ")]
     assert "a client asked for more than its part" in quota
     (cache,) = [line for line in shmmap("status").splitlines() if line.startswith("cache ")]
-    assert cache.split(maxsplit=1)[1] == "large enough: nothing evicted or refused"
+    assert cache.split(maxsplit=1)[1] == "large enough: nothing evicted for room, nothing refused"
 
 
 def until(shmmap: Shmmap, word: str) -> list[str]:

@@ -97,6 +97,7 @@ def test_six_questions(tight: Shmmap) -> None:
         assert judged["cache_too_small"]
         assert "--budget" in judged["hint"]
         assert sum(judged["budget"].values()) == 1 << 20
+        assert sum(judged["memory"].values()) == 1 << 20
         del held
 
 
@@ -186,8 +187,8 @@ def test_metrics_and_files(shmmap: Shmmap, divided_map: DividedMap, tmp_path: Pa
 def test_while_the_daemon_is_stopped_and_after_it_was_killed(shmmap: Shmmap) -> None:
     shmmap("query", "--circle", "0,0,25")
     shmmap.daemon.send(signal.SIGSTOP)
-    assert "STOPPED" in shmmap("top")
-    assert "the daemon is stopped: cells on disk are not shown" in shmmap("map")
+    assert "PAUSED" in shmmap("top")
+    assert "the daemon is paused: cells on disk are not shown" in shmmap("map")
     assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 0' in shmmap("metrics")
     shmmap.daemon.send(signal.SIGCONT)
     shmmap.daemon.kill()

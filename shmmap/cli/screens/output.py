@@ -29,6 +29,7 @@ __all__ = [
     "print_pairs",
     "print_table",
     "printable",
+    "rows_text",
     "wants_style",
 ]
 
@@ -57,6 +58,11 @@ def printable(text: str) -> str:
         one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode("ascii")
         for one in text
     )
+
+
+def rows_text(count: int, layer: str) -> str:
+    """Return ``"1,200 points"``, and ``"157 rows"`` for a layer whose rows are voxels or the like."""
+    return counted(count, "point" if layer == "points" else "row")
 
 
 def print_line(text: str = "", *, file: TextIO | None = None, flush: bool = False) -> None:
@@ -145,14 +151,14 @@ def columns_that_fit(
 
 
 def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
-    """Print ``name  value`` lines with the values aligned; on a terminal long ones go on below themselves."""
+    """Print ``name  value`` lines with the values aligned; on a terminal long ones are folded."""
     width = max((len(name) for name, _ in pairs), default=0)
     for name, value in pairs:
         print_hanging(f"{name:{width}}  ", value)
 
 
 def print_hanging(head: str, text: str) -> None:
-    """Print ``head`` and ``text`` as a line; on a terminal too narrow for it the text goes on below."""
+    """Print ``head`` and ``text`` as a line; on a terminal too narrow for it the text continues below."""
     head, lines = printable(head), [printable(text)]
     if sys.stdout.isatty():
         import shutil

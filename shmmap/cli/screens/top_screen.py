@@ -24,6 +24,7 @@ LABEL: Final = 12
 _WIDE: Final = 100  # columns from which there is room for everything about a client
 _SHORTEST_NAME: Final = 14
 SPAN_TITLES: Final = (("10s", "10 s"), ("1min", "1 min"), ("10min", "10 min"))
+_STATE_NAMES: Final = {"healthy": "healthy", "stopped": "PAUSED"}
 _STATE_STYLES: Final = {
     "healthy": "bold green",
     "stopped": "bold yellow",
@@ -32,27 +33,29 @@ _STATE_STYLES: Final = {
 }
 _PARTS: Final = (
     # part, what it is called, glyph, style
-    ("pinned", "in use", "█", "cyan"),
+    ("in_use", "in use", "█", "cyan"),
     ("idle", "idle", "▓", "green"),
-    ("zombie", "retired", "▒", "yellow"),
-    ("reserved", "reserved", "░", "magenta"),
+    ("retired", "retired", "▒", "yellow"),
+    ("loading", "loading", "░", "magenta"),
+    ("statistics", "statistics", "░", "blue"),
     ("free", "free", "·", "bright_black"),
 )
 
 
 def budget_parts(counters: dict[str, int]) -> dict[str, int]:
-    """Split the budget: bytes in use and idle (both can be handed out), retired, reserved, free.
+    """Split the budget: bytes in use and idle (both can be handed out), retired, loading, statistics, free.
 
-    Reserved is what loads under way and the statistics themselves take.
+    Loading is reserved for loads under way, statistics is what the statistics themselves take.
     """
     resident, zombie = counters["bytes_resident"], counters["bytes_zombie"]
     # retired segments are there only because somebody maps them
     pinned = min(max(counters["bytes_pinned"] - zombie, 0), resident)
     parts = {
-        "pinned": pinned,
+        "in_use": pinned,
         "idle": resident - pinned,
-        "zombie": zombie,
-        "reserved": counters["bytes_reserved"] + counters["bytes_statistics"],
+        "retired": zombie,
+        "loading": counters["bytes_reserved"],
+        "statistics": counters["bytes_statistics"],
     }
     parts["free"] = max(counters["budget_bytes"] - sum(parts.values()), 0)
     return parts
@@ -89,8 +92,8 @@ def screen(
     if verdict.hint:
         lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
     lines += _latencies(found, earlier)
-    lines += _flowing("loads", _loads(counters), width)
-    lines += _flowing("pressure", _pressure(counters), width)
+    lines += _flowing("queue", _loads(counters), width)
+    lines += _flowing("segments", _segments(counters), width)
     lines.append([])
     lines += _clients(found.clients, counters["sessions"], found.beat_monotonic_ns, width, max_clients)
     return lines
@@ -101,7 +104,7 @@ def _labelled(label: str, pieces: Line) -> Line:
 
 
 def _flowing(label: str, units: Sequence[Line], width: int, *, gap: int = 3) -> list[Line]:
-    """Put units side by side behind a label, and go on below the first where the line is full."""
+    """Put units side by side behind a label, continued below the first where the line is full."""
     lines: list[Line] = [_labelled(label, [])]
     used = LABEL
     for unit in units:
@@ -130,7 +133,7 @@ def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
         (identity.instance, "bold"),
         (f"  pid {identity.pid}  ", ""),
         (
-            found.state.upper() if found.state != "healthy" else "healthy",
+            _STATE_NAMES.get(found.state, found.state.upper()),
             _STATE_STYLES.get(found.state, "bold red"),
         ),
         (told, ""),
@@ -173,13 +176,13 @@ def _hits(counters: dict[str, int]) -> list[Line]:
         ratio = f"{100 * hits / (hits + misses):.1f} %" if hits + misses else "–"
         pieces.append([(f"{title}: {ratio}", "")])
     total = counters["hits"] + counters["misses"]
-    pieces.append([(f"of {counted(total, 'cell')} asked for since the start", "bright_black")])
+    pieces.append([(f"({counted(total, 'cell')} asked for since the start)", "bright_black")])
     return pieces
 
 
 def _latencies(found: Snapshot, earlier: Snapshot | None) -> list[Line]:
     lines = []
-    titles = (("request", "requests"), ("wait", "waits"), ("load", "cell loads"))
+    titles = (("request", "requests"), ("wait", "load waits"), ("load", "load time"))
     for name, title in titles:
         histogram: Histogram | None = found.histograms.get(name)
         if histogram is None:
@@ -203,10 +206,10 @@ def _quantiles(histogram: Histogram) -> str:
 
 def _loads(counters: dict[str, int]) -> list[Line]:
     pieces: list[Line] = [
-        [(f"queue {counters['load_queue']:,}", "")],
+        [(f"loads {counters['load_queue']:,}", "")],
         [(f"waiting requests {counters['waiting_requests']:,}", "")],
         [(f"loaders {counters['workers']:,}", "")],
-        [(f"done {counters['loads_finished']:,}", "")],
+        [(f"loads done {counters['loads_finished']:,}", "")],
     ]
     troubles = {"loads_failed": "failed", "loads_timed_out": "timed out", "worker_crashes": "crashed"}
     return pieces + [
@@ -214,10 +217,11 @@ def _loads(counters: dict[str, int]) -> list[Line]:
     ]
 
 
-def _pressure(counters: dict[str, int]) -> list[Line]:
+def _segments(counters: dict[str, int]) -> list[Line]:
     refused = f"refused: budget {counters['refused_over_budget']:,}, quota {counters['refused_quota']:,}"
+    evicted = counters.get("evictions_1min", 0)
     return [
-        [(f"evictions {counters['evictions']:,} ({counters.get('evictions_1min', 0):,} in 1 min)", "")],
+        [(f"evicted for room {counters['evictions']:,} ({evicted:,} in 1 min)", "")],
         [(refused, "red" if counters.get("refused_over_budget_1min") else "")],
         [(f"retired {counters['zombies']:,}", "")],
         [(f"stale {counters['stale_cells']:,}", "")],

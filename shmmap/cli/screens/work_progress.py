@@ -45,13 +45,14 @@ class StageProgress:
         self._digits = 1 if scale > 1 else 0
         self._began_s = time.monotonic()
         self._name = ""
-        self._total = self._points = self._counted_from = 0
+        self._total = self._points = self._shown = self._counted_from = 0
         self._stage_s = self._shown_s = self._began_s
 
     def stage(self, name: str, total: int) -> None:
         """A stage begins."""
         self._end_line()
         self._name, self._total, self._points, self._counted_from = name, total, 0, -1
+        self._shown = 0
         self._stage_s = self._shown_s = time.monotonic()
         if total:
             self._show()
@@ -70,6 +71,7 @@ class StageProgress:
         """Everything is done."""
         del points
         self._end_line()
+        self._total = 0
 
     def text(self, now: float) -> str:
         """The line as it would be shown at ``now``, `time.monotonic`."""
@@ -90,6 +92,7 @@ class StageProgress:
     def _show(self) -> None:
         if self._quiet:
             return
+        self._shown = self._points
         text = self.text(time.monotonic())
         if self._live:
             self._stream.write(f"\r{text}\x1b[K")
@@ -98,6 +101,8 @@ class StageProgress:
         self._stream.flush()
 
     def _end_line(self) -> None:
+        if not self._live and self._total and self._points >= self._total and self._shown < self._total:
+            self._show()
         if self._live and self._name and not self._quiet:
             self._stream.write("\r\x1b[K")
             self._stream.flush()

@@ -32,4 +32,4 @@ def print_result(
     if as_json:
         print_json({**asdict(made), "seconds": seconds, "peak_memory_bytes": peak})
     else:
-        print_pairs([*lines, ("time", f"{format_duration(seconds)}, {format_bytes(peak)}")])
+        print_pairs([*lines, ("time", format_duration(seconds)), ("peak memory", format_bytes(peak))])

@@ -27,9 +27,10 @@ _JSON = """\
   {"clients": [{"session": hex, "pid": as the kernel says, 0 where it does not, "uid", "user", "gid",
                 "client", "command", "cells": given to it and not returned, "bytes": theirs, "requests",
                 "idle_s", "pose": [x, y] or null, "mapped_bytes": mapped now, according to the kernel,
-                "superseded": segments among those that were replaced or evicted, "superseded_bytes"}],
+                "superseded": stale or retired segments among those (OUTDATED), "superseded_bytes"}],
    "unknown_holders": segments mapped by unidentified processes, "unknown_bytes"}
-The list includes this program itself."""
+The list includes this program itself.
+Exit code: 0, or 69 when no daemon answers."""
 
 _COLUMNS = (
     Column("CLIENT"),
@@ -38,7 +39,7 @@ _COLUMNS = (
     Column("CELLS", "right"),
     Column("GIVEN", "right"),
     Column("MAPPED", "right"),
-    Column("RETIRED", "right", spare=1),
+    Column("OUTDATED", "right", spare=1),
     Column("REQUESTS", "right", spare=4),
     Column("IDLE", "right", spare=5),
     Column("AT", spare=3),
@@ -49,7 +50,8 @@ _COLUMNS = (
 _LEGEND = """\
 CELLS, GIVEN: cells it was given and has not returned, and their memory
 MAPPED: mapped now, according to the kernel
-RETIRED: the part of MAPPED that was replaced or evicted; freed when it lets go"""
+OUTDATED: the part of MAPPED that is stale (a newer version exists) or retired (out of service), see
+  STATE in `shmmap ls`; retired memory is freed when the last client lets go"""
 
 
 def add_parser(subparsers: Subparsers) -> None:

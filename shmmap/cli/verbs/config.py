@@ -23,6 +23,19 @@ _CHECK_JSON = """\
   {"file": path or null, "good": true}
 Exit code: 0 good, 66 no map there, 78 a mistake: the codes that the daemon would exit with."""
 
+_CHOSEN = {
+    "metadata": "beside or inside the map",
+    "runtime_dir": "/run/shmmap, or $XDG_RUNTIME_DIR/shmmap for a user's daemon",
+    "endpoint": "INSTANCE.sock in the runtime directory",
+    "group": "only the daemon's own user may connect",
+    "admin_group": "only root and the daemon's own user",
+    "budget_bytes": "at start: a quarter of the memory available, at most 4 GiB",
+    "workers": "at start: one less than there are processors, from 1 to 4",
+    "cache_dir": "the service's or the user's cache directory",
+    "cache_bytes": "no layers are kept",
+}
+"""What a setting stands for that is empty or 0."""
+
 _EPILOG = """\
 `check` and `show` read FILE, or the one that the installed service reads, and SHMMAP_* variables."""
 
@@ -52,7 +65,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "show",
         run_show,
         help="print every setting",
-        description="Print every setting with the value in force, under its name in the file.",
+        description="Print every setting, under its name in the file; where a default is chosen at start, "
+        "how it is chosen.",
         json=_SHOW_JSON,
     )
     show.add_argument("--origin", action="store_true", help="say where each setting comes from")
@@ -104,14 +118,24 @@ def run_show(args: argparse.Namespace) -> int:
         shown |= {called: shown[name] for name, called in FILE_NAMES.items()}
         print_json({"file": file or None, "settings": shown})
         return 0
-    lines = {name: f"{FILE_NAMES.get(name, name)} = {_toml(one.value)}" for name, one in settings.items()}
+    lines = {
+        name: f"{FILE_NAMES.get(name, name)} = {_toml(one.value, size=name in FILE_NAMES)}"
+        for name, one in settings.items()
+    }
     width = max(map(len, lines.values()))
     for name, line in lines.items():
-        print_line(f"{line.ljust(width)}  # {settings[name].origin}" if args.origin else line)
+        remarks = [settings[name].origin] if args.origin else []
+        if not settings[name].value and name in _CHOSEN:
+            remarks.append(_CHOSEN[name])
+        print_line(f"{line.ljust(width)}  # {': '.join(remarks)}" if remarks else line)
     return 0
 
 
-def _toml(value: Any) -> str:
+def _toml(value: Any, *, size: bool) -> str:
+    if size and value:
+        for power, unit in ((3, "G"), (2, "M"), (1, "K")):
+            if value % 1024**power == 0:
+                return f'"{value // 1024**power}{unit}"'
     # settings are strings, numbers and truths, which TOML writes as JSON does
     return json.dumps(value, ensure_ascii=False)
 
@@ -126,7 +150,7 @@ def run_init(args: argparse.Namespace) -> int:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise BadRequest(f"{path} is there already", hint="name another FILE, or move it away") from None
+        raise BadRequest(f"{path} exists", hint="name another FILE, or move it away") from None
     except OSError as error:
         raise CannotWrite(f"cannot write {path}: {error.strerror}") from error
     print_line(f"{path}: every setting, explained; `shmmap serve --config {path}` uses it")

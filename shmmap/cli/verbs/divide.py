@@ -28,7 +28,7 @@ JSON (fields may be added, none is removed):
    "encoding", "fields": [[name, dtype]], "bounds": [[x, y, z], [x, y, z]],
    "sources": [{"path", "size", "mtime_ns", "ctime_ns", "points"}], "notes": [text],
    "resumed_points", "seconds", "peak_memory_bytes"}
-Exit code: 0, 2 wrong usage or OUT is there already, 65 bad data or no finite point, 66 no such input,
+Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no such input,
 73 OUT cannot be written, 75 another run is making OUT."""
 
 
@@ -62,10 +62,9 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="X,Y,Z|auto|none",
         type=_translation,
         default="auto",
-        help="added to every point; auto (the default) moves float64 and LAS points near the origin where "
-        "float32 would lose more than 0.5 mm, as `serve` does with a cloud; none keeps their frame, "
-        "in float64 "
-        "where needed",
+        help="added to every point; auto (the default) shifts float64 and LAS clouds to the origin if "
+        "float32 would lose more than 0.5 mm where they are, as `serve` does with a cloud; none keeps their "
+        "frame, in float64 where needed",
     )
     points.add_argument(
         "--leaf",
@@ -105,9 +104,9 @@ def add_parser(subparsers: Subparsers) -> None:
         default="1G",
         help="most memory the process may take (default: 1G)",
     )
-    work.add_argument("--force", action="store_true", help="replace a divided map that is there")
+    work.add_argument("--force", action="store_true", help="replace a divided map that exists")
     work.add_argument(
-        "--resume", action="store_true", help="go on where a killed run of the same command stopped"
+        "--resume", action="store_true", help="continue where a killed run of the same command stopped"
     )
     work.add_argument(
         "--check", action="store_true", help="read the map back and verify it before it appears"
@@ -144,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
     except KeyboardInterrupt:
-        complain("shmmap", "interrupted", "the same command with --resume goes on")
+        complain("shmmap", "interrupted", "the same command with --resume continues")
         raise
     seconds = time.monotonic() - began_s
     print_result(made, _lines(made), seconds=seconds, as_json=args.json)
@@ -171,8 +170,8 @@ def _lines(made: DividedMap) -> list[tuple[str, str]]:
     left_out = f", {made.dropped:,} not finite" if made.dropped else ""
     lines = [
         ("map", made.path),
-        ("cells", f"{made.cells:,} of {made.cell_size:g} m"),
-        ("points", f"{made.points:,} of {made.points_read:,}{left_out}"),
+        ("cells", f"{made.cells:,}, side {made.cell_size:g} m"),
+        ("points", f"{made.points:,} of {made.points_read:,} read{left_out}"),
         ("fields", fields_text(made.fields)),
     ]
     if made.resumed_points:

@@ -17,7 +17,8 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"worst": "ok" | "warn" | "fail",
-   "findings": [{"name", "state": "ok" | "warn" | "fail", "fact", "advice": text, may be empty}]}
+   "findings": [{"name", "state": "ok" | "warn" | "fail", "fact", "advice": text, may be empty,
+                 "skipped": bool, nothing to look at; `state` is "ok" then}]}
 Exit code: 0 no finding is `fail`, 1 one is, 78 the configuration has a mistake."""
 
 
@@ -68,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
 def _print(findings: list[Finding]) -> None:
     width = max(len(one.name) for one in findings)
     for one in findings:
-        print_hanging(f"{one.state.ljust(4)}  {one.name.ljust(width)}  ", one.fact)
+        state = "skip" if one.skipped else one.state
+        print_hanging(f"{state.ljust(4)}  {one.name.ljust(width)}  ", one.fact)
         if one.advice:
             print_hanging(f"{' ' * (width + 6)}  -> ", one.advice)

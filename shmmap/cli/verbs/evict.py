@@ -4,23 +4,27 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
-from shmmap.cli.screens.output import print_json, print_line
+from shmmap.cli.screens.output import counted, print_json, print_line
 
 if TYPE_CHECKING:
+    from shmmap.client.client import Client
     from shmmap.protocol.messages import Evicted
 
 __all__ = ["add_parser", "run"]
 
+_NAMED: Final = 20
+"""Kept segments that are named one by one."""
+
 _JSON = """\
-  {"freed": segments whose memory is free, "pinned": segments retired, but still mapped by a client,
-   "kept": segments left alone because they are pinned (`shmmap pin`),
-   "unknown": [ids the map does not have]}
-Exit code: 0; 1 when an id is unknown or an area touches no cell."""
+  {"freed": segments whose memory is free, "still_mapped": segments retired, freed when no client maps them,
+   "kept": segments kept in service because an operator pinned them (`shmmap pin`),
+   "unknown": [ids the map does not have], "pinned": as still_mapped, its older name: not `shmmap pin`}
+Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -54,21 +58,39 @@ def run(args: argparse.Namespace) -> int:
                 print_json(_as_json(Evicted(0, 0, 0)))
             return no_cell_there(args, client, area)
         answer = client.evict(cells)
+        kept = _kept(client, cells) if answer.kept and not args.json else []
     if args.json:
         print_json(_as_json(answer))
     else:
-        in_use = f", {answer.pinned:,} retired but still in use by clients" if answer.pinned else ""
-        print_line(f"{answer.freed:,} segments freed{in_use}")
+        print_line(f"{counted(answer.freed, 'segment')} freed")
+        if answer.pinned:
+            print_line(f"{counted(answer.pinned, 'segment')} retired, freed when no client maps them")
         if answer.kept:
-            print_line(f"{answer.kept:,} left alone: pinned by an operator (see `shmmap unpin`)")
+            print_line(f"{counted(answer.kept, 'segment')} kept, pinned by an operator (see `shmmap unpin`):")
+        for line in kept[:_NAMED]:
+            print_line(f"  {line}")
+        if len(kept) > _NAMED:
+            print_line(f"  and {len(kept) - _NAMED:,} more, see `shmmap pin`")
         for name in answer.unknown:
             print_line(f"unknown cell: {name}")
     return 1 if answer.unknown else 0
 
 
+def _kept(client: Client, cells: list[str] | None) -> list[str]:
+    """Return the segments that an operator keeps, of these cells or of all: ``"town_0_0.pcd: points"``."""
+    names = set(cells or ())
+    return [
+        f"{row.id.rpartition('/')[2]}: {row.layer}"
+        for row in client.pin().cells
+        if row.state in ("resident", "stale")
+        and (cells is None or row.id in names or row.id.rpartition("/")[2] in names)
+    ]
+
+
 def _as_json(answer: Evicted) -> dict[str, object]:
     return {
         "freed": answer.freed,
+        "still_mapped": answer.pinned,
         "pinned": answer.pinned,
         "kept": answer.kept,
         "unknown": list(answer.unknown),

@@ -66,7 +66,7 @@ def add_parser(subparsers: Subparsers) -> None:
         default="binary",
         help="encoding of PCD files (default: binary)",
     )
-    parser.add_argument("--force", action="store_true", help="overwrite files that are there")
+    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
     parser.add_argument(
         "--wait", metavar="SECONDS", type=seconds, default=60.0, help="how long loads may take (default: 60)"
     )
@@ -216,4 +216,4 @@ def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argpar
 
 
 def _exists(path: Path) -> BadRequest:
-    return BadRequest(f"{path} is there already", hint="give another name, or --force to overwrite it")
+    return BadRequest(f"{path} exists", hint="give another name, or --force to overwrite it")

@@ -22,10 +22,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "health",
         run,
-        help="is the daemon well? (exit code 0: yes)",
-        description="Say whether the daemon is healthy, stopped (by a debugger or SIGSTOP), hung or "
-        "dead.  Reads its "
-        "statistics in shared memory, so it answers whatever the daemon does.",
+        help="is the daemon healthy? (exit code 0: yes)",
+        description="Say whether the daemon is healthy, stopped (paused by SIGSTOP or a debugger), hung or "
+        "dead.  Reads its statistics in shared memory, so it answers whatever the daemon does.",
         json=_JSON,
     )
     add_statistics_options(parser)

@@ -30,8 +30,8 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"path", "format", "encoding": of a PCD file, "version", "file_bytes", "points": points in the file,
-   "dropped": how many of them are not finite, "width", "height",
-   "fields": [{"name", "dtype": as numpy writes it, "count": values per point, "unit"}],
+   "dropped": how many of them are not finite (NOT FINITE), "width", "height",
+   "fields": [{"name": "xyz" for x, y and z, "dtype": as numpy writes it, "count": values per point, "unit"}],
    "bounds": {"min": [x, y, z], "max": [x, y, z]} of the finite points, null when there are none,
    "viewpoint": [x, y, z, qw, qx, qy, qz], "warnings": [text]}
 Of a directory:
@@ -86,7 +86,10 @@ def run(args: argparse.Namespace) -> int:
         print_line()
         print_table(
             (Column("FIELD"), Column("DTYPE"), Column("COUNT", "right"), Column("UNIT")),
-            [[spec.name, spec.dtype.str, str(spec.components), spec.unit] for spec in found.columns],
+            [
+                [_field_name(spec.name), spec.dtype.str, str(spec.components), spec.unit]
+                for spec in found.columns
+            ],
         )
     if _bounds(found) is None:
         what = f"none of its {found.points:,} points is finite" if found.points else "it has no points"
@@ -173,8 +176,12 @@ def _row(found: CloudDescription, directory: str) -> list[str]:
         f"{found.points:,}",
         f"{found.dropped:,}",
         *spans,
-        " ".join("x y z" if spec.name == "xyz" else spec.name for spec in found.columns),
+        " ".join(_field_name(spec.name) for spec in found.columns),
     ]
+
+
+def _field_name(name: str) -> str:
+    return "x y z" if name == "xyz" else name
 
 
 def _all_bounds(found: list[CloudDescription]) -> dict[str, list[float]] | None:

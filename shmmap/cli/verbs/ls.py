@@ -41,10 +41,10 @@ _COLUMNS = (
     Column("SIZE", "right", spare=6),
     Column("STATE", spare=4),
     Column("LAYER", spare=3),
-    Column("POINTS", "right"),
+    Column("ROWS", "right"),
     Column("MEMORY", "right"),
     Column("HITS", "right", spare=5),
-    Column("USED", "right", spare=1),
+    Column("LAST USED", "right", spare=1),
     Column("LOAD", "right", spare=7),
 )
 
@@ -61,12 +61,13 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="the cells in shared memory",
         description="List the cells in shared memory, one line for each layer of a cell.  Reads the daemon's "
-        "statistics: works while the daemon is stopped or hangs.\n"
+        "statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
+        "`shmmap stop`.\n"
         "X, Y, SIZE: lower corner and side, metres, map frame.\n"
-        "STATE: resident; stale when a newer version exists that is not loaded yet; retired when it "
-        "left service, "
-        "to be freed when no process maps it.\n"
-        "HITS, USED: how often it was given to clients, and how long ago the last time.\n"
+        "STATE: resident; stale when a newer version exists that is not loaded yet; retired (in JSON: "
+        "zombie) when it left service, to be freed when no process maps it.\n"
+        "ROWS: points, or what a layer has instead, such as voxels.\n"
+        "HITS, LAST USED: how often it was given to clients, and how long ago the last time.\n"
         "LOAD: how long loading took.",
         json=_JSON,
     )
@@ -120,7 +121,12 @@ def _list(args: argparse.Namespace) -> int:
             }
         )
     else:
-        print_table(_COLUMNS, [_as_text(row, now_ns) for row in rows])
+        if rows:
+            print_table(_COLUMNS, [_as_text(row, now_ns) for row in rows])
+        elif not found.cells:
+            print_line("nothing is in memory: cells are loaded when a client asks for them")
+        elif not nothing_there:
+            print_line(f"no cell in memory is {args.state}")
         if found.rows_missing:
             print_line(f"and {found.rows_missing:,} more that the statistics have no room for")
     if found.state == "dead":
@@ -155,6 +161,10 @@ def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[s
     }
 
 
+def _whole_seconds(span_s: float) -> str:
+    return format_duration(span_s) if span_s >= 60 else f"{span_s:.0f} s"
+
+
 def _as_text(row: CellRow, now_ns: int) -> list[str]:
     idle_s = _idle_s(row, now_ns)
     return [
@@ -167,6 +177,6 @@ def _as_text(row: CellRow, now_ns: int) -> list[str]:
         f"{row.points:,}",
         format_bytes(row.bytes),
         f"{row.hits:,}",
-        "never" if idle_s is None else format_duration(idle_s),
+        "never" if idle_s is None else f"{_whole_seconds(idle_s)} ago",
         format_duration(row.load_ns * 1e-9),
     ]

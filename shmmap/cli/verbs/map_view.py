@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
         if path is not None:
             write_text(path, make(scene))
             print_line(f"wrote {path}")
-    if args.svg is None and args.html is None:
+    off_the_map = area is not None and scene.empty and everywhere is not None
+    if args.svg is None and args.html is None and not off_the_map:
         _print(scene)
     if found.state == "dead":
         return DaemonUnreachable.exit_code
@@ -126,7 +127,8 @@ def _note(found: Snapshot, rows: list[CellRow], cells: int, *, left_out: bool, s
     segments, clients = counted(len(rows), "segment"), counted(len(found.clients), "client")
     note = f"{segments} in memory, {format_bytes(memory)}, {clients}"
     if silent:
-        return f"{note}; the daemon is {found.state}: cells on disk are not shown"
+        state = "paused" if found.state == "stopped" else found.state
+        return f"{note}; the daemon is {state}: cells on disk are not shown"
     return f"{note}, {counted(cells, 'cell')} in the map" + (
         " (too many to show those on disk)" if left_out else ""
     )

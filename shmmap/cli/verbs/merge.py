@@ -7,7 +7,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
-from shmmap.cli.screens.output import format_bytes
+from shmmap.cli.screens.output import counted, format_bytes
 from shmmap.cli.screens.work_result import fields_text, print_result
 
 if TYPE_CHECKING:
@@ -17,11 +17,11 @@ __all__ = ["add_parser", "run"]
 
 _EPILOG = """\
 IN is a divided map, a directory of clouds or a cloud of any format that is read.  Points that `divide`
-moved go back to where they were, in float64.  Files are merged in the order of their paths.
+shifted return to where they were, in float64.  Files are merged in the order of their paths.
 JSON (fields may be added, none is removed):
   {"path", "points", "bytes", "files": how many were merged, "fields": [[name, dtype]],
    "origin": {map: [x, y, z] that was added}, "seconds", "peak_memory_bytes"}
-Exit code: 0, 2 wrong usage or OUT is there already, 65 bad data or no point in the inputs, 66 no such input,
+Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no point in the inputs, 66 no such input,
 73 OUT cannot be written."""
 
 
@@ -46,12 +46,12 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--keep-frame",
         action="store_true",
-        help="keep points where the map has them, also where `divide` moved them",
+        help="keep points where the map has them, also if `divide` shifted them",
     )
     parser.add_argument(
         "--common-fields", action="store_true", help="keep only the fields that all inputs have"
     )
-    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json_option(parser)
 
@@ -85,7 +85,7 @@ def _lines(made: MergedCloud) -> list[tuple[str, str]]:
     ]
     return [
         ("cloud", f"{made.path} ({format_bytes(made.bytes)})"),
-        ("points", f"{made.points:,} of {made.files:,} files"),
+        ("points", f"{made.points:,} from {counted(made.files, 'file')}"),
         ("fields", fields_text(made.fields)),
         *notes,
     ]

@@ -27,7 +27,8 @@ def add_parser(subparsers: Subparsers) -> None:
         help="counters and latencies in Prometheus' format",
         description="Print counters, gauges and latency histograms in Prometheus' text format.  "
         "Reads the daemon's "
-        "statistics: works while the daemon is stopped or hangs.",
+        "statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
+        "`shmmap stop`.",
         epilog=_EPILOG,
     )
     add_statistics_options(parser, json=False)

@@ -6,17 +6,25 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.options import Subparsers, add_json_option, add_layer_option, add_verb, at_least, size_bytes
-from shmmap.cli.screens.output import format_bytes, format_duration, print_json, print_line, print_pairs
+from shmmap.cli.screens.output import (
+    counted,
+    format_bytes,
+    format_duration,
+    print_json,
+    print_line,
+    print_pairs,
+)
 
 __all__ = ["add_parser", "run"]
 
 _SHOWN_FAILURES = 20
 
 _EPILOG = """\
-Layers computed before are kept; a stopped run, started again, goes on where it was.  After a map was copied
-or its files touched, its layers are recognised by the files' contents.  Give `serve` the same --cache-dir.
+Layers computed before are kept; a stopped run, started again, continues where it was.  After a map was
+copied or its files touched, its layers are recognised by the files' contents.
+Give `serve` the same --cache-dir.
 JSON (fields may be added, none is removed):
-  {"map", "cells", "layers": [spec], "kept", "recognised", "built": layers of cells, "bytes",
+  {"map", "cells", "layers": [spec], "kept", "recognised": by contents, "built": layers of cells, "bytes",
    "cache_dir", "cache_bytes": disk space of the whole cache, "seconds",
    "failed": [{"id", "layer", "message"}]}
 Exit code: 0, 1 if a layer of some cell could not be computed, 2 wrong usage, 65 bad map, 66 no map,
@@ -112,14 +120,14 @@ def run(args: argparse.Namespace) -> int:
         print_line("note: the layers are larger than --cache-size: some were removed from the cache again")
     print_pairs(
         [
-            ("map", f"{origin.path}, {done.cells:,} cells"),
+            ("map", f"{origin.path}, {counted(done.cells, 'cell')}"),
             ("layers", " ".join(layers)),
             ("built", f"{done.built:,}"),
-            ("there already", f"{done.kept + done.recognised:,}"),
+            ("kept", f"{done.kept + done.recognised:,}"),
             ("failed", f"{len(done.failures):,}"),
             ("size", format_bytes(done.bytes)),
             ("cache", f"{cache_dir}, {format_bytes(done.cache_bytes)}"),
-            ("took", format_duration(seconds)),
+            ("time", format_duration(seconds)),
         ]
     )
     return 1 if done.failures else 0

@@ -26,6 +26,7 @@ from shmmap.cli.screens.output import (
     print_json,
     print_line,
     print_table,
+    rows_text,
 )
 from shmmap.cli.screens.refusals import failure_lines, holder_rows
 from shmmap.errors import BadRequest
@@ -46,8 +47,8 @@ _JSON = """\
                "holder_rows": [{"session": hex, "pid", "uid", "client", "command", "cells", "bytes"}]}]}
 Codes: unknown_cell, load_failed, load_timeout, over_budget, no_space.
 A holder maps memory of the full budget; session 0 and pid 0: a process that did not use the client library.
-Exit code: 0; 1 when a cell is pending, failed or unknown, when the area touches no cell, or when a layer has
-nothing in all of them.  With --held, 0 when nothing is new."""
+Exit code: 0; 1 when a cell is pending, failed or unknown, when the area touches no cell, or when a layer is
+empty in every cell.  With --held, 0 when nothing is new."""
 
 
 _COLUMNS = (
@@ -55,7 +56,7 @@ _COLUMNS = (
     Column("X", "right", spare=2),
     Column("Y", "right", spare=2),
     Column("LAYER", spare=3),
-    Column("POINTS", "right"),
+    Column("ROWS", "right"),
     Column("MEMORY", "right"),
     Column("VERSION", spare=4),
     Column("SEGMENT", spare=5),
@@ -71,7 +72,8 @@ def add_parser(subparsers: Subparsers) -> None:
         help="what a client would get for an area or for ids",
         description="Ask the daemon for cells, as a client does: it loads those that are not in "
         "memory.  Prints "
-        "where each of them lies in shared memory.",
+        "where each of them lies in shared memory.\n"
+        "ROWS: points, or what a layer has instead, such as voxels.",
         json=_JSON,
     )
     what = parser.add_mutually_exclusive_group(required=True)
@@ -97,7 +99,8 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SECONDS|none",
         type=lambda text: None if text == "none" else seconds(text),
         default=10.0,
-        help="how long to wait for cells that have to be loaded; none: print what is in memory (default: 10)",
+        help="how long to wait for cells that have to be loaded; none: do not wait: print what is in memory, "
+        "the rest is loaded in the background (default: 10)",
     )
     add_allow_empty(parser)
     add_daemon_options(parser)
@@ -108,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.daemon_address import connect
 
     area = area_from(args)
+    held_given = args.held is not None
     held = [held_cell(text) for text in args.held or ()]
     if held and area is None:
         raise BadRequest("--held needs an area", hint="add --circle, --square or --box")
@@ -115,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     with connect(args) as client:
         if area is None:
             found = client.selected(args.id, layers, wait=args.wait)
-        elif args.held is not None:
+        elif held_given:
             found = client.differential(area, held, layers, wait=args.wait)
         else:
             found = client.area(area, layers, wait=args.wait)
@@ -123,7 +127,9 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print_json(_as_json(found, welcome.frame_id))
         else:
-            _print_text(found, welcome.id_prefix)
+            _print_text(
+                found, welcome.id_prefix, summed=bool(found.cells) or held_given or not found.complete
+            )
         if not found.complete:
             return 1
         return _judge_empty(args, client, area, found)
@@ -193,7 +199,7 @@ def _as_json(found: CellSet, frame_id: str) -> dict[str, object]:
     }
 
 
-def _print_text(found: CellSet, id_prefix: str) -> None:
+def _print_text(found: CellSet, id_prefix: str, *, summed: bool) -> None:
     if found.cells:
         print_table(
             _COLUMNS,
@@ -218,5 +224,9 @@ def _print_text(found: CellSet, id_prefix: str) -> None:
     for line in failure_lines(found.failed):
         indent = len(line) - len(line.lstrip())
         print_hanging(line[:indent], line[indent:])
-    points, nbytes = (sum(getattr(cell, name) for cell in found.cells) for name in ("points", "nbytes"))
-    print_line(f"{counted(len(found.cells), 'cell')}, {counted(points, 'point')}, {format_bytes(nbytes)}")
+    if not summed:
+        return
+    rows, nbytes = (sum(getattr(cell, name) for cell in found.cells) for name in ("points", "nbytes"))
+    other = next((cell.layer for cell in found.cells if cell.layer != "points"), "points")
+    cells = counted(len({cell.id for cell in found.cells}), "cell")
+    print_line(f"{cells}, {rows_text(rows, other)}, {format_bytes(nbytes)}")

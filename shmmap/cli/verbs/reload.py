@@ -6,13 +6,15 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
-from shmmap.cli.screens.output import print_json, print_line
+from shmmap.cli.screens.output import counted, print_json, print_line
 
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"map_version": hex, "changed": cells whose file changed, "added", "removed",
-   "problems": [text]}"""
+   "problems": [text]}
+Exit code: 0; 1 when this user may not do it, 65 bad map: the map before stays, 66 no map there, 69 when no
+daemon answers."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -48,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         )
         return 0
     print_line(
-        f"{answer.changed:,} cells changed, {answer.added:,} added, {answer.removed:,} removed;"
+        f"{counted(answer.changed, 'cell')} changed, {answer.added:,} added, {answer.removed:,} removed;"
         f" map version {answer.map_version:016x}"
     )
     for problem in answer.problems:

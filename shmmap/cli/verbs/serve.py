@@ -14,8 +14,9 @@ Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then f
 MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
 or inside the folder of the files), or one cloud of any format that is read: a PCD file of up to 256 MiB
 is one cell as it is; any other is first divided into the cache directory, just as `shmmap divide` does it:
-points of a LAS file, or of any with float64 coordinates, far from the origin move near it, and the log and
-`shmmap status` say by how much.  To keep their frame: `shmmap divide --translate none`, and serve that map.
+a LAS or float64 cloud far from the origin is shifted close to it, and the log and `shmmap status` say by
+how much.  To keep its frame: `shmmap divide --translate none`, and serve that map.
+`shmmapd` is `shmmap serve`: the same options.
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
 its next start (a restart sends it first, then SIGTERM as usual; in a container: --stop-signal USR1);
@@ -34,7 +35,9 @@ def add_parser(subparsers: Subparsers) -> None:
         epilog=_EPILOG,
     )
     parser.add_argument("map_path", metavar="MAP", nargs="?", help="the map: a directory or a cloud")
-    parser.add_argument("--metadata", metavar="FILE", help="the map's YAML, where it lies elsewhere")
+    parser.add_argument(
+        "--metadata", metavar="FILE", help="the map's YAML, if it lies neither beside nor in the map"
+    )
     parser.add_argument(
         "--strict", action="store_true", default=None, help="refuse what Autoware's own loader refuses"
     )
@@ -49,17 +52,38 @@ def add_parser(subparsers: Subparsers) -> None:
     place.add_argument(
         "--instance", metavar="NAME", help="name of this daemon among several (default: default)"
     )
-    place.add_argument("--endpoint", metavar="PATH", help="request socket, a path or an ipc:// URL")
-    place.add_argument("--runtime-dir", metavar="DIR", help="directory of the request socket")
+    place.add_argument(
+        "--endpoint",
+        metavar="PATH",
+        help="request socket, a path or an ipc:// URL (default: INSTANCE.sock in the runtime directory)",
+    )
+    place.add_argument(
+        "--runtime-dir",
+        metavar="DIR",
+        help="directory of the request socket (default: /run/shmmap, or $XDG_RUNTIME_DIR/shmmap for a user's "
+        "daemon)",
+    )
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
-    place.add_argument("--group", metavar="GROUP", help="group whose members may connect and read the map")
+    place.add_argument(
+        "--group",
+        metavar="GROUP",
+        help="group whose members may connect and read the map (default: none, only the daemon's user)",
+    )
     place.add_argument(
         "--admin-group", metavar="GROUP", help="group whose members may reload, evict, pin and stop it"
     )
     limits = parser.add_argument_group("limits")
-    limits.add_argument("--budget", metavar="BYTES", help="most memory for cells, such as 512M or 2G")
     limits.add_argument(
-        "--session-quota", metavar="PART", help="part of the budget that one client may fill (default: 0.9)"
+        "--budget",
+        metavar="BYTES",
+        help="most memory for cells, such as 512M or 2G (default: a quarter of the memory available at "
+        "start, at most 4G)",
+    )
+    limits.add_argument(
+        "--session-quota",
+        metavar="PART",
+        help="what one client may keep for itself alone: a part of the budget, up to 1, or a size such as 1G "
+        "(default: 0.9)",
     )
     limits.add_argument(
         "--workers", metavar="N", help="most loader processes (default: one less than processors, at most 4)"
@@ -80,7 +104,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--cache-dir",
         metavar="DIR",
-        help="where the map's index, divided clouds and computed layers are kept between starts",
+        help="where the map's index, divided clouds and computed layers are kept between starts (default: "
+        "the service's or the user's cache directory)",
     )
     parser.add_argument(
         "--cache-size",

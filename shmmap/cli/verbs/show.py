@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from shmmap.cli.areas import extent_text
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.accounts import user_name
-from shmmap.cli.screens.output import format_bytes, print_json, print_pairs
+from shmmap.cli.screens.output import format_bytes, print_json, print_pairs, rows_text
 from shmmap.cli.screens.refusals import holder_row
 
 if TYPE_CHECKING:
@@ -114,8 +114,9 @@ def _lines(cell: ShownCell) -> list[tuple[str, str]]:
 
 def _segment_line(segment: ShownSegment) -> str:
     state = "retired" if segment.state == "zombie" else segment.state
+    rows = rows_text(segment.points, segment.layer)
     return (
-        f"{segment.layer}, {state}, {segment.points:,} points, {format_bytes(segment.bytes)},"
+        f"{segment.layer}, {state}, {rows}, {format_bytes(segment.bytes)},"
         f" version {segment.version:016x}, {segment.segment}"
     )
 

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import format_bytes, format_duration, format_metres, print_json, print_pairs
+from shmmap.cli.screens.output import (
+    counted,
+    format_bytes,
+    format_duration,
+    format_metres,
+    print_json,
+    print_pairs,
+)
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.errors import DaemonUnreachable
 
@@ -19,7 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped" | "hung" | "dead", "beat_age_s": seconds since its last heartbeat,
+  {"state": "healthy" | "stopped": paused by a signal or a debugger | "hung" | "dead",
+   "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so}}
 Exit code: 0, or 69 when the daemon is dead or was never started."""
@@ -34,7 +42,8 @@ def add_parser(subparsers: Subparsers) -> None:
         help="state of the daemon: memory, clients, requests, cache size",
         description="Show the state of the daemon: memory, clients, requests, loads, and whether "
         "the cache is large "
-        "enough.  Reads its statistics in shared memory: works while the daemon is stopped or hangs.",
+        "enough.  Reads its statistics in shared memory: "
+        "works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after `shmmap stop`.",
         json=_JSON,
     )
     add_statistics_options(parser)
@@ -78,19 +87,18 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     share = f" ({100 * used / budget:.0f} %)" if budget else ""
     state = {
         "healthy": f"healthy, pid {identity.pid}, up {format_duration(uptime_s)}",
-        "stopped": f"STOPPED, pid {identity.pid}: continue it with `kill -CONT {identity.pid}`",
+        "stopped": f"PAUSED, pid {identity.pid}: continue it with `kill -CONT {identity.pid}`",
         "hung": f"HUNG, pid {identity.pid}: no heartbeat for {format_duration(found.beat_age_s)}",
         "dead": f"DEAD: pid {identity.pid} crashed or was killed; start it again, it keeps the "
         f"cells in memory",
     }[found.state]
     asked = count["hits"] + count["misses"]
-    hit_rate = f", {100 * count['hits'] / asked:.0f} % from memory" if asked else ""
     lines = [
         ("daemon", state),
         ("instance", f"{identity.instance} (shmmap {identity.library_version})"),
         ("endpoint", identity.endpoint),
         ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
-        ("memory", f"{format_bytes(used)} of {format_bytes(budget)}{share} in {identity.shm_dir}"),
+        ("memory", f"{format_bytes(used)} taken of {format_bytes(budget)}{share} in {identity.shm_dir}"),
         ("resident", f"{count['cells_resident']:,} segments, {format_bytes(count['bytes_resident'])}"),
         ("in use", f"{format_bytes(count['bytes_pinned'])} mapped by clients"),
     ]
@@ -99,6 +107,9 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         lines.insert(
             4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
         )
+    if problems := count.get("map_problems", 0):
+        told = f"{counted(problems, 'problem')} found in the map, see the log or `shmmap reload`"
+        lines.append(("map", told))
     if count["stale_cells"]:
         lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
     if count["zombies"]:
@@ -111,17 +122,23 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         source = "the clients' locks" if count["pin_source"] == 1 else "what clients report"
         lines.append(("use", f"this system grants no leases: memory in use is known from {source} only"))
     lines += [
-        ("clients", f"{count['sessions']:,} now, {count['sessions_opened']:,} so far"),
-        ("requests", f"{count['requests']:,}, {format_bytes(count['bytes_sent'])} sent{hit_rate}"),
+        (
+            "clients",
+            f"{count['sessions']:,} now, {count['sessions_opened']:,} so far, verbs of `shmmap` included",
+        ),
+        ("requests", f"{count['requests']:,}, {format_bytes(count['bytes_sent'])} sent"),
+        ("cells asked", f"{asked:,}" + (f", {100 * count['hits'] / asked:.0f} % in memory" if asked else "")),
         (
             "loads",
             (
                 f"{count['loads_finished']:,} done, {count['load_queue']:,} queued,"
                 f" {count['loads_failed']:,} failed, {count['loads_timed_out']:,} timed out,"
-                f" {count['worker_crashes']:,} crashed loaders"
+                f" {counted(count['worker_crashes'], 'crashed loader')}"
             ),
         ),
     ]
+    if count["loads_failed"]:
+        lines.append(("", "`shmmap doctor` names the cells that fail"))
     verdict = cache_verdict(count)
     lines.append(("cache", verdict.text))
     if verdict.hint:

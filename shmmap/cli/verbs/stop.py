@@ -23,8 +23,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="end the daemon and free its memory",
         description="End the daemon, as SIGTERM does: a cell's memory is freed as soon as no "
-        "process maps it.  For "
-        "members of the daemon's --admin-group, who cannot send it a signal.",
+        "process maps it.  The daemon's user, root and members of its --admin-group may do this; unlike "
+        "a signal it works for other users than the daemon's.",
         json=_JSON,
     )
     add_daemon_options(parser)

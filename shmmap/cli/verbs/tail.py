@@ -19,6 +19,7 @@ from shmmap.cli.screens.output import (
     json_text,
     print_hanging,
     print_line,
+    rows_text,
 )
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ _JSON = """\
   "pressure" | "reload" | "joined" | "left", "seq", "epoch": hex, "time": Unix seconds, and what the
   protocol's table of events says of that kind; versions and sessions as hex}, or
   {"event": "missed", "epoch": hex, "first", "last"} for events that the daemon does not keep any more.
-Live on a terminal or with --follow; else it ends after the events the daemon has kept."""
+Live on a terminal or with --follow; else it ends after the events the daemon has kept.
+Exit code: 0, or 69 when no daemon answers."""
 
 DEFAULT_SINCE_S: Final = 60.0
 SILENT_S: Final = 5.0
@@ -44,9 +46,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "tail",
         run,
         help="events: loads, evictions, failures, clients",
-        description="Print the events of the last minute, and go on with new ones: cells loaded, "
+        description="Print the events of the last minute, then new ones as they happen: cells loaded, "
         "changed, evicted, "
-        "failed, retried; cells refused for want of memory; reloads; clients that connect and leave; the "
+        "failed, retried; cells refused for lack of memory; reloads; clients that connect and leave; the "
         "daemon's start and end.",
         json=_JSON,
     )
@@ -59,7 +61,10 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
-        "--follow", action="store_true", default=None, help="go on with new events; the default on a terminal"
+        "--follow",
+        action="store_true",
+        default=None,
+        help="continue with new events; the default on a terminal",
     )
     group.add_argument("--no-follow", action="store_false", dest="follow", help="end after past events")
     add_daemon_options(parser)
@@ -137,11 +142,17 @@ def _loaded(f: dict[str, Any]) -> str:
     took = f"in {format_duration(f['load_ns'] * 1e-9)}" if f["load_ns"] else "retired before, back in service"
     why = ", was evicted to make room before" if f["again"] else ""
     why += ", replaces an older version" if f["replaces"] else ""
-    return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {f['points']:,} points, {took}{why}"
+    rows = rows_text(f["points"], f["layer"])
+    return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {rows}, {took}{why}"
 
 
 def _evicted(f: dict[str, Any]) -> str:
-    why = {"room": "to make room", "request": "on request", "map": "it left the map"}.get(f["why"], f["why"])
+    why = {
+        "room": "to make room",
+        "request": "on request",
+        "map": "it left the map",
+        "damaged": "it was damaged",
+    }.get(f["why"], f["why"])
     return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {why}"
 
 
@@ -167,16 +178,23 @@ def _epoch(f: dict[str, Any]) -> str:
     return f"the daemon is {f['what']}: {f['cells']:,} cells in the map{adopted}"
 
 
+_CHANGES: Final = {
+    "changed": "its file changed",
+    "moved": "its box changed",
+    "added": "added to the map",
+    "removed": "removed from the map",
+}
+
 _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "epoch": _epoch,
     "loaded": _loaded,
-    "changed": lambda f: f"{f['id']}  {f['how']}",
+    "changed": lambda f: f"{f['id']}  {_CHANGES.get(f['how'], f['how'])}",
     "evicted": _evicted,
     "failed": lambda f: f"{f['id']} {f['layer']}  {f['code']}: {f['message']}",
     "retried": lambda f: f"{f['id']} {f['layer']}  again after {f['code']}",
     "pressure": _pressure,
     "reload": _reload,
     "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",
-    "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, had {format_bytes(f['bytes'])}",
+    "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, held {format_bytes(f['bytes'])}",
     "missed": lambda f: f"events {f['first']:,} to {f['last']:,}: the daemon does not keep them any more",
 }

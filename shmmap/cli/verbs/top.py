@@ -28,10 +28,12 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"state": as in `shmmap status`, "beat_age_s",
-   "budget": {"pinned": mapped by clients, "idle", "zombie": retired, "reserved", "free"} in bytes,
+   "memory": {"in_use": mapped by clients, "idle", "retired", "loading", "statistics", "free"} in bytes,
+   "budget": the same by older names: {"pinned": in use, "idle", "zombie": retired,
+              "reserved": loading and statistics, "free"},
    "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
    "latency_s": {"request", "wait", "load": {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
-   "evictions", "refused_over_budget", "refused_quota",
+   "evictions": for lack of room, "refused_over_budget", "refused_quota",
    "clients": [{"client", "command", "pid", "uid", "cells", "bytes", "requests", "idle_s", "pose"}]}
 Exit code: 0, or 69 when the daemon is dead or was never started."""
 
@@ -57,9 +59,11 @@ def add_parser(subparsers: Subparsers) -> None:
         help="live view: memory, latency, clients",
         description="Show how the memory budget is used, how many of the cells asked for were in memory, "
         "latencies, loads, evictions, refusals and clients.  Live on a terminal, once in a pipe.\n"
-        "Budget: in use (mapped by clients), idle (in memory, mapped by no client), retired (out of "
-        "service, freed "
-        "when no process maps it), reserved (for loads under way), free.\n"
+        "Budget: in use (mapped by clients; not `shmmap pin`), idle (in memory, mapped by no client), "
+        "retired (out of service, freed when no process maps it), loading (reserved for loads under way), "
+        "statistics (what this view reads), free.\n"
+        "Requests: the daemon's own time for one.  Load waits: how long clients waited for loads.  "
+        "Load time: of one cell.\n"
         "GIVEN: memory of the cells a client was given and has not returned.",
         json=_JSON,
     )
@@ -173,7 +177,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
     from shmmap.statistics.counters import SPANS
 
     count = found.counters
-    verdict = cache_verdict(count)
+    verdict, parts = cache_verdict(count), budget_parts(count)
     ratios = {}
     for span in SPANS:
         hits, asked = count[f"hits_{span}"], count[f"hits_{span}"] + count[f"misses_{span}"]
@@ -181,7 +185,14 @@ def _as_json(found: Snapshot) -> dict[str, object]:
     return {
         "state": found.state,
         "beat_age_s": round(found.beat_age_s, 6),
-        "budget": budget_parts(count),
+        "memory": parts,
+        "budget": {
+            "pinned": parts["in_use"],
+            "idle": parts["idle"],
+            "zombie": parts["retired"],
+            "reserved": parts["loading"] + parts["statistics"],
+            "free": parts["free"],
+        },
         "hit_ratio": ratios,
         "cache_too_small": verdict.too_small,
         "cache": verdict.why,

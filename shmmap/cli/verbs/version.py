@@ -12,7 +12,8 @@ __all__ = ["add_parser", "installed_version", "run"]
 
 
 _JSON = """\
-  {"shmmap": "x.y.z", "protocol": "major.minor", "layout": "major.minor", "python": "x.y.z"}"""
+  {"shmmap": "x.y.z", "protocol": "major.minor", "layout": "major.minor", "python": "x.y.z"}
+Exit code: 0."""
 
 
 def installed_version() -> str:

@@ -184,7 +184,7 @@ class CellCache:
         Raises
         ------
         OSError
-            It cannot be published, for want of memory, say.
+            It cannot be published, for lack of memory, say.
         """
         mode, gid = self._access
         resident.name = new_segment_name(self._instance)

@@ -107,7 +107,7 @@ class Reclaimer:
         return retired_name(resident.name) if resident.name in self.ledger.retired else resident.name
 
     def is_pinned(self, resident: Resident) -> bool | None:
-        """The kernel's word on a segment; None if its name is gone."""
+        """What the kernel says of a segment; None if its name is gone."""
         if self.pins.source is PinSource.SESSIONS:
             return bool(resident.sessions)
         return self.pins.is_used(self.name_on_disk(resident))

@@ -28,7 +28,7 @@ class CellEvents:
     Attributes
     ----------
     pressure
-        Tells of cells that were refused for want of memory.
+        Tells of cells that were refused for lack of memory.
     """
 
     def __init__(
@@ -77,9 +77,10 @@ class CellEvents:
         """A segment left service; of superseded ones their successor's event tells."""
         if why == "room":
             self._history.evicted(resident.key, resident.version)
-            cell, layer = resident.key
-            log.info("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason="budget")
         if why != "superseded":
+            cell, layer = resident.key
+            reason = "budget" if why == "room" else why
+            log.info("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason=reason)
             self._log.publish(
                 events.Evicted, self._wire_id(resident.key.cell_id), resident.key.layer,
                 resident.version, resident.nbytes, why,

@@ -80,7 +80,7 @@ class EventLog:
 
 
 class PressureEvents:
-    """Tells of cells refused for want of memory, at most once a second however many there are.
+    """Tells of cells refused for lack of memory, at most once a second however many there are.
 
     Parameters
     ----------

@@ -182,7 +182,7 @@ class Scheduler:
             self.loads.clear_failures(SPACE_CODES)
 
     def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Somebody dropped these: what was refused for want of memory may fit now."""
+        """Somebody dropped these: what was refused for lack of memory may fit now."""
         self._cache.reclaimer.let_go(residents, now_s)
         self.loads.clear_failures(SPACE_CODES)
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel's word on which segments are in use."""
+"""Which segments are in use, according to the kernel."""

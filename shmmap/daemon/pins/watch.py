@@ -79,7 +79,7 @@ class PinWatch:
             os.close(fd)
 
     def told(self, fd: int) -> bool:
-        """Whether anybody else uses an open segment, by the kernel's word; False where it gives none."""
+        """Whether anybody else uses an open segment, according to the kernel; False where it gives none."""
         if self.source is PinSource.LEASES:
             return in_use(fd)
         return self.source is PinSource.LOCKS and bool(holders(fd, limit=1))

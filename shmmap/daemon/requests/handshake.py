@@ -81,7 +81,7 @@ class Handshake:
         """A client's process ended, or it said goodbye: what it held may be free now."""
         held, pid = session.residents(), session.peer.pid
         if held:
-            log.info("client gone", pid=pid, name=session.client, held_bytes=session.held_bytes)
+            log.info("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
         self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
         self.cells.forget(session)
         if session.pidfd >= 0:

@@ -47,8 +47,9 @@ class MapChange:
         tell_reload(self.event_log, self.statistics, catalogue, change, cache.wire_id)
         counts = {name: len(getattr(change, name)) for name in ("changed", "moved", "added", "removed")}
         log.info("reload done", cells=len(catalogue), **counts)
+        self.statistics.set("map_problems", len(catalogue.problems))
         for problem in catalogue.problems:
-            log.warning("map problem", text=problem)
+            log.warning("problem in the map", what=problem)
 
     def _keep(self, error: ShmmapError) -> None:
         tell_reload_failed(self.event_log, self.statistics, self.cache.catalogue.map_version, error)

@@ -33,7 +33,7 @@ class Heard:
 
 
 def peer_of(frame: zmq.Frame) -> Peer:
-    """Return the kernel's word on who sent a message."""
+    """Return who sent a message, according to the kernel."""
     try:
         address = frame.get("Peer-Address")
     except zmq.ZMQError:

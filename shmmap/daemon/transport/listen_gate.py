@@ -2,7 +2,7 @@
 """One connection at a time, and none when descriptors run short.
 
 libzmq accepts connections in a thread of its own, as fast as they come, and *aborts the process* when
-``accept`` fails for want of a descriptor (4.3.5, ``ipc_listener.cpp``: EMFILE is not among the errors
+``accept`` fails for lack of a descriptor (4.3.5, ``ipc_listener.cpp``: EMFILE is not among the errors
 it forgives).  So the listening socket is disarmed in libzmq's own epoll set and armed for exactly
 one ``accept`` (EPOLLONESHOT) whenever somebody wants in and a descriptor is to spare.  The kernel
 queues the others meanwhile; nothing they do costs the daemon anything.

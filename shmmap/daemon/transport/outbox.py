@@ -70,7 +70,7 @@ class Outbox:
         self._statistics.add("bytes_sent", len(reply))
 
     def _reads(self, session: Session) -> bool:
-        """Whether a session that was sent much goes on getting replies.
+        """Whether a session that was sent much continues to get replies.
 
         Who asks again has read the last reply as a rule: then nothing is left in the kernel, nor in
         libzmq, which keeps only what the kernel does not take.
@@ -87,7 +87,7 @@ class Outbox:
         return True
 
     def unread(self, sessions: Collection[Session]) -> dict[int, int]:
-        """Bytes sent and, by the kernel's word, not read, by process."""
+        """Bytes sent and, according to the kernel, not read, by process."""
         found: dict[int, int] = {}
         for session in sessions:
             pid = session.peer.pid

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is connected, by the kernel's word, and what each of them holds."""
+"""Who is connected, according to the kernel, and what each of them holds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Session:
     """One client.
 
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
-    naming holders.  Safety never depends on it, pins are the kernel's word.  ``says_where`` tells
+    naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``says_where`` tells
     an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
     asked for.  ``fd`` is the connection's descriptor (libzmq's own: never closed here),
     ``unread_bytes`` what was sent since the client is known to have read everything.  ``asker`` is whose

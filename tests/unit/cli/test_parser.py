@@ -85,7 +85,6 @@ def test_negative_numbers_are_joined_only_behind_their_options() -> None:
         ["query", "--circ", "1,2,3"],
         ["status", "--timeout", "never"],
         ["nonsense"],
-        [],
     ],
 )
 def test_wrong_usage_exits_2_and_hints_at_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,10 +110,15 @@ def test_wrong_usage_exits_2_and_hints_at_help(words: list[str], capsys: pytest.
         ),
         (
             ["status", "--jsno"],
-            "shmmap status: unrecognized arguments: --jsno; did you mean --json?",
+            "shmmap status: unknown option --jsno; did you mean --json?",
             "shmmap status --help",
         ),
-        (["status", "extra"], "shmmap status: unrecognized arguments: extra", "shmmap status --help"),
+        (["status", "extra"], "shmmap status: unexpected argument: extra", "shmmap status --help"),
+        (
+            ["query", "--circel", "1,2,3"],
+            "shmmap query: unknown option --circel; did you mean --circle?",
+            "shmmap query --help",
+        ),
     ],
 )
 def test_what_is_misspelt_is_refused_by_its_verb_with_a_suggestion(
@@ -124,6 +128,14 @@ def test_what_is_misspelt_is_refused_by_its_verb_with_a_suggestion(
         main(words)
     assert ended.value.code == 2
     assert capsys.readouterr().err == f"{complaint}\nhint: {hint}\n"
+
+
+def test_without_a_verb_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert all(f"\n    {verb} " in said.err for verb in CONTRACT)
+    assert "Exit codes" in said.err
 
 
 def test_descriptions_are_filled_and_tables_in_them_are_not(

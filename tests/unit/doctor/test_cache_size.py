@@ -19,22 +19,25 @@ def counters(**values: int) -> dict[str, int]:
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({}, "large enough: nothing evicted or refused"),
+        ({}, "large enough: nothing evicted for room, nothing refused"),
         (
             {"evictions": 29},
-            "large enough: nothing evicted or refused in the last 10 min (29 evicted since the start)",
+            (
+                "large enough: nothing evicted for room or refused in the last 10 min"
+                " (29 evicted for room since the start)"
+            ),
         ),
         (
             {"evictions": 29, "refused_over_budget": 4},
             (
-                "large enough: nothing evicted or refused in the last 10 min"
-                " (29 evicted and 4 refused since the start)"
+                "large enough: nothing evicted for room or refused in the last 10 min"
+                " (29 evicted for room and 4 refused since the start)"
             ),
         ),
-        ({"refused_quota": 9}, "large enough: nothing evicted or refused"),
+        ({"refused_quota": 9}, "large enough: nothing evicted for room, nothing refused"),
         (
             {"evictions_10min": 50, "misses_10min": 500, "loads_after_eviction_10min": 5, "evictions": 50},
-            "large enough: 50 evicted in the last 10 min, hardly any asked for again",
+            "large enough: 50 evicted for room in the last 10 min, hardly any asked for again",
         ),
         (
             {"evictions_10min": 50, "misses_10min": 50, "loads_after_eviction_10min": 30},

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who may change what the daemon serves: reload, evict, pin, shut down.
 
-Asked of the kernel's word on the peer (`Peer`), never of anything a client says.  Root and the
+Judged by what the kernel says of the peer (`Peer`), never of anything a client says.  Root and the
 daemon's own user always may; so may members of the configured administrators' group.
 """
 

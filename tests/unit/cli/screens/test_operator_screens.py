@@ -50,14 +50,17 @@ def text(found: Snapshot, *, width: int = 100, max_clients: int = 10) -> str:
 
 FULL = counters(
     budget_bytes=100 * MIB, bytes_resident=60 * MIB, bytes_pinned=50 * MIB, bytes_zombie=10 * MIB,
-    bytes_reserved=5 * MIB, hits=90, misses=10, hits_10s=3, misses_10s=1, map_cells=1234, sessions=1,
+    bytes_reserved=4 * MIB, bytes_statistics=MIB, hits=90, misses=10,
+    hits_10s=3, misses_10s=1, map_cells=1234,
+    sessions=1,
 )  # fmt: skip
 
 
 def test_the_budget_is_split_without_a_rest() -> None:
     parts = budget_parts(FULL)
     assert parts == {
-        "pinned": 40 * MIB, "idle": 20 * MIB, "zombie": 10 * MIB, "reserved": 5 * MIB, "free": 25 * MIB,
+        "in_use": 40 * MIB, "idle": 20 * MIB, "retired": 10 * MIB, "loading": 4 * MIB, "statistics": MIB,
+        "free": 25 * MIB,
     }  # fmt: skip
     crowded = counters(budget_bytes=MIB, bytes_resident=MIB, bytes_pinned=5 * MIB, bytes_statistics=MIB)
     assert budget_parts(crowded)["free"] == 0
@@ -83,7 +86,7 @@ def test_the_screen_tells_what_an_operator_asks() -> None:
 
 
 def test_a_daemon_that_does_not_beat_says_so() -> None:
-    assert "STOPPED  no heartbeat" in text(snapshot(FULL, [], state="stopped"))
+    assert "PAUSED  no heartbeat" in text(snapshot(FULL, [], state="stopped"))
     assert "no client is connected" in text(snapshot(counters(), []))
     assert "HUNG" in text(snapshot(FULL, [], state="hung"))
 

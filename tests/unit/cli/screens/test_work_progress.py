@@ -37,6 +37,19 @@ def test_part_rate_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+def test_a_stage_in_a_pipe_ends_with_all_of_it() -> None:
+    out = io.StringIO()
+    progress = StageProgress(out)
+    progress.stage("merging", 3_000_000)
+    progress.advance(3_000_000)
+    progress.done(3_000_000)
+    progress.done(3_000_000)
+    assert out.getvalue().splitlines() == [
+        "merging    0%  0.0 of 3.0 M points",
+        "merging  100%  3.0 of 3.0 M points",
+    ]
+
+
 def test_what_a_resumed_run_finds_done_is_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)

@@ -26,7 +26,7 @@ def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert main(["config", "check", "--json", str(file)]) == 0
     assert json.loads(capsys.readouterr().out) == {"file": str(file), "good": True}
     assert main(["config", "init", str(file)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert f"{file} exists" in capsys.readouterr().err
     assert main(["config", "init", str(tmp_path / "none" / "x.toml")]) == 73
 
 

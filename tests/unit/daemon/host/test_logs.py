@@ -32,8 +32,8 @@ def test_on_a_terminal(
     out, err = capsys.readouterr()
     first, second = err.splitlines()
     assert out == ""
-    assert re.fullmatch(r"\d\d:\d\d:\d\d INFO    cell a\\x1b\[2J\.pcd", first)
-    assert re.fullmatch(r"\d\d:\d\d:\d\d ERROR   bad", second)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    cell a\\x1b\[2J\.pcd", first)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ERROR   bad", second)
 
 
 def test_under_systemd(

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells of the map cannot be loaded."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from shmmap.doctor.finding import Finding, ok, skip, warn
+from shmmap.doctor.patient import Patient
+from shmmap.errors import ShmmapError
+from shmmap.quantities import counted
+
+__all__ = ["check_cells"]
+
+ANSWER_S: Final = 2.0
+NAMED: Final = 3
+"""Cells that are named, with their causes."""
+
+
+def check_cells(patient: Patient) -> Finding:
+    """Can every cell be loaded that was asked for?"""
+    name = "cells"
+    if not patient.alive or patient.seen is None:
+        return skip(name, "no daemon runs")
+    failures = patient.seen.counters.get("loads_failed", 0)
+    if not failures:
+        return ok(name, "no load has failed")
+    since = f"{counted(failures, 'load')} failed since the start"
+    advice = "`shmmap inspect FILE` reads a cell's file and says what is wrong with it"
+    if patient.seen.state != "healthy":
+        return warn(name, since, "`shmmap tail` names the cells once the daemon answers; so does its log")
+    try:
+        failing = _failing(patient)
+    except ShmmapError as error:
+        return warn(name, f"{since}; the daemon was not asked which: {error.message}", "its log says which")
+    if not failing:
+        return ok(name, f"{since}; no cell is known to fail now")
+    causes = "; ".join(f"{cell} ({layer}): {failing[cell, layer]}" for cell, layer in list(failing)[:NAMED])
+    more = f"; and {len(failing) - NAMED:,} more" if len(failing) > NAMED else ""
+    return warn(name, f"{counted(len(failing), 'cell')} cannot be loaded: {causes}{more}", advice)
+
+
+def _failing(patient: Patient) -> dict[tuple[str, str], str]:
+    """Return message by cell and layer: what failed and was not loaded since, as far as the daemon recalls.
+
+    Raises
+    ------
+    ShmmapError
+        The daemon does not answer, or not this user.
+    """
+    from shmmap.client.event_stream import EventStream
+    from shmmap.protocol.events import Changed, Failed, Loaded
+
+    identity = patient.seen.identity if patient.seen is not None else None
+    started_s = identity.started_unix_ns * 1e-9 if identity is not None else 0.0
+    since_s = max(time.time() - started_s, 0.0) + 1.0
+    failing: dict[tuple[str, str], str] = {}
+    with EventStream(patient.socket, since=since_s, name="shmmap doctor", timeout=ANSWER_S) as stream:
+        while (event := stream.next(0.0)) is not None:
+            if isinstance(event, Failed):
+                failing[event.id, event.layer] = event.message
+            elif isinstance(event, Loaded):
+                failing.pop((event.id, event.layer), None)
+            elif isinstance(event, Changed) and event.how == "removed":
+                failing = {key: text for key, text in failing.items() if key[0] != event.id}
+    return failing
