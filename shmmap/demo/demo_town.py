@@ -48,7 +48,7 @@ class DemoSettings:
     length, step
         Of the drive that is measured, metres.
     onward
-        How far it goes on after that, a metre at a time: the drive without a daemon.
+        How far it continues after that, a metre at a time: the drive without a daemon.
     scanned
         Length of the drive with three programs, metres.
     pace_s
