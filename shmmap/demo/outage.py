@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive whose daemon is killed with SIGKILL and starts again, while every process continues with what it has."""
+"""A drive whose daemon is killed with SIGKILL and starts again, and all processes continue."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ KIND: Final = LayerKind(
     ),
     parameters=(
         Parameter("leaf", float, "edge of a voxel", "m", required=True, above=0.0, maximum=1e6),
-        Parameter("min_points", int, "minimum number of points of a voxel", default=6, minimum=2, maximum=1 << 30),
+        Parameter("min_points", int, "minimum points of a voxel", default=6, minimum=2, maximum=1 << 30),
     ),
     columns=(
         LayerColumn("mean", np.dtype("<f8"), "(rows, 3)", "m", "mean of the points, map frame"),
