@@ -46,7 +46,6 @@ from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
-from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["Service"]
 
@@ -260,7 +259,7 @@ class Service:
         It may come in the middle of the first one's work, so it trusts the disk alone.
         """
         del number, frame
-        directory, instance = ShmDirectory(self._config.shm_dir), self._config.instance
+        directory, instance = self._memory.directory, self._config.instance
         locks = (directory.path + lock_name(instance), lock_path(self._socket_path))
         ours = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]
         take_away(directory, instance, (*ours, *locks))

@@ -57,6 +57,7 @@ class MapInMemory:
         mode: int,
         gid: int,
     ) -> None:
+        self.directory = directory
         self.epoch = secrets.randbits(63) | 1
         self.identity = DaemonIdentity(
             pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),

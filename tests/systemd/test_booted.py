@@ -307,7 +307,7 @@ def test_the_doctor_tells_each_user_what_is_wrong(fresh: BootedSystemd) -> None:
     well = findings("alice")
     assert {name for name, text in well.items() if text.startswith("fail")} == set(), well
     assert well["group"].startswith("ok: alice is a member of shmmap")
-    assert well["descriptors"].startswith("ok: limit of the daemon")
+    assert well["open files"].startswith("ok: limit of the daemon")
     stranger = findings("mallory")
     assert stranger["group"].startswith("fail: mallory is not a member of shmmap")
     assert "usermod -aG shmmap mallory" in stranger["group"]
