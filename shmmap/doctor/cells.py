@@ -27,7 +27,6 @@ def check_cells(patient: Patient) -> Finding:
     if not failures:
         return ok(name, "no load has failed")
     since = f"{counted(failures, 'load')} failed since the start"
-    advice = "`shmmap inspect FILE` reads a cell's file and says what is wrong with it"
     if patient.seen.state != "healthy":
         return warn(name, since, "`shmmap tail` names the cells once the daemon answers; so does its log")
     try:
@@ -36,9 +35,20 @@ def check_cells(patient: Patient) -> Finding:
         return warn(name, f"{since}; the daemon was not asked which: {error.message}", "its log says which")
     if not failing:
         return ok(name, f"{since}; no cell is known to fail now")
-    causes = "; ".join(f"{cell} ({layer}): {failing[cell, layer]}" for cell, layer in list(failing)[:NAMED])
+    causes = "; ".join(_cause(*one, failing[one]) for one in list(failing)[:NAMED])
     more = f"; and {len(failing) - NAMED:,} more" if len(failing) > NAMED else ""
-    return warn(name, f"{counted(len(failing), 'cell')} cannot be loaded: {causes}{more}", advice)
+    prefix = patient.seen.identity.id_prefix if patient.seen.identity is not None else ""
+    return warn(
+        name,
+        f"{counted(len({cell for cell, _ in failing}), 'cell')} cannot be loaded: {causes}{more}",
+        f"`shmmap inspect {prefix}{next(iter(failing))[0]}` reads the file and says what is wrong with it",
+    )
+
+
+def _cause(cell: str, layer: str, message: str) -> str:
+    """A line about one failure; messages begin with the path of the file, which ends as the cell's id."""
+    before, found, cause = message.partition(f"{cell}: ")
+    return f"{cell} ({layer}): {cause if found and before.startswith('/') else message}"
 
 
 def _failing(patient: Patient) -> dict[tuple[str, str], str]:

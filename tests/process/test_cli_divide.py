@@ -53,7 +53,7 @@ def test_divide_check_and_merge(cloud: Path, tmp_path: Path) -> None:
     assert map_rows(tmp_path / "map") == expected_rows(rows_of(xyzircaedt(4000)))
     merged = shmmap("merge", tmp_path / "map", tmp_path / "back.pcd", "--quiet")
     assert (merged.returncode, merged.stderr) == (0, "")
-    assert "4,000 of" in merged.stdout
+    assert "4,000 from" in merged.stdout
     again = shmmap("divide", tmp_path / "back.pcd", tmp_path / "again", "--quiet")
     assert (again.returncode, again.stderr) == (0, "")
     assert map_rows(tmp_path / "again") == map_rows(tmp_path / "map")

@@ -64,7 +64,7 @@ class PlainProgress(QuietProgress):
         now_s = time.monotonic()
         if now_s - self._told_s >= _PLAIN_EVERY_S and self._done < self._total:
             self._told_s = now_s
-            print_line(f"  {self._done} of {self._total}", flush=True)
+            print_line(f"  step {self._done} of {self._total}", flush=True)
 
     def event(self, text: str) -> None:
         """Something happened."""

@@ -39,12 +39,14 @@ def failure_lines(failed: Iterable[CellError]) -> list[str]:
     """Return one line for each cause, and below it who uses the memory."""
     causes: dict[tuple[str, str, str], list[CellError]] = {}
     for error in failed:
-        reason = error.message.removeprefix(f"{error.cell_id} ({error.layer}): ")
+        # a file's message begins with its path, which the cell's id is
+        reason = error.message.removeprefix(_named(error)).removeprefix(f"{error.cell_id}: ")
         causes.setdefault((error.code, error.layer, reason), []).append(error)
     lines = []
     for (code, layer, reason), errors in causes.items():
         if len(errors) == 1:
-            lines.append(f"failed: {errors[0].message} [{code}]")
+            named = _named(errors[0]) if errors[0].message.startswith(_named(errors[0])) else ""
+            lines.append(f"failed: {named}{reason} [{code}]")
         else:
             names = [error.cell_id.rpartition("/")[2] for error in errors]
             more = ", ..." if len(names) > _NAMED_CELLS else ""
@@ -52,6 +54,10 @@ def failure_lines(failed: Iterable[CellError]) -> list[str]:
             lines.append(f"failed: {len(errors):,} cells ({layer}): {reason} [{code}]: {shown}")
         lines += _holder_lines(errors)
     return lines
+
+
+def _named(error: CellError) -> str:
+    return f"{error.cell_id} ({error.layer}): "
 
 
 def _holder_lines(errors: Iterable[CellError]) -> list[str]:

@@ -26,7 +26,7 @@ class StageProgress:
     quiet
         Show nothing.
     unit, scale
-        What is counted, and how much of it is shown as 1.
+        What is counted, and how much of it is shown as 1; a stage with less is shown one by one.
     """
 
     def __init__(
@@ -40,9 +40,8 @@ class StageProgress:
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._quiet = quiet
-        self._unit = unit
-        self._scale = scale
-        self._digits = 1 if scale > 1 else 0
+        self._units = (unit.removeprefix("M "), 1.0, 0), (unit, scale, 1 if scale > 1 else 0)
+        self._unit, self._scale, self._digits = self._units[1]
         self._began_s = time.monotonic()
         self._name = ""
         self._total = self._points = self._shown = self._counted_from = 0
@@ -52,6 +51,7 @@ class StageProgress:
         """A stage begins."""
         self._end_line()
         self._name, self._total, self._points, self._counted_from = name, total, 0, -1
+        self._unit, self._scale, self._digits = self._units[total >= self._units[1][1]]
         self._shown = 0
         self._stage_s = self._shown_s = time.monotonic()
         if total:
@@ -78,7 +78,7 @@ class StageProgress:
         part = f"{self._points / self._total:4.0%}  " if self._total else ""
         text = f"{self._name}  {part}{self._number(self._points)} of {self._number(self._total)} {self._unit}"
         spent = now - self._stage_s
-        if spent < _SETTLE_S or self._points <= self._counted_from:
+        if spent < _SETTLE_S or self._points <= self._counted_from or self._points >= self._total:
             return text
         rate = (self._points - max(0, self._counted_from)) / spent
         left = (self._total - self._points) / rate

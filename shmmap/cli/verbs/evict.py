@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _kept(client: Client, cells: list[str] | None) -> list[str]:
     """Return the segments that an operator keeps, of these cells or of all: ``"town_0_0.pcd: points"``."""
-    names = set(cells or ())
+    names = {cell.removeprefix(client.welcome.id_prefix) for cell in cells or ()}
     return [
         f"{row.id.rpartition('/')[2]}: {row.layer}"
         for row in client.pin().cells

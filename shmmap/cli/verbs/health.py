@@ -12,8 +12,8 @@ from shmmap.errors import DaemonUnreachable
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped" | "hung" | "dead", "beat_age_s", "pid", "instance"}
-Exit code: 0 healthy, 1 stopped or hung, 69 dead or never started."""
+  {"state": "healthy" | "stopped": paused | "hung" | "dead", "beat_age_s", "pid", "instance"}
+Exit code: 0 healthy, 1 paused or hung, 69 dead or never started."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -23,7 +23,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "health",
         run,
         help="is the daemon healthy? (exit code 0: yes)",
-        description="Say whether the daemon is healthy, stopped (paused by SIGSTOP or a debugger), hung or "
+        description="Say whether the daemon is healthy, paused (by SIGSTOP or a debugger), hung or "
         "dead.  Reads its statistics in shared memory, so it answers whatever the daemon does.",
         json=_JSON,
     )
@@ -46,5 +46,6 @@ def run(args: argparse.Namespace) -> int:
         )
     else:
         age = format_duration(found.beat_age_s)
-        print_line(f"{found.state}: pid {identity.pid}, last heartbeat {age} ago")
+        state = "paused" if found.state == "stopped" else found.state
+        print_line(f"{state}: pid {identity.pid}, last heartbeat {age} ago")
     return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(found.state, 1)

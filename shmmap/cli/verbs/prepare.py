@@ -43,7 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
     add_layer_option(parser, "layers, such as 'ndt(leaf=2.0)' or points")
-    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, where it is not with the map")
+    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
     )

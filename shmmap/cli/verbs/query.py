@@ -127,9 +127,7 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print_json(_as_json(found, welcome.frame_id))
         else:
-            _print_text(
-                found, welcome.id_prefix, summed=bool(found.cells) or held_given or not found.complete
-            )
+            _print_text(found, welcome.id_prefix, summed=bool(found.cells) or held_given)
         if not found.complete:
             return 1
         return _judge_empty(args, client, area, found)

@@ -108,8 +108,7 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
             4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
         )
     if problems := count.get("map_problems", 0):
-        told = f"{counted(problems, 'problem')} found in the map, see the log or `shmmap reload`"
-        lines.append(("map", told))
+        lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
     if count["stale_cells"]:
         lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
     if count["zombies"]:

@@ -120,7 +120,7 @@ def test_a_long_stage_says_in_a_pipe_how_far_it_is(
     progress.stage("Driving", 4)
     for _ in range(4):
         progress.step()
-    assert capsys.readouterr().out.splitlines() == ["Driving ...", "  2 of 4"]
+    assert capsys.readouterr().out.splitlines() == ["Driving ...", "  step 2 of 4"]
 
 
 @pytest.mark.parametrize("width", [80, 120])

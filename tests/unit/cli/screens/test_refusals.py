@@ -29,6 +29,12 @@ def test_one_line_a_cause_and_each_holder_once() -> None:
     ]
 
 
+def test_a_path_is_told_once() -> None:
+    message = "/map/bad.pcd (points): /map/bad.pcd: cut off"
+    failed = LoadFailed(message, cell_id="/map/bad.pcd", layer="points")
+    assert failure_lines([failed]) == ["failed: /map/bad.pcd (points): cut off [load_failed]"]
+
+
 def test_who_asks_is_no_holder_of_nothing() -> None:
     assert failure_lines([refused("a.pcd", ASKER)]) == [f"failed: /map/a.pcd (points): {FULL} [over_budget]"]
 

@@ -50,6 +50,13 @@ def test_a_stage_in_a_pipe_ends_with_all_of_it() -> None:
     ]
 
 
+def test_few_points_are_told_one_by_one() -> None:
+    progress = StageProgress(io.StringIO())
+    progress.stage("merging", 20_000)
+    progress.advance(5_000)
+    assert progress.text(time.monotonic()) == "merging   25%  5,000 of 20,000 points"
+
+
 def test_what_a_resumed_run_finds_done_is_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
