@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["add_pose_format_option", "add_pose_option", "pose_from"]
+__all__ = ["add_pose_format_option", "add_pose_option", "pose_from", "pose_text"]
 
 _POSE: Final = "X,Y,Z,ROLL,PITCH,YAW"
 """Metavar of options whose values are poses."""
@@ -40,8 +40,8 @@ def add_pose_format_option(parser: argparse.ArgumentParser | argparse._ArgumentG
         "--pose-format",
         choices=tuple(_FORMATS),
         default="rpy",
-        help="how poses are written in options: rpy: X,Y,Z,ROLL,PITCH,YAW in metres and radians, about fixed"
-        " axes as in ROS (default); tum: X,Y,Z,QX,QY,QZ,QW; xyyaw: X,Y,YAW",
+        help="how poses are written in options, and printed: rpy: X,Y,Z,ROLL,PITCH,YAW in metres and radians,"
+        " about fixed axes as in ROS (default); tum: X,Y,Z,QX,QY,QZ,QW; xyyaw: X,Y,YAW",
     )
 
 
@@ -68,6 +68,34 @@ def pose_from(args: argparse.Namespace, option: str) -> NDArray[np.float64]:
     if args.pose_format == "xyyaw":
         return matrix_of((*numbers[:2], 0.0), _quaternion(0.0, 0.0, numbers[2]))
     return matrix_of(numbers[:3], _quaternion(*numbers[3:]))
+
+
+def pose_text(T: NDArray[np.float64], pose_format: str) -> str:
+    """Return a pose, (4, 4), as `pose_from` reads it: numbers with commas between them.
+
+    Parameters
+    ----------
+    T
+        Metres, map frame.
+    pose_format
+        As ``--pose-format`` names it; ``xyyaw`` leaves out height, roll and pitch.
+    """
+    from shmmap_clients.scans.trajectory import quaternion_of
+
+    r, (x, y, z) = T[:3, :3], T[:3, 3].tolist()
+    yaw = math.atan2(r[1, 0], r[0, 0])
+    if pose_format == "tum":
+        return _numbers((x, y, z), quaternion_of(r))
+    if pose_format == "xyyaw":
+        return _numbers((x, y), (yaw,))
+    roll, pitch = math.atan2(r[2, 1], r[2, 2]), math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    return _numbers((x, y, z), (roll, pitch, yaw))
+
+
+def _numbers(metres: tuple[float, ...], rotation: tuple[float, ...]) -> str:
+    """Write metres to the millimetre, and rotations to the microradian; no number is -0."""
+    words = [f"{round(value, 3) + 0.0:.3f}" for value in metres]
+    return ",".join(words + [f"{round(value, 6) + 0.0:.6f}" for value in rotation])
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:

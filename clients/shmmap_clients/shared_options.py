@@ -44,20 +44,24 @@ def add_scans_option(parser: Parser) -> None:
 def add_leaf_option(parser: Parser) -> None:
     """Add ``--leaf``."""
     parser.add_argument(
-        "--leaf", type=positive, default=2.0, metavar="M", help="edge of an NDT voxel (default: 2)"
+        "--leaf", type=positive, default=2.0, metavar="M", help="edge length of an NDT voxel (default: 2)"
     )
 
 
 def add_thin_option(parser: Parser, *, default: float) -> None:
     """Add ``--thin``."""
-    shown = f"{default:g}; 0: all points" if default else "0, all points, as the original programs do"
+    shown = (
+        f"{default:g}; 0: use all points"
+        if default
+        else "0: use all points, to equal the original programs; 1 is recommended: about 20 times faster,"
+        " and more accurate"
+    )
     parser.add_argument(
         "--thin",
         type=not_negative,
         default=default,
         metavar="M",
-        help="replace the scan's points in each cube of M metres by their mean: with all points NDT takes 20"
-        f" times as long as with 1 m, and is less accurate (default: {shown})",
+        help=f"replace the scan's points in each cube of M metres by their mean (default: {shown})",
     )
 
 
@@ -112,7 +116,8 @@ def add_sigma_options(parser: Parser) -> None:
         type=positive,
         default=0.1745,
         metavar="RAD",
-        help="how far off its yaw may be; 1.82 and more: not known at all (default: 0.1745, 10 degrees)",
+        help="how far off the rough yaw may be, standard deviation; 3.14: the yaw is unknown (default:"
+        " 0.1745, 10 degrees)",
     )
 
 
@@ -123,5 +128,5 @@ def add_height_option(parser: Parser, *, default: float | None, shown: str) -> N
         type=float,
         default=default,
         metavar="M",
-        help=f"height of the scan's frame above the map's ground (default: {shown})",
+        help=f"height of the frame that the points are in above the map's ground (default: {shown})",
     )

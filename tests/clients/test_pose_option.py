@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 
 from shmmap import BadRequest
 
@@ -56,3 +56,18 @@ def test_what_is_no_pose_is_refused(text: str, capsys: pytest.CaptureFixture[str
     with pytest.raises(SystemExit):
         read(text)
     assert "expected a pose X,Y,Z,ROLL,PITCH,YAW" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["rpy", "tum"])
+def test_a_printed_pose_can_be_given_again(name: str) -> None:
+    for text in ("16.492,78.504,-3.673,0.3,-0.2,2.5", "-1,2,3,-3.1,1.5,-0.7", "0,0,0,0,0,0"):
+        T = read(text)
+        np.testing.assert_allclose(read(pose_text(T, name), "--pose-format", name), T, atol=2e-6)
+    assert (
+        pose_text(read("16.492,78.504,-3.673,0,0,0"), "rpy")
+        == "16.492,78.504,-3.673,0.000000,0.000000,0.000000"
+    )
+
+
+def test_a_printed_heading_leaves_out_the_rest() -> None:
+    assert pose_text(read("1,2,3,0.1,0.2,0.5"), "xyyaw") == "1.000,2.000,0.500000"

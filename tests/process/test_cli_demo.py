@@ -165,7 +165,7 @@ def test_without_numba_the_demo_says_what_is_left_out(
     print_report(result, "town.svg", 1.0)
     lines = capsys.readouterr().out.splitlines()[-8:]
     assert [line.split("  ")[0] for line in lines] == [
-        "town", "memory", "one more", "waiting", "CPU", "kill -9", "position", "all of it",
+        "town", "memory", "one more", "waiting", "CPU", "kill -9", "position", "duration",
     ]  # fmt: skip
     assert "the package numba is not installed" in lines[6]
 

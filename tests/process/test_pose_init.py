@@ -101,7 +101,9 @@ def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> 
     assert ": reliable" in done.stdout
     flat = [*words[:3], f"{x + 1},{y - 1},{yaw}", *words[4:], "--pose-format", "xyyaw"]
     again = subprocess.run([*program, *flat], capture_output=True, text=True)
-    assert again.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]  # the last are times
+    # the first is the pose as --pose-format says, the last has times
+    assert again.stdout.splitlines()[1:-1] == done.stdout.splitlines()[1:-1]
+    assert again.stdout.splitlines()[0].count(",") == 2
     missing = [*program, "--scan", str(tmp_path / "none.npz"), "--pose", "0,0,0,0,0,0"]
     assert subprocess.run(missing, capture_output=True).returncode == 66
     assert subprocess.run([*program, "--scan", "x"], capture_output=True).returncode == 2

@@ -211,6 +211,11 @@ class PoseInitializer:
             search_s=time.perf_counter() - had_map,
         )
 
+    @property
+    def trust(self) -> TrustLimits:
+        """Limits of trust that are in force, for the map that was searched last."""
+        return self._fine.trust
+
     def _take_map(self, rough: RoughPose) -> tuple[float | None, list[float]]:
         """Have the map around a place, and return the heights of its ground there."""
         self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)

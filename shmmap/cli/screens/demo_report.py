@@ -26,7 +26,7 @@ def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
     print_line()
     _print_table(result)
     print_line()
-    print_pairs([*_lines(result), ("all of it", f"{format_duration(duration_s)}; picture: {picture}")])
+    print_pairs([*_lines(result), ("duration", f"{format_duration(duration_s)}; picture: {picture}")])
 
 
 def _print_table(result: DemoResult) -> None:
@@ -71,7 +71,7 @@ def _lines(result: DemoResult) -> list[tuple[str, str]]:
 def _town(result: DemoResult) -> str:
     town, one = result.town, result.many.shared
     return (
-        f"{town.cells} cells, {town.points / 1e6:.0f} million points; each process keeps the {one.cells}"
+        f"{town.cells} cells, {town.points / 1e6:.1f} million points; each process keeps the {one.cells}"
         f" cells around the vehicle, {format_bytes(one.map_bytes)}."
     )
 
@@ -81,7 +81,18 @@ def _memory(result: DemoResult) -> str:
     last = result.rounds[count]
     return (
         f"{count} processes with a private copy each: {format_bytes(last.private.total_bytes)}; with shmmap:"
-        f" {format_bytes(last.shared.total_bytes)}."
+        f" {format_bytes(last.shared.total_bytes)}.{_too_small(result)}"
+    )
+
+
+def _too_small(result: DemoResult) -> str:
+    """Say why sharing saves nothing where the map is sparse: every process also has a fixed size."""
+    last = result.rounds[max(result.rounds)]
+    if last.shared.total_bytes < last.private.total_bytes:
+        return ""
+    return (
+        f" The map around the vehicle ({format_bytes(last.shared.map_bytes)}) is too small for sharing to"
+        " save memory; --density 100 makes a larger one."
     )
 
 
@@ -119,11 +130,12 @@ def _cpu(result: DemoResult) -> str:
 
 def _outage(result: DemoResult) -> str:
     out = result.outage
+    millions = sum(out.counted) / len(out.counted) / 1e6
     return (
-        f"Without a daemon for {format_duration(out.down_s)}, {out.consumers} processes read on:"
-        f" {sum(out.counted) / 1e6:.0f} million points, {1 / out.pace_s:.0f} times a second, at most"
-        f" {format_duration(out.longest_pause_s)} apart. The new daemon took over {out.adopted} of"
-        f" {out.segments} segments."
+        f"There was no daemon for {format_duration(out.down_s)}, and {out.consumers} processes continued to"
+        f" read the map {1 / out.pace_s:.0f} times a second, at most {format_duration(out.longest_pause_s)}"
+        f" apart, {millions:.1f} million points each. The new daemon took over {out.adopted} of {out.segments}"
+        " segments."
     )
 
 

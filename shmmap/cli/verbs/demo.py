@@ -59,7 +59,7 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "demo",
         run,
-        help="see it work: no map needed, under a minute",
+        help="see it work: no map needed, about a minute",
         description="Build a town and drive through it with one process, then with eight: each with a private"
         " copy of the map, then all on one copy that shmmap shares.  Kill the daemon, and see the processes"
         " drive on.  Localize simulated LiDAR scans, and compare with the truth.",
@@ -75,7 +75,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--density",
         metavar="POINTS",
         type=_density,
-        help="points per square metre of ground; fewer are quicker (default: 100, or what fits)",
+        help="points per square metre of ground, 2 to 1000; fewer are quicker (default: 100, or what fits)",
     )
     parser.add_argument(
         "--full",

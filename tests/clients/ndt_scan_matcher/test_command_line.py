@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,7 +58,14 @@ def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture
     assert code == 0
     assert "T_map_base" in out
     assert "points 500" in out  # left out by the cap
-    assert "by the limits" in out
+    assert "worst case for the largest scan allowed: " in out
+    assert "(700 points x " in out
+    found = re.search(r"^pose +(\S+)$", out, re.MULTILINE)
+    assert found is not None
+    again = main(
+        ["align", "--map", str(files["map.npz"]), "--scan", str(files["scan.npz"]), "--guess", found[1]]
+    )
+    assert again == 0, "what is printed is what options take"
     assert "trusted                 yes" in out
 
 

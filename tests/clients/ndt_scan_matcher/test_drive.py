@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.decimation import KEPT
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport
+from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
@@ -180,6 +180,23 @@ def test_summary_and_picture_of_a_drive(tmp_path: Path) -> None:
         for one in drawn:
             plot.add(one)
         assert ElementTree.fromstring(plot.svg()).tag.endswith("svg")
+
+
+def test_the_summary_in_words_leaves_out_what_has_no_data(capsys: pytest.CaptureFixture[str]) -> None:
+    statistics = DriveStatistics()
+    for number in range(3):
+        statistics.add(frame(number, np.eye(4), None))  # without a map: no score
+    updates = UpdateStatistics()
+    updates.add(added=64, removed=0, request_s=0.1, build_s=0.01, private_bytes=60_000)
+    print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
+    out = capsys.readouterr().out
+    assert "updates: 1, cells added: 64, cells removed: 0" in out
+    assert "0.06 MB at most, beside the shared memory" in out
+    rows = [line.split("  ")[0] for line in out.splitlines() if " variance " in line]
+    assert "latency, ms" in rows
+    assert "map request, ms" in rows
+    assert "NVTL" not in rows
+    assert "transform probability" not in rows
 
 
 def test_a_frame_as_json_says_how_far_it_is_from_the_truth() -> None:

@@ -26,7 +26,8 @@ _EPILOG: Final = """\
 JSON (fields may be added, none is removed):
   {"points", "kept", "no_map": bool, "compare_ms"}
 The file written has the kept points with all fields, and a column index: their
-rows in the scan; with --mask all points, and a column kept.
+rows in the scan; with --mask all points, and a column kept (1: not explained by
+the map).
 Exit code: 0; 1 when there is no map around the scan, or no point is kept."""
 
 
@@ -42,12 +43,18 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--map", required=True, metavar="FILE", help="map: PCD, NPZ or any other cloud file")
     add_scan_option(parser)
-    add_pose_option(parser, "--pose", "pose of the sensor (default: the scan is in the map frame)")
+    add_pose_option(
+        parser, "--pose", "pose of the frame that the points are in (default: they are in the map frame)"
+    )
     add_pose_format_option(parser)
     add_rule_options(parser)
     out = parser.add_argument_group("output")
     out.add_argument("--out", metavar="DIR", help="write SCAN.pcd into this directory")
-    out.add_argument("--mask", action="store_true", help="write all points, with a column kept")
+    out.add_argument(
+        "--mask",
+        action="store_true",
+        help="write all points, with a column named kept (1: not explained by the map)",
+    )
     out.add_argument(
         "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
     )

@@ -63,7 +63,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--poses",
         metavar="FILE",
-        help="poses of the sensor for the scans of a directory, TUM format; a publisher's scans bring theirs",
+        help="poses of the frame that the points are in, for the scans of a directory, TUM format; a"
+        " publisher's scans bring theirs",
     )
     add_rule_options(parser)
     window = parser.add_argument_group("map around the vehicle")
@@ -86,7 +87,9 @@ def add_parser(subparsers: Any) -> None:
         "--out", metavar="DIR|ENDPOINT", help="write PCD files, or publish scans at this ZeroMQ address"
     )
     out.add_argument(
-        "--mask", action="store_true", help="give all points, with a column kept, not only the kept ones"
+        "--mask",
+        action="store_true",
+        help="give all points, with a column named kept (1: not explained by the map)",
     )
     out.add_argument(
         "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
@@ -168,10 +171,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(statistics: DriveStatistics) -> None:
-    times = statistics.summary()["compare_ms"] or {"p50": 0.0, "p99": 0.0}
+    times = statistics.summary()["compare_ms"]
+    spent = f" {times['p50']:.1f} ms each (p99 {times['p99']:.1f});" if times else ""
     print(
-        f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;"
-        f" {times['p50']:.1f} ms each (p99 {times['p99']:.1f});"
+        f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;{spent}"
         f" {statistics.incomplete} scans with cells missing, {statistics.no_map} without a map"
     )
 

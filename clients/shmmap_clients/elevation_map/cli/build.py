@@ -45,8 +45,10 @@ _EPILOG: Final = """\
 JSON (fields may be added, none is removed):
   {"map_version": hex, "cells", "loaded": cells that this run loaded,
    "rows", "columns": of the grid, "resolution", "origin": south-west corner,
-   "occupied": columns with a point, "measured": columns with a height,
-   "measured_share": of the occupied ones, or null, "filled": columns,
+   "occupied": columns with a point, "measured": columns with a height from
+   points,
+   "measured_share": of the occupied ones, or null, "filled": columns whose
+   height was filled in from others near,
    "stray": points outside their cell, "failed": [{"id", "code", "message"}],
    "files": [path]}
 Exit code: 0; 1 when cells could not be loaded, or no column has a height."""
@@ -60,7 +62,7 @@ def add_parser(subparsers: Any) -> None:
         run,
         help="make an elevation map of the whole map",
         description="Make an elevation map of the daemon's whole map, one cell at a time, and write it.  What"
-        " was made before is cached for each version of the map, and an interrupted run goes on.",
+        " was made before is cached for each version of the map, and an interrupted run continues.",
         epilog=_EPILOG,
     )
     parser.add_argument(
@@ -152,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     if args.hillshade and Path(args.hillshade).suffix.lower() != ".png":
         raise BadRequest(f"{args.hillshade}: a hillshade is written as .png")
     fill_reach(args.fill_radius / rule.resolution)
-    with _ProgressLine(quiet=args.quiet) as progress:
+    with _ProgressLine("points" if args.rule == "surface" else "columns", quiet=args.quiet) as progress:
         with connect(args, _NAME) as client:
             for attempt in range(_ATTEMPTS):
                 try:
@@ -208,8 +210,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(
             f"{built.cells} cells, {built.loaded} loaded: {grid.shape[1]} x {grid.shape[0]} columns of"
-            f" {grid.resolution:g} m, {built.occupied} with points, {measured} measured,"
-            f" {counts[FILLED]} filled"
+            f" {grid.resolution:g} m, {built.occupied} with points, {measured} with a height,"
+            f" {counts[FILLED]} more with heights filled in"
         )
         print(f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out")
         for error in built.failed:
@@ -242,7 +244,8 @@ def _cache(named: str | None) -> Path:
 class _ProgressLine:
     """One line that is written over on a terminal, and a line now and then elsewhere."""
 
-    def __init__(self, *, quiet: bool) -> None:
+    def __init__(self, rows: str, *, quiet: bool) -> None:
+        self._rows = rows
         self._quiet = quiet
         self._terminal = sys.stderr.isatty()
         self._next_s = 0.0
@@ -259,7 +262,7 @@ class _ProgressLine:
         now_s = time.monotonic()
         if now_s >= self._next_s or progress.done == progress.cells:
             self._next_s = now_s + (_EVERY_S if self._terminal else 10 * _EVERY_S)
-            self.say(f"{progress.done} of {progress.cells} cells, {progress.rows} rows")
+            self.say(f"{progress.done} of {progress.cells} cells, {progress.rows} {self._rows}")
 
     def say(self, text: str) -> None:
         """Show what is being done."""

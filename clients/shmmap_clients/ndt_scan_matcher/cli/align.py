@@ -14,7 +14,7 @@ from shmmap_clients.command_line import (
     print_json,
 )
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options, matcher_from
-from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 from shmmap_clients.shared_options import add_leaf_option, add_scan_option, add_thin_option
 
 __all__ = ["add_parser", "run"]
@@ -26,12 +26,15 @@ JSON (fields may be added, none is removed):
    "trustworthy": bool, "no_map": bool, "failed_limits": [name],
    "covariance": 6x6 of x y z roll pitch yaw, or null,
    "cut": {"points", "neighbor_points", "neighbors", "voxels"}: left out by
-     limits, "worst_case_ms": bound by the limits, on this machine,
+     limits, "worst_case_ms": for the largest scan that the limits allow,
+     estimated on this machine,
    "align_ms": measured, "points", "voxels", "variant", "convention": the same,
    "neighbors", "backend"}
-  Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
+  failed_limits names what did not hold: no_map, converged (it did not
+  converge), nvtl, transform_probability, oscillations.
 Exit code: 0; 1 when the alignment did not converge, or no point of the scan has
-a voxel of the map near."""
+a voxel of the map near.  One that converged and is not trusted: 0; trustworthy
+and the line "trusted" say so."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -41,7 +44,8 @@ def add_parser(subparsers: Any) -> None:
         "align",
         run,
         help="align one scan with one map file; no daemon",
-        description="Align one scan with one map file and print the pose of the scan; no daemon is needed.",
+        description="Align one scan with one map file and print the pose of the frame that the points are in;"
+        " no daemon is needed.",
         epilog=_JSON,
     )
     parser.add_argument("--map", required=True, metavar="FILE", help="map: PCD, NPZ or any other cloud file")
@@ -108,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(document)
     else:
+        print(f"{'pose':24}{pose_text(result.T_map_base, args.pose_format)}")
         _print(document, [trust.describe(name) for name in result.failed_limits], bound.describe())
     if result.no_map:
         x, y, z = result.T_map_base[:3, 3]

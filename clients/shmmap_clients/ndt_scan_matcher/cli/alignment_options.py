@@ -60,12 +60,20 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
     add_backend_option(group)
     add_threads_option(group)
     limits = parser.add_argument_group("limits (what exceeds one is left out and counted)")
-    limits.add_argument("--max-points", type=at_least(1), metavar="N", help="points of a scan")
     limits.add_argument(
-        "--max-neighbors", type=at_least(1), metavar="N", help="voxels per point; the nearest are taken"
+        "--max-points", type=at_least(1), metavar="N", help="points of a scan (default: 131072)"
     )
     limits.add_argument(
-        "--max-voxels", type=at_least(1), metavar="N", help="voxels of the map; whole cells are left out"
+        "--max-neighbors",
+        type=at_least(1),
+        metavar="N",
+        help="voxels per point; the nearest are taken (default: 32)",
+    )
+    limits.add_argument(
+        "--max-voxels",
+        type=at_least(1),
+        metavar="N",
+        help="voxels of the map; whole cells are left out (default: 1000000)",
     )
     trust = parser.add_argument_group("trust (a result beyond one of these limits is not trusted)")
     trust.add_argument(

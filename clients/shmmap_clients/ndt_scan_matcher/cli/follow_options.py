@@ -58,10 +58,11 @@ JSON (fields may be added, none is removed).
    "state": tracking, uncertain or lost, "relocalized", "iterations",
    "transform_probability", "nvtl", "waited", "latency_ms",
    "error_m", "error_deg": to the true pose, null without a truth}
-Names of limits: no_map, converged, nvtl, transform_probability, oscillations.
+failed_limits names what did not hold: no_map, converged (the alignment did not
+converge), nvtl, transform_probability, oscillations.
 
-Exit code: 0; 1 when a scan was not trusted (with --allow-empty: other than for
-want of a map), the map did not keep up, or there was no scan."""
+Exit code: 0; 1 when a scan was not trusted (with --allow-empty: for another
+reason than no map), the map did not keep up, or there was no scan."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +74,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="true poses of the scans of a directory, TUM format, to compare with and to start from; a"
         " publisher's scans bring theirs",
     )
-    add_pose_option(parser, "--init", "start pose (default: the first scan's true pose)")
+    add_pose_option(
+        parser,
+        "--init",
+        "start pose of the frame that the points are in (default: the first scan's true pose)",
+    )
     add_pose_format_option(parser)
     parser.add_argument(
         "--odometry",
@@ -136,7 +141,7 @@ def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
         group, "--rough", "start pose that is metres and degrees off: search around it; implies --relocalize"
     )
     add_sigma_options(group)
-    add_height_option(group, default=None, shown="the z of the pose to search around is right")
+    add_height_option(group, default=None, shown="keep the z of the pose that is searched around")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:

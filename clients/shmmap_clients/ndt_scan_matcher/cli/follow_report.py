@@ -128,18 +128,18 @@ class FollowReport:
             x, y = frame.result.T_map_base[:2, 3]
             line = (
                 f"\r{self._frames:6} {printable(frame.name):20.20} ({x:9.2f}, {y:9.2f})"
-                f" NVTL {frame.result.nvtl:5.2f} {frame.result.iterations:3} it"
+                f" NVTL {frame.result.nvtl:5.2f} {frame.result.iterations:3} iterations"
                 f" {frame.latency_s * 1e3:7.1f} ms {frame.state:9}"
             )
             print(line, end="", file=sys.stderr, flush=True)
 
 
 def print_summary(summary: DriveSummary) -> None:
-    """Print the summary of a drive for people."""
+    """Print the summary of a drive for people; rows without data (scores without a map) are left out."""
     s = summary
     print(
         f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} trusted,"
-        f" {s.cut_frames} cut by limits"
+        f" {s.cut_frames} shortened by the limits"
     )
     if s.failed_limits:
         why = (f"{s.trust.describe(name)} ({count})" for name, count in s.failed_limits.items())
@@ -147,10 +147,10 @@ def print_summary(summary: DriveSummary) -> None:
     if s.lost or s.relocalized:
         print(f"  lost          {s.lost} scans; relocalized {s.relocalized} times")
     print(
-        f"map             {s.map_updates} updates, +{s.cells_added} -{s.cells_removed} cells;"
-        f" {s.waited} scans waited"
+        f"map             updates: {s.map_updates}, cells added: {s.cells_added}, cells removed:"
+        f" {s.cells_removed}, scans that waited for it: {s.waited}"
     )
-    print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most")
+    print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most, beside the shared memory")
     if s.errors is not None:
         e = s.errors
         print(
@@ -161,17 +161,19 @@ def print_summary(summary: DriveSummary) -> None:
         if words:
             print(f"  relative      {'; '.join(words)}")
     for name, spread in (
-        ("TP", s.transform_probability),
+        ("transform probability", s.transform_probability),
         ("NVTL", s.nvtl),
         ("iterations", s.iterations),
-        ("latency ms", s.latency_ms),
-        ("  thin ms", s.thin_ms),
-        ("  map ms", s.map_ms),
-        ("  align ms", s.align_ms),
-        ("map request ms", s.map_request_ms),
-        ("map build ms", s.map_build_ms),
+        ("latency, ms", s.latency_ms),
+        ("  thinning, ms", s.thin_ms),
+        ("  waiting for map, ms", s.map_ms),
+        ("  alignment, ms", s.align_ms),
+        ("map request, ms", s.map_request_ms),
+        ("map building, ms", s.map_build_ms),
     ):
+        if not spread.max > 0.0:  # none (NaN), or no scan had it
+            continue
         print(
-            f"{name:15} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
+            f"{name:21} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
             f"  p99 {spread.p99:8.3f}  max {spread.max:8.3f}"
         )

@@ -47,8 +47,9 @@ class TimeBound:
     def describe(self) -> str:
         """Return the bound with what it is made of."""
         return (
-            f"at most {self.total_ms:.0f} ms by the limits"
-            f" ({self.evaluations} evaluations x {self.points} points x {self.point_ns:.0f} ns)"
+            f"worst case for the largest scan allowed: {self.total_ms / 1e3:.1f} s"
+            f" ({self.points} points x {self.evaluations} evaluations x {self.point_ns:.0f} ns); a lower"
+            " --max-points lowers it"
         )
 
 

@@ -17,7 +17,7 @@ from shmmap_clients.command_line import (
     print_json,
     run_command,
 )
-from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
+from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 from shmmap_clients.shared_options import (
     add_backend_option,
     add_height_option,
@@ -44,7 +44,8 @@ JSON (fields may be added, none is removed):
    "alternatives": [{"T_map_base", "score", "nvtl"}] other poses, best first,
    "candidates", "map_ms", "search_ms"}
   Where there is no map, "no_map" is true and the others are null, false, 0 or
-  empty.  failed_limits says why a pose is not reliable.
+  empty.  failed_limits names what did not hold where a pose is not reliable
+  (converged: the alignment did not converge).
 Exit code: 0; 1 when the pose is not reliable, or there is no map around it."""
 
 
@@ -64,11 +65,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_scan_option(parser)
     add_pose_option(
-        parser, "--pose", "rough pose; its z counts only where the map has no ground near", required=True
+        parser,
+        "--pose",
+        "rough pose; the height comes from the map's ground, and from its z only where there is none near",
+        required=True,
     )
     add_pose_format_option(parser)
     add_sigma_options(parser)
-    add_height_option(parser, default=0.0, shown="0")
+    add_height_option(parser, default=0.0, shown="0, a frame on the ground, such as base_link")
     parser.add_argument(
         "--candidates", type=at_least(1), default=200, metavar="N", help="poses to score (default: 200)"
     )
@@ -115,7 +119,8 @@ def _run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_document(found))
     else:
-        _print(found)
+        failed = [initializer.trust.describe(name) for name in found.result.failed_limits]
+        _print(found, args.pose_format, failed)
     return 0 if found.reliable else 1
 
 
@@ -143,12 +148,13 @@ def _document(found: InitialPose | None) -> dict[str, Any]:
     }
 
 
-def _print(found: InitialPose) -> None:
+def _print(found: InitialPose, pose_format: str, failed: list[str]) -> None:
     result = found.result
+    print(f"pose          {pose_text(found.T_map_base, pose_format)}")
     print("T_map_base")
     for row in found.T_map_base:
         print("  " + " ".join(f"{value:12.6f}" for value in row))
-    verdict = "reliable" if found.reliable else f"NOT reliable (failed: {', '.join(result.failed_limits)})"
+    verdict = "reliable" if found.reliable else f"NOT reliable ({', '.join(failed)})"
     print(f"score         {found.score:.3f}, NVTL {result.nvtl:.3f}: {verdict}")
     print(f"ground        {'none near' if found.ground_z is None else f'{found.ground_z:.3f} m'}")
     for one in found.alternatives:

@@ -49,8 +49,8 @@ def test_eight_lines_with_what_was_measured(capsys: pytest.CaptureFixture[str]) 
     print_report(result(), "/tmp/town.svg", 31.0)
     out = capsys.readouterr().out.splitlines()
     lines = {line[:10].strip(): line[10:].strip() for line in out[-8:]}
-    assert " ".join(lines) == "town memory one more waiting CPU kill -9 position all of it"
-    assert "21 million points" in lines["town"]
+    assert " ".join(lines) == "town memory one more waiting CPU kill -9 position duration"
+    assert "20.8 million points" in lines["town"]
     assert lines["memory"] == "8 processes with a private copy each: 920 MiB; with shmmap: 360 MiB."
     # (920 - 115) / 7 and (360 - 220) / 7
     assert (
@@ -59,12 +59,28 @@ def test_eight_lines_with_what_was_measured(capsys: pytest.CaptureFixture[str]) 
     assert "78.0 ms at worst with private copies, 2.0 ms with shmmap" in lines["waiting"]
     assert "4.1 s; with shmmap: 6.0 s" in lines["CPU"]
     assert "117 cells: 1.5 s" in lines["CPU"]
-    for words in ("for 1.7 s", "8 processes", "12 million", "10 times a second", "104.0 ms", "143 of 144"):
+    for words in (
+        "for 1.7 s",
+        "8 processes",
+        "1.5 million points each",
+        "10 times a second",
+        "104.0 ms",
+        "143 of 144",
+    ):
         assert words in lines["kill -9"]
     assert "0.9 cm from the truth on average, 1.4 cm at most" in lines["position"]
-    assert lines["all of it"] == "31.0 s; picture: /tmp/town.svg"
+    assert lines["duration"] == "31.0 s; picture: /tmp/town.svg"
     table = [line.split() for line in out if line.endswith(" ms") and line[0].isdigit()]
     assert [row[0] for row in table] == ["1", "1", "8", "8"]
+
+
+def test_a_map_too_small_to_gain_from_sharing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    sparse = result()
+    print_report(sparse, "town.svg", 1.0)
+    assert "--density" not in capsys.readouterr().out
+    sparse.rounds[8] = Round(drive(8, 220, 10), drive(8, 170, 0))
+    print_report(sparse, "town.svg", 1.0)
+    assert "is too small for sharing to save memory; --density 100" in capsys.readouterr().out
 
 
 def test_the_three_programs_have_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
