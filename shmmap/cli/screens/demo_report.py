@@ -131,11 +131,11 @@ def _cpu(result: DemoResult) -> str:
 def _outage(result: DemoResult) -> str:
     out = result.outage
     millions = sum(out.counted) / len(out.counted) / 1e6
+    adopted = f"The new daemon took over {out.adopted} of {out.segments} segments."
     return (
         f"There was no daemon for {format_duration(out.down_s)}, and {out.consumers} processes continued to"
         f" read the map {1 / out.pace_s:.0f} times a second, at most {format_duration(out.longest_pause_s)}"
-        f" apart, {millions:.1f} million points each. The new daemon took over {out.adopted} of {out.segments}"
-        " segments."
+        f" apart, {millions:.1f} million points each. {adopted}"
     )
 
 
