@@ -39,7 +39,7 @@ from shmmap.testing.daemon_process import DaemonProcess
 __all__ = ["COUNTS", "FULL_COUNTS", "MANY", "DemoResult", "Round", "run_demo"]
 
 MANY: Final = 8
-"""Processes that drive on while there is no daemon."""
+"""Processes that keep driving while there is no daemon."""
 
 COUNTS: Final = (1, MANY)
 """Processes that drive together, one drive after the other."""
@@ -162,7 +162,7 @@ def run_demo(
                 watched = WatchedDaemon(daemon, client)
                 rounds[MANY] = Round(show.shared(fleet, watched), private)
                 traffic, resident = watched.traffic(), _resident_now(daemon)
-                progress.stage(f"Killing the daemon while {MANY} processes drive on", len(town.onward))
+                progress.stage(f"Killing the daemon while {MANY} processes keep driving", len(town.onward))
                 outage = drive_through_outage(fleet, daemon, client, town.onward, progress)
             result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
             if localization is None:

@@ -101,7 +101,7 @@ def build_elevation_map(
 ) -> BuiltElevation:
     """Return the elevation of the daemon's whole map; made only where the cache does not have it.
 
-    A build that was interrupted goes on from its last checkpoint.
+    A build that was interrupted continues from its last checkpoint.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an interrupted build needs to go on: how far it was, and the rows that wait at seams."""
+"""What an interrupted build needs to continue: how far it was, and the rows that wait at seams."""
 
 from __future__ import annotations
 

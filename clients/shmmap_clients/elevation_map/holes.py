@@ -3,7 +3,7 @@
 
 A hole that has a known height within the radius, and three to go by, gets the value, at its middle, of the
 plane that fits the known heights within the radius and two columns more best, weighted by 1 / distance²;
-so a slope goes on through a hole.  Where those lie on one line it is their weighted mean.
+so a slope continues through a hole.  Where those lie on one line it is their weighted mean.
 Upstream inpaints an 8-bit image of the whole map, where 100 m of relief make steps of 0.39 m.
 """
 

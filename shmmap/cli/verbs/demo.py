@@ -62,7 +62,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="see it work: no map needed, about a minute",
         description="Build a town and drive through it with one process, then with eight: each with a private"
         " copy of the map, then all on one copy that shmmap shares.  Kill the daemon, and see the processes"
-        " drive on.  Localize simulated LiDAR scans, and compare with the truth.",
+        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.",
         json=_JSON,
     )
     parser.add_argument(

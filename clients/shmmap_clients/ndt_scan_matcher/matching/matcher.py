@@ -50,7 +50,7 @@ class Settings:
     line_search
         More-Thuente's line search.
     mode
-        ``"coarse_fine"``: when the variant's alignment has ended, go on from there with the voxels' true
+        ``"coarse_fine"``: when the variant's alignment has ended, continue from there with the voxels' true
         covariances: the wide basin of the one and the accuracy of the other.
     fine_epsilon
         Where the fine part stops.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The line search of More and Thuente (1994) as PCL and ndt_omp have it, to the letter.
 
-Where the originals divide by zero they go on with an infinity or a NaN; so does this.  They differ in one
+Where the originals divide by zero they continue with an infinity or a NaN; so does this.  They differ in one
 case, see `search_step`.
 """
 
