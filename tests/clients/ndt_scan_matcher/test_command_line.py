@@ -73,7 +73,9 @@ def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture
 def test_the_help_has_the_limits_that_hold(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["align", "--help"])
-    said = re.findall(r"--max-(\w+) N\s[^(]*\(default: (\d+)\)", capsys.readouterr().out)
+    said = re.findall(
+        r"--max-(points|neighbors|voxels) N\s[^(]*\(default:\s+(\d+)\)", capsys.readouterr().out
+    )
     limits = Limits()
     assert said == [
         ("points", str(limits.source_points)),
