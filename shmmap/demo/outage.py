@@ -94,7 +94,7 @@ def drive_through_outage(
     daemon.kill()
     killed_s = time.perf_counter()
     leg.follow_max_s = leg.longest_pause_s = 0.0
-    progress.event(f"The daemon is killed (SIGKILL); {len(before)} processes drive on without it")
+    progress.event(f"The daemon is killed (SIGKILL); {len(before)} processes keep driving without it")
     first = leg.driven
     for _ in range(_ALONE):
         leg.step()
