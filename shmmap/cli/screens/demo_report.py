@@ -91,8 +91,8 @@ def _too_small(result: DemoResult) -> str:
     if last.shared.total_bytes < last.private.total_bytes:
         return ""
     return (
-        f" The map around the vehicle ({format_bytes(last.shared.map_bytes)}) is too small for sharing to"
-        " save memory; --density 100 makes a larger one."
+        f" The map around the vehicle ({format_bytes(last.shared.map_bytes)}) is too small to gain"
+        " from sharing; --density 100 makes a larger one."
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher.cli import main
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 
 from tests.clients.ndt_scan_matcher.scene import scan_from, street
 
@@ -67,6 +68,20 @@ def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture
     )
     assert again == 0, "what is printed is what options take"
     assert "trusted                 yes" in out
+
+
+def test_the_help_has_the_limits_that_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["align", "--help"])
+    said = re.findall(
+        r"--max-(points|neighbors|voxels) N\s[^(]*\(default:\s+(\d+)\)", capsys.readouterr().out
+    )
+    limits = Limits()
+    assert said == [
+        ("points", str(limits.source_points)),
+        ("neighbors", str(limits.neighbors)),
+        ("voxels", str(limits.voxels)),
+    ]
 
 
 def test_align_far_from_the_map_is_a_negative_answer(

@@ -49,13 +49,14 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--fine",
         action="store_true",
-        help="after that, align again with the voxels' true covariances: several times more accurate",
+        help="align once more after the variant's alignment, with the voxels' true covariances: several times"
+        " more accurate",
     )
     group.add_argument(
         "--steady",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="steps that do not oscillate between two places, as the originals' can (default: with --fine)",
+        help="steps that do not oscillate between two places, as the originals' can (default: if --fine)",
     )
     add_backend_option(group)
     add_threads_option(group)

@@ -166,7 +166,7 @@ def print_summary(summary: DriveSummary) -> None:
         ("iterations", s.iterations),
         ("latency, ms", s.latency_ms),
         ("  thinning, ms", s.thin_ms),
-        ("  waiting for map, ms", s.map_ms),
+        ("  getting the map, ms", s.map_ms),
         ("  alignment, ms", s.align_ms),
         ("map request, ms", s.map_request_ms),
         ("map building, ms", s.map_build_ms),
@@ -174,6 +174,6 @@ def print_summary(summary: DriveSummary) -> None:
         if not spread.max > 0.0:  # none (NaN), or no scan had it
             continue
         print(
-            f"{name:21} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
+            f"{name:22} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"
             f"  p99 {spread.p99:8.3f}  max {spread.max:8.3f}"
         )

@@ -80,7 +80,7 @@ def test_a_map_too_small_to_gain_from_sharing_says_so(capsys: pytest.CaptureFixt
     assert "--density" not in capsys.readouterr().out
     sparse.rounds[8] = Round(drive(8, 220, 10), drive(8, 170, 0))
     print_report(sparse, "town.svg", 1.0)
-    assert "is too small for sharing to save memory; --density 100" in capsys.readouterr().out
+    assert "is too small to gain from sharing; --density 100" in capsys.readouterr().out
 
 
 def test_the_three_programs_have_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
