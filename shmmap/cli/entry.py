@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
 from shmmap.cli.program import exit_code_of, join_negative_values
 from shmmap.errors import BadRequest
+from shmmap.errors.packages import needed_packages
 
 __all__ = ["main", "serve_main"]
 
@@ -33,7 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             build_parser().print_help(sys.stderr)
             return BadRequest.exit_code
         args = build_parser(words).parse_args(words)
-        code: int = args.run(args)
+        with needed_packages(f"shmmap {words[0]}"):
+            code: int = args.run(args)
         return code
 
     return exit_code_of("shmmap", run)

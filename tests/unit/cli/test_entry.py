@@ -49,6 +49,17 @@ def test_exit_codes_of_the_contract(
     assert capsys.readouterr() == ("", "shmmap: it broke\nhint: mend it\n")
 
 
+def test_a_missing_package_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where only the client's packages are installed."""
+    fail_with(monkeypatch, ModuleNotFoundError("No module named 'xxhash'", name="xxhash"))
+    assert main(["version"]) == errors.PackageMissing.exit_code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("shmmap: shmmap version needs the package xxhash, which is not installed\n")
+
+
 def test_no_hint_no_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     fail_with(monkeypatch, errors.MapMissing("no map at /nowhere"))
     assert main(["version"]) == 66
