@@ -259,6 +259,8 @@ class Service:
         It may come in the middle of the first one's work, so it trusts the disk alone.
         """
         del number, frame
+        for again in STOP_SIGNALS:  # one after the other they would pile up in here
+            signal.signal(again, signal.SIG_IGN)
         directory, instance = self._memory.directory, self._config.instance
         locks = (directory.path + lock_name(instance), lock_path(self._socket_path))
         ours = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]

@@ -204,12 +204,12 @@ def test_a_process_that_asks_too_much_at_once(
 ) -> None:
     """What waits beyond the limit is refused; the refusal says so, and later requests are served.
 
-    All replies together are less than what may be left unread.
+    All replies together are fewer, and less, than what the daemon keeps for a client that has not read them yet.
     """
     one = daemon(divided_map.root)
     client = connect(one)
     serves(client)
-    body = [client.send("selected", ["0_0.pcd"] * 100, ["points"], None) for _ in range(600)]
+    body = [client.send("selected", ["0_0.pcd"] * 500, ["points"], None) for _ in range(200)]
     kinds = [client.receive() for _ in body]
     refused = [reply for reply in kinds if reply[0] == "error"]
     assert all(reply[2] == "busy" for reply in refused)
