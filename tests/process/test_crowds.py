@@ -204,7 +204,7 @@ def test_a_process_that_asks_too_much_at_once(
 ) -> None:
     """What waits beyond the limit is refused; the refusal says so, and later requests are served.
 
-    All replies together are fewer, and less, than what the daemon keeps for a client that has not read them yet.
+    All replies together are fewer, and less, than what the daemon keeps for a client that does not read.
     """
     one = daemon(divided_map.root)
     client = connect(one)
