@@ -24,6 +24,7 @@ import zmq
 import shmmap.daemon
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.host.signals import StartSignals
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map_in_memory import MapInMemory
@@ -126,6 +127,7 @@ class WholeDaemon:
         self._context.term()
         self.service._end()
         self.memory.close(keep=False)
+        take_slices(0)  # the loop's short turns are not for the tests that follow
 
 
 @pytest.fixture
