@@ -103,14 +103,7 @@ class Service:
             send=self._outbox.send, clock=time.monotonic,
         )  # fmt: skip
         sampler = Sampler(
-            cache,
-            scheduler,
-            statistics,
-            memory.rows,
-            memory.event_log,
-            sessions=sessions,
-            waiting=cells,
-            on_beat=self._beat,
+            cache, scheduler, statistics, memory.rows, memory.event_log, sessions, cells, self._beat
         )
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
@@ -208,12 +201,10 @@ class Service:
         cache = self._memory.cache
         return status_line(
             resident=len({key.cell_id for key in cache.ledger.by_key}),  # some have layers, too
-            cells=len(cache.catalogue),
-            used_bytes=cache.ledger.used_bytes,
-            budget_bytes=cache.ledger.budget_bytes,
-            clients=len(self._memory.sessions),
+            cells=len(cache.catalogue), clients=len(self._memory.sessions),
+            used_bytes=cache.ledger.used_bytes, budget_bytes=cache.ledger.budget_bytes,
             failed=self._memory.statistics.values["loads_failed"],
-        )
+        )  # fmt: skip
 
     # --- reload -----------------------------------------------------------------------------------
 

@@ -184,12 +184,8 @@ def _convert(name: str, value: Any, origin: str) -> Any:
 def _unknown(name: str, origin: str) -> ConfigError:
     names = [FILE_NAMES.get(field.name, field.name) for field in fields(DaemonConfig)]
     near = difflib.get_close_matches(name, names, n=1)
-    return ConfigError(
-        f"{origin}: unknown setting {name!r}",
-        key=name,
-        origin=origin,
-        hint=f"did you mean {near[0]!r}?" if near else f"settings are: {', '.join(names)}",
-    )
+    hint = f"did you mean {near[0]!r}?" if near else f"settings are: {', '.join(names)}"
+    return ConfigError(f"{origin}: unknown setting {name!r}", key=name, origin=origin, hint=hint)
 
 
 def load_config(

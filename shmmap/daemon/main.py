@@ -85,17 +85,12 @@ def run(config: DaemonConfig) -> int:
         stack.callback(directory.close)
         pins = choose_pins(directory)
         origin = find_origin(
-            config.map_path,
-            metadata=config.metadata,
-            strict=config.strict,
-            cache_dir=config.cache_dir,
+            config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
             tell=notify,
-        )
+        )  # fmt: skip
+        cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere
-            config,
-            map_path=origin.path,
-            shm_dir=directory.path,
-            cache_dir=absolute_path(config.cache_dir or default_cache_directory()),
+            config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
         )
         with signals.held():
             lock = InstanceLock(lock_path(path))

@@ -44,20 +44,18 @@ def start_child(
     ours, theirs = channel()
     try:
         with theirs:
+            # one worker, one core: Open3D would start a thread for each
+            environment = {
+                "OMP_NUM_THREADS": "1",
+                **os.environ,
+                "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+            }
             process = subprocess.Popen(
                 [sys.executable, "-m", module, str(theirs.fileno()), str(os.getpid()), *arguments],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                # one worker, one core: Open3D would start a thread for each
-                env={
-                    "OMP_NUM_THREADS": "1",
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-                },
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                env=environment, start_new_session=new_session,
                 cwd="/",  # nothing is imported from where the parent happens to run
-                start_new_session=new_session,
-            )
+            )  # fmt: skip
     except BaseException:
         ours.close()
         raise

@@ -128,7 +128,7 @@ class Survey:
         self._look()
 
     def drop_unused(self, session: Session, before_s: float) -> None:
-        """Take off a session's ledger what it does not map any more, for a bounded time, largest first.
+        """Note what a session does not map any more, for a bounded time, largest first.
 
         Of what was handed out at ``before_s`` or later it may be about to open.
         """

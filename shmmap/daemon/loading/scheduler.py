@@ -43,10 +43,6 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["Scheduler"]
 
 
-def _nobody(key: Key) -> None:
-    del key
-
-
 class Scheduler:
     """Carries out loads.
 
@@ -83,7 +79,7 @@ class Scheduler:
         self.loads = loads
         self.pool = pool
         pool.on_message = lambda worker: self.on_worker(worker, clock())
-        self.on_settled: Callable[[Key], None] = _nobody
+        self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
         self.room = Room(cache, loads, pool)
@@ -172,8 +168,7 @@ class Scheduler:
         points = cache.warm.get(index, LAYER) if layer != LAYER else None
         return Job(
             number, load.key.cell_id, catalogue.path(index), layer, catalogue.box(index), catalogue.frame_id,
-            load.estimate, points.name if points is not None else "",
-            tuple(map(catalogue.path, around)),
+            load.estimate, points.name if points is not None else "", tuple(map(catalogue.path, around)),
         )  # fmt: skip
 
     def hear_of_closes(self, now_s: float) -> None:

@@ -106,18 +106,10 @@ class _Worker:
                 made = self._make(job, fd)
                 header = made.header
                 done = worker_messages.Done(
-                    job.number,
-                    header.header_bytes,
-                    header.rows,
-                    header.dropped_points,
-                    header.z_min,
-                    header.z_max,
-                    header.source,
-                    time.monotonic_ns() - started_ns,
-                    tuple(warning[:500] for warning in made.warnings[:20]),
-                    made.neighbours,
-                    made.cached,
-                )
+                    job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
+                    header.z_max, header.source, time.monotonic_ns() - started_ns,
+                    tuple(warning[:500] for warning in made.warnings[:20]), made.neighbours, made.cached,
+                )  # fmt: skip
                 step("worker.pass")
                 self._send(worker_messages.Segment(), fd)
                 step("worker.passed")

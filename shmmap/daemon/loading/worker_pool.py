@@ -67,10 +67,6 @@ class Worker:
         return self.channel.fileno()
 
 
-def _unheard(worker: Worker) -> None:
-    del worker
-
-
 class WorkerPool:
     """Up to ``limit`` worker processes.
 
@@ -109,7 +105,7 @@ class WorkerPool:
         self._shm_dir = shm_dir
         self._deadline_s = deadline_s
         self._watched = watched
-        self.on_message: Callable[[Worker], None] = _unheard
+        self.on_message: Callable[[Worker], None] = lambda _worker: None
         self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
         self._workers: dict[int, Worker] = {}
         self._ending: list[subprocess.Popen[bytes]] = []

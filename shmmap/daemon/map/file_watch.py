@@ -25,21 +25,9 @@ MOST_S: Final = 5.0
 LOOK_S: Final = 1.0
 """How often a directory that has vanished is looked for."""
 
-_REMOTE: Final = frozenset(
-    {
-        "nfs",
-        "nfs4",
-        "cifs",
-        "smb3",
-        "9p",
-        "ceph",
-        "lustre",
-        "glusterfs",
-        "afs",
-        "fuse.sshfs",
-        "fuse.glusterfs",
-    }
-)
+_REMOTE: Final = (
+    "nfs", "nfs4", "cifs", "smb3", "9p", "ceph", "lustre", "glusterfs", "afs", "fuse.sshfs", "fuse.glusterfs",
+)  # fmt: skip
 
 
 def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:

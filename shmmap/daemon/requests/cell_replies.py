@@ -73,24 +73,13 @@ class CellReplies:
             self.statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
 
     def reply(
-        self,
-        session: Session,
-        request: int,
-        answer: Answer,
-        removed: tuple[str, ...],
-        removed_packed: bytes,
+        self, session: Session, request: int, answer: Answer, removed: tuple[str, ...], removed_packed: bytes
     ) -> None:
-        """Send a reply; the ledger follow in `hand_out`, when it is on its way."""
+        """Send a reply; the bookkeeping follows in `hand_out`, when it is on its way."""
         reply = encode_cells(
-            request,
-            self.epoch,
-            self.cache.catalogue.map_version,
-            answer.handles,
-            removed,
-            removed_packed,
-            answer.pending,
-            answer.failed,
-        )
+            request, self.epoch, self.cache.catalogue.map_version, answer.handles, removed, removed_packed,
+            answer.pending, answer.failed,
+        )  # fmt: skip
         self.send(session, reply)
 
     def hand_out(self, session: Session, answer: Answer, now_s: float) -> None:

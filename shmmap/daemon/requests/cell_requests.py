@@ -116,21 +116,16 @@ class CellRequests:
             if warm is not None:
                 answer = Answer([resident.handle for resident in warm.residents], warm.residents)
                 self._answers.reply(session, message.request, answer, warm.removed, warm.removed_packed)
-                # the ledger can wait until the answer is out
+                # the bookkeeping can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
                 self._account(session, warm.held)
                 self._answers.hand_out(session, answer, now_s)
                 return
         lacks = difference(self._cache, message, self._cache.at_height(found.tolist(), area.z), layers)
         wanted = PendingRequest(
-            session,
-            message.request,
-            lacks.cells,
-            removed=lacks.removed,
-            removed_packed=lacks.removed_packed,
-            held_old=lacks.old,
-            area=area,
-        )
+            session, message.request, lacks.cells, removed=lacks.removed, removed_packed=lacks.removed_packed,
+            held_old=lacks.old, area=area,
+        )  # fmt: skip
         self._account(session, lacks.held)
         self._begin(wanted, message.wait, now_s)
 
