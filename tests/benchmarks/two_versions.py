@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether this version is slower than another one: both take turns, and the ratios of the pairs count.
+
+    git worktree add ../other COMMIT
+    (cd ../other && python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]')
+    python -m tests.benchmarks.two_versions ../other [warm attach load import status] [--pairs 40]
+
+The other checkout has its environment in ``.venv``, as this one has.  Printed are the medians of both, the
+median of the paired ratios (this version to the other), and the ratio that it is below with 95 %
+confidence (bootstrap).  Less than 1: this version is faster.
+
+- ``warm``: a warm differential with 40 new cells of 256 held, named and packed, 10th percentile of 300
+- ``attach``: request and attach the cells around a place, a cell's share, 10th percentile of 20
+- ``load``: the cells of `load_pcd` into segments, one after the other
+- ``import``: CPU time of importing the client
+- ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import statistics
+import subprocess
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from tests.benchmarks.load_pcd import cloud, cut
+
+__all__ = ["main"]
+
+_SERVED = """
+import shutil, sys, tempfile, time
+from pathlib import Path
+import numpy as np
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import make_map
+scratch = tempfile.mkdtemp()
+made = make_map(Path(scratch) / "map", columns=20, rows=20, points={points})
+one = DaemonProcess(made.root, "--budget", "2G").start()
+{begin}
+print("up", flush=True)
+for line in sys.stdin:
+    times = []
+    for _ in range({rounds}):
+        before = time.perf_counter()
+        count = {work}
+        times.append((time.perf_counter() - before) / count)
+    print(float(np.percentile(times, 10)) * 1e6, flush=True)
+client.close()
+one.stop()
+one.dispose()
+shutil.rmtree(scratch)
+"""
+_WARM = """
+from tests.support.message_pack import pack
+from tests.support.raw_client import RawClient, pack_versions
+client = RawClient(one.endpoint)
+area = ["box", -159.0, -159.0, 159.0, 159.0]
+inside, everything = client.area(area).cells, client.area(["box", -300.0, -300.0, 300.0, 300.0]).cells
+outside = [h for h in everything if h.id not in {i.id for i in inside}]
+left = inside[::6][:40]
+held = [h for h in inside if h not in left] + outside[:40]
+named = [[h.id.removeprefix(client.id_prefix), h.version] for h in held]
+packed = pack_versions([h.version for h in held])
+requests = {
+    "named": pack(["differential", 1, area, ["points"], named, b"", 10.0]),
+    "packed": pack(["differential", 1, area, ["points"], [], packed, 10.0]),
+}
+def ask(request):
+    client.socket.send(request)
+    client.socket.recv()
+    return 1
+"""
+_ATTACH = """
+import shmmap
+client = shmmap.connect(one.endpoint)
+client.around(0, 0, radius=500)
+"""
+_LOAD = """
+import os, sys, tempfile, time
+from shmmap.layers.points import build_points
+from shmmap.segment.directory import ShmDirectory
+files = sys.argv[1:]
+path = tempfile.mkdtemp(dir="/dev/shm")
+directory = ShmDirectory(path)
+print("up", flush=True)
+for line in sys.stdin:
+    took = 0.0
+    for file in files:
+        fd = directory.create()
+        before = time.perf_counter()
+        build_points(file, fd, cell_id=file, box=(0.0, 0.0, 20.0, 20.0))
+        took += time.perf_counter() - before
+        os.close(fd)
+    print(took * 1e6, flush=True)
+os.rmdir(path)
+"""
+_CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
+
+
+def python(checkout: Path) -> str:
+    """Return the interpreter of a checkout's environment."""
+    return str(checkout / ".venv" / "bin" / "python")
+
+
+class Measuring:
+    """A process of one checkout that measures whenever it is told to."""
+
+    def __init__(self, checkout: Path, program: str, *arguments: str) -> None:
+        self._process = subprocess.Popen(
+            [python(checkout), "-c", program, *arguments],
+            cwd=checkout, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self._say() == "up"
+
+    def _say(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    def measure(self, what: str) -> float:
+        """Return microseconds."""
+        assert self._process.stdin is not None
+        print(what, file=self._process.stdin, flush=True)
+        return float(self._say())
+
+    def close(self) -> None:
+        """End it."""
+        self._process.communicate()
+
+
+def cpu_us(checkout: Path, *arguments: str) -> float:
+    """CPU time of a Python program of a checkout, microseconds."""
+    # numpy's threads, just started, spin as long as the process lives
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    pid = os.posix_spawn(
+        python(checkout),
+        [python(checkout), *arguments],
+        environment,
+        file_actions=[(os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_WRONLY, 0) for fd in (1, 2)],
+    )
+    _, _, usage = os.wait4(pid, 0)
+    return (usage.ru_utime + usage.ru_stime) * 1e6
+
+
+def compare(name: str, this: Callable[[], float], other: Callable[[], float], pairs: int) -> None:
+    """Take turns, and print what comes of it."""
+    this()  # warms up
+    other()
+    found = []
+    for number in range(pairs):
+        if number % 2:
+            found.append((this(), other()))
+        else:
+            theirs = other()
+            found.append((this(), theirs))
+    ratios = [mine / theirs for mine, theirs in found]
+    draw = random.Random(1)
+    medians = sorted(statistics.median(draw.choices(ratios, k=pairs)) for _ in range(4000))
+    mine, theirs = (statistics.median(values) for values in zip(*found, strict=True))
+    print(
+        f"{name:14} this {mine / 1e3:9.3f} ms, other {theirs / 1e3:9.3f} ms,"
+        f" ratio {statistics.median(ratios):.3f}, below {medians[3800]:.3f} with 95 % confidence",
+        flush=True,
+    )
+
+
+def served(points: int, begin: str, rounds: int, work: str) -> str:
+    """Return a program that measures ``work`` on a daemon of its checkout."""
+    return _SERVED.format(points=points, begin=begin.strip(), rounds=rounds, work=work)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("other", type=Path, help="checkout of the other version")
+    parser.add_argument("what", nargs="*", default=["warm", "attach", "load", "import", "status"])
+    parser.add_argument("--pairs", type=int, default=40)
+    options = parser.parse_args()
+    checkouts = (Path(__file__).resolve().parents[2], options.other.resolve())
+
+    def both(program: str, asks: dict[str, str], *arguments: str) -> None:
+        this, other = (Measuring(checkout, program, *arguments) for checkout in checkouts)
+        for name, ask in asks.items():
+            compare(name, partial(this.measure, ask), partial(other.measure, ask), options.pairs)
+        this.close()
+        other.close()
+
+    def started(name: str, *arguments: str) -> None:
+        this, other = checkouts
+        compare(name, lambda: cpu_us(this, *arguments), lambda: cpu_us(other, *arguments), options.pairs)
+
+    for what in options.what:
+        if what == "warm":
+            asks = {"warm, packed": "packed", "warm, named": "named"}
+            both(served(30, _WARM, 300, "ask(requests[line.strip()])"), asks)
+        elif what == "attach":
+            both(served(2000, _ATTACH, 20, "len(client.around(0, 0, radius=45))"), {"attach": ""})
+        elif what == "load":
+            with tempfile.TemporaryDirectory() as folder:
+                paths = cut(cloud(), Path(folder))["binary"]
+                both(_LOAD, {"load": ""}, *paths)
+        elif what == "import":
+            started("import", "-c", _CLIENT)
+        elif what == "status":
+            started("status", "-m", "shmmap.cli", "status", "--endpoint", "/nowhere/x.sock")
+            started("status --help", "-m", "shmmap.cli", "status", "--help")
+        else:
+            parser.error(f"there is no {what}")
+
+
+if __name__ == "__main__":
+    main()
