@@ -64,16 +64,16 @@ if TYPE_CHECKING:
         StaleHandle,
         StaleSocket,
         UnknownCell,
-        needed_packages,
     )
     from shmmap.formats.cloud import read_cloud
-    from shmmap.formats.pcd_writer import write_pcd
+    from shmmap.formats.pcd.writer import write_pcd
     from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
     from shmmap.layers.build import build_layer
     from shmmap.layers.contract import LayerKind, LayerTable
     from shmmap.layers.covariance import voxel_covariances
     from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
+    from shmmap.needed_packages import needed_packages
     from shmmap.protocol.messages import HeldCell, Holder, Intent
 
 __version__ = "0.2.0"
@@ -186,12 +186,14 @@ def __getattr__(name: str) -> Any:
     elif name == "read_cloud":
         module = "shmmap.formats.cloud"
     elif name == "write_pcd":
-        module = "shmmap.formats.pcd_writer"
+        module = "shmmap.formats.pcd.writer"
+    elif name == "needed_packages":
+        module = "shmmap.needed_packages"
     elif name in __all__:
         module = "shmmap.errors"
     else:
         raise AttributeError(f"module 'shmmap' has no attribute {name!r}")
-    from shmmap.errors import needed_packages
+    from shmmap.needed_packages import needed_packages
 
     with needed_packages(f"shmmap.{name}"):
         value = getattr(importlib.import_module(module), name)

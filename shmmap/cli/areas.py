@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "add_area_options",
+    "add_area_or_ids",
     "add_cells_argument",
     "area_from",
     "area_text",
@@ -67,6 +68,19 @@ def add_area_options(
             help="only cells that reach into these heights, metres; also cells never loaded, whose heights "
             "are unknown",
         )
+
+
+def add_area_or_ids(parser: argparse.ArgumentParser) -> None:
+    """Add the areas and ``--id``, one of which must be given."""
+    group = parser.add_mutually_exclusive_group(required=True)
+    add_area_options(parser, group)
+    group.add_argument(
+        "--id",
+        metavar="ID",
+        nargs="+",
+        action="extend",
+        help="cells by id, or by file name where it is unique",
+    )
 
 
 def area_from(args: argparse.Namespace) -> Area | None:

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Missed
     from shmmap.client.map_listing import CellInfo, MapListing
     from shmmap.client.points_around import PointsAround
-    from shmmap.client.retention import Departed, Retention, RetentionPolicy
-    from shmmap.client.window import MapWindow
-    from shmmap.client.window_state import WindowUpdate
+    from shmmap.client.window.map_window import MapWindow
+    from shmmap.client.window.retention import Departed, Retention, RetentionPolicy
+    from shmmap.client.window.state import WindowUpdate
 
 __all__ = [
     "Cell",
@@ -50,15 +50,15 @@ __all__ = [
 
 _LATER: Final = {
     "CellInfo": "map_listing",
-    "Departed": "retention",
+    "Departed": "window.retention",
     "EventStream": "event_stream",
     "MapListing": "map_listing",
-    "MapWindow": "window",
+    "MapWindow": "window.map_window",
     "Missed": "event_stream",
     "PointsAround": "points_around",
-    "Retention": "retention",
-    "RetentionPolicy": "retention",
-    "WindowUpdate": "window_state",
+    "Retention": "window.retention",
+    "RetentionPolicy": "window.retention",
+    "WindowUpdate": "window.state",
 }
 
 

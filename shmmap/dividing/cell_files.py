@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
-from shmmap.formats.pcd_writer import pcd_header
+from shmmap.formats.pcd.writer import pcd_header
 
 __all__ = ["CellFiles", "Slot", "raise_open_files_limit"]
 

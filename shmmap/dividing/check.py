@@ -10,7 +10,7 @@ from typing import Any
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.progress import Progress
 from shmmap.errors import MapDataError
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd.reader import PcdReader
 
 __all__ = ["check_cells"]
 

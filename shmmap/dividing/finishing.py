@@ -19,7 +19,7 @@ from shmmap.dividing.partition import Partition, block_points_for, worker_count
 from shmmap.dividing.progress import Progress
 from shmmap.dividing.voxels import BYTES_PER_POINT, reduce_voxels
 from shmmap.errors import BadRequest
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 
 __all__ = ["thin_out", "write_ordered"]
 

@@ -19,7 +19,7 @@ from shmmap.dividing.row_layout import AXES, NO_MOVE, RowLayout, common_rows
 from shmmap.dividing.sources import Source, open_source
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
-from shmmap.formats.pcd_writer import pcd_header, pcd_rows
+from shmmap.formats.pcd.writer import pcd_header, pcd_rows
 from shmmap.quantities import format_bytes
 
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]

@@ -12,7 +12,7 @@ from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.memory import MIN_MEMORY_BYTES
 from shmmap.dividing.row_layout import AXES
 from shmmap.errors import BadRequest
-from shmmap.formats.pcd_header import ENCODINGS
+from shmmap.formats.pcd.header import ENCODINGS
 
 __all__ = ["DivideSettings", "lattice_of"]
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, Protocol
 
@@ -17,8 +18,8 @@ from shmmap.formats.causes import refusal
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.open3d_reader import read_with_open3d
-from shmmap.formats.pcd_mapped import expanded_blocks
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd.mapped import expanded_blocks
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.quantities import format_bytes
 
 __all__ = ["Bound3", "Source", "open_source"]
@@ -187,7 +188,7 @@ class _BinaryPcd:
         self._reader = None
 
 
-class _Stream:
+class _Stream(ABC):
     """What is common to formats that come as blocks of columns."""
 
     claimed_bounds: Bound3 | None = None
@@ -202,8 +203,9 @@ class _Stream:
         self._block: Mapping[str, NDArray[Any]] = {}
         self._used = self._length = 0
 
+    @abstractmethod
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
-        raise NotImplementedError
+        """Give the columns of one block of points after the other, from point ``start`` on."""
 
     def begin(self, layout: RowLayout, start: int) -> None:
         self.close()

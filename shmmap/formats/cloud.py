@@ -16,8 +16,8 @@ from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.finite import Bounds
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.open3d_reader import OPEN3D_SUFFIXES, read_with_open3d
-from shmmap.formats.pcd_header import IDENTITY_VIEWPOINT
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd.header import IDENTITY_VIEWPOINT
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.source_file import open_regular
 
 __all__ = ["CLOUD_SUFFIXES", "CloudDescription", "PointCloud", "describe", "read_cloud", "read_pcd"]

@@ -16,9 +16,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest, InternalError, needed_packages
+from shmmap.errors import BadRequest, InternalError
 from shmmap.layers.contract import BUILT_ANYWHERE, Box, Columns, LayerTable, PointTable
 from shmmap.layers.spec import LayerSpec, parse_layer
+from shmmap.needed_packages import needed_packages
 
 __all__ = ["build_layer", "build_spec"]
 

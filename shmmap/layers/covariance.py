@@ -23,7 +23,8 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest, needed_packages
+from shmmap.errors import BadRequest
+from shmmap.needed_packages import needed_packages
 
 __all__ = ["CONVENTIONS", "Convention", "voxel_covariances"]
 

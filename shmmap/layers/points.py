@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_reader import Block, PcdReader
+from shmmap.formats.pcd.reader import Block, PcdReader
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.writer import SegmentWriter

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, SegmentCorrupt
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers.contract import Box, PointTable
 from shmmap.segment.layout import NO_SOURCE, SourceStamp
 from shmmap.segment.verify import read_header

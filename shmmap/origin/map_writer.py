@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 from shmmap.formats.durable_file import flush_directory
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from shmmap.logfmt import log
 from shmmap.origin.metadata_text import metadata_text
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.formats.degrees import degrees_warning
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.stamp import Stamp
 

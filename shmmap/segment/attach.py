@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import posix_ipc
 
-from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle, needed_packages
+from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
+from shmmap.needed_packages import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import read_columns, unpack_header
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader

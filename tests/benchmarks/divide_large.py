@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shmmap.formats.pcd_writer import pcd_header
+from shmmap.formats.pcd.writer import pcd_header
 
 FIELDS = {
     "xyzi": [(name, "<f4") for name in ("x", "y", "z", "intensity")],

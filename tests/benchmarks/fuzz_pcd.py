@@ -29,9 +29,9 @@ import numpy as np
 import xxhash
 
 from shmmap.errors import MapDataError
-from shmmap.formats import lzf
 from shmmap.formats.causes import CAUSES
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd import lzf
+from shmmap.formats.pcd.reader import PcdReader
 from tests.support.pcd_bytes import CODES, Field, Number, column, lzf_decode, lzf_encode, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")

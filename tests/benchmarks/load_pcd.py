@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.formats.cloud import read_pcd
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from shmmap.layers.points import build_points
 from tests.benchmarks.street_data import street
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import matrix_from_pose
 from shmmap_clients.scans.trajectory import tum_line
 
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from shmmap.simulation.lidar import Lidar
 from shmmap.simulation.town import Town
 from tests.benchmarks.street_data import SENSOR_HEIGHT_M, sampled

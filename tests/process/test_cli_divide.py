@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_directory import open_map
 from tests.benchmarks.divide_large import FIELDS, generate
 from tests.support.clouds import expected_rows, map_rows, rows_of, xyzircaedt

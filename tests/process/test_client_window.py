@@ -21,8 +21,8 @@ import pytest
 
 import shmmap
 from shmmap.client import map_listing
-from shmmap.client.retention import Departed
-from shmmap.client.window_follower import WindowFollower
+from shmmap.client.window.follower import WindowFollower
+from shmmap.client.window.retention import Departed
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points

@@ -12,7 +12,7 @@ import pytest
 from shmmap.dividing import served_cloud
 from shmmap.dividing.served_cloud import DividedCloud, find_origin
 from shmmap.errors import CannotWrite, MapDataError, MapMissing
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin import single_pcd
 from shmmap.origin.map_directory import MapDirectory
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shmmap.dividing.divide import divide
 from shmmap.dividing.report import DividedMap
 from shmmap.dividing.settings import DivideSettings
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from tests.support.pcd_files import read_pcd
 
 Columns = dict[str, NDArray[Any]]

@@ -16,7 +16,7 @@ import numpy as np
 
 from shmmap.errors import BadRequest, MapDataError, ProtocolMismatch, SegmentError
 from shmmap.formats.causes import CAUSES
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.protocol.codec import decode_reply, decode_request, encode, request_number, unpack_versions
 from shmmap.segment.attach import attach
 from shmmap.segment.layout import PAGE_BYTES, TAIL_BYTES

@@ -34,9 +34,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "evict",
         run,
         help="free cells from memory",
-        description="Retire cells from shared memory: no client gets them any more, and their "
-        "memory is freed "
-        "as soon as no process maps it.  The next request loads them again.",
+        description="Retire cells from shared memory: no client gets them any more, and their memory is "
+        "freed as soon as no process maps it.  The next request loads them again.",
         json=_JSON,
     )
     add_cells_argument(parser)

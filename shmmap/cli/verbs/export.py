@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from shmmap.cli.areas import add_area_options, area_from, area_text, no_cell_there
+from shmmap.cli.areas import add_area_or_ids, area_from, area_text, no_cell_there
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
@@ -44,15 +44,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "Whole cells are written, unless --crop is given.",
         json=_JSON,
     )
-    what = parser.add_mutually_exclusive_group(required=True)
-    add_area_options(parser, what)
-    what.add_argument(
-        "--id",
-        metavar="ID",
-        nargs="+",
-        action="extend",
-        help="cells by id, or by file name where it is unique",
-    )
+    add_area_or_ids(parser)
     parser.add_argument("--crop", action="store_true", help="leave out points outside the area (and --z)")
     out = parser.add_mutually_exclusive_group(required=True)
     out.add_argument("-o", "--output", metavar="FILE", help="one merged file, .pcd or .npz")
@@ -201,7 +193,7 @@ def _write_npz(file: IO[bytes], columns: dict[str, NDArray[Any]]) -> None:
 def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argparse.Namespace) -> None:
     """Write one file; it appears whole or not at all."""
     from shmmap.formats.durable_file import appearing_file, writing_errors
-    from shmmap.formats.pcd_writer import write_pcd
+    from shmmap.formats.pcd.writer import write_pcd
 
     with writing_errors(str(path)):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -60,9 +60,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "inspect",
         run,
         help="what point-cloud files hold",
-        description="Read a point-cloud file to its end and show its fields, points, bounds and "
-        "whatever is odd "
-        "about it.  Of a directory (a map, or a folder of clouds): one line for each file, and totals.",
+        description="Read a point-cloud file to its end and show its fields, points, bounds and whatever "
+        "is odd about it.  Of a directory (a map, or a folder of clouds): one line for each file, and "
+        "totals.",
         json=_JSON,
     )
     parser.add_argument(

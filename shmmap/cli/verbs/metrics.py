@@ -25,9 +25,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "metrics",
         run,
         help="counters and latencies in Prometheus' format",
-        description="Print counters, gauges and latency histograms in Prometheus' text format.  "
-        "Reads the daemon's "
-        "statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
+        description="Print counters, gauges and latency histograms in Prometheus' text format.  Reads the "
+        "daemon's statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
         "`shmmap stop`.",
         epilog=_EPILOG,
     )

@@ -32,9 +32,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "pin",
         run,
         help="keep cells in memory",
-        description="Load cells and keep them in shared memory until `shmmap unpin` or until the "
-        "daemon ends, "
-        "whoever else needs memory.  Without cells: list what is pinned.",
+        description="Load cells and keep them in shared memory until `shmmap unpin` or until the daemon "
+        "ends, whoever else needs memory.  Without cells: list what is pinned.",
         json=PINS_JSON,
     )
     add_cells_argument(parser)

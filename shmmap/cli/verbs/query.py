@@ -7,7 +7,7 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
-from shmmap.cli.areas import add_area_options, area_from, no_cell_there
+from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there
 from shmmap.cli.options import (
     Subparsers,
     add_daemon_options,
@@ -76,15 +76,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "ROWS: points, or what a layer has instead, such as voxels.",
         json=_JSON,
     )
-    what = parser.add_mutually_exclusive_group(required=True)
-    add_area_options(parser, what)
-    what.add_argument(
-        "--id",
-        metavar="ID",
-        nargs="+",
-        action="extend",
-        help="cells by id, or by file name where it is unique",
-    )
+    add_area_or_ids(parser)
     add_layer_option(parser, "what to have of each cell (default: points)")
     parser.add_argument(
         "--held",

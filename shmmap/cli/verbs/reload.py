@@ -24,9 +24,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "reload",
         run,
         help="read the map again: changed, new and deleted files",
-        description="Let the daemon read the map's list of cells again, as SIGHUP does.  Clients "
-        "get what changed "
-        "with their next request; cells they have mapped stay readable.",
+        description="Let the daemon read the map's list of cells again, as SIGHUP does.  Clients get what "
+        "changed with their next request; cells they have mapped stay readable.",
         json=_JSON,
     )
     add_daemon_options(parser)

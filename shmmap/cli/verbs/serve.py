@@ -98,8 +98,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--eviction",
         metavar="POLICY",
         help="which cells go first when memory is needed: distance (farthest from all clients; the "
-        "default) or "
-        "lru (longest unused)",
+        "default) or lru (longest unused)",
     )
     parser.add_argument(
         "--cache-dir",

@@ -36,9 +36,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "show",
         run,
         help="one cell: versions, memory, which processes use it",
-        description="Show everything the daemon knows about one cell: its box, its segments in "
-        "shared memory, which "
-        "processes map them, its last failure.",
+        description="Show everything the daemon knows about one cell: its box, its segments in shared "
+        "memory, which processes map them, its last failure.",
         json=_JSON,
     )
     parser.add_argument("cell", metavar="CELL", help="its id, or the file's name where that is unique")

@@ -40,10 +40,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "status",
         run,
         help="state of the daemon: memory, clients, requests, cache size",
-        description="Show the state of the daemon: memory, clients, requests, loads, and whether "
-        "the cache is large "
-        "enough.  Reads its statistics in shared memory: "
-        "works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after `shmmap stop`.",
+        description="Show the state of the daemon: memory, clients, requests, loads, and whether the cache "
+        "is large enough.  Reads its statistics in shared memory: works while the daemon is paused "
+        "(SIGSTOP, a debugger) or hangs; not after `shmmap stop`.",
         json=_JSON,
     )
     add_statistics_options(parser)

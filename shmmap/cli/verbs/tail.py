@@ -47,9 +47,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="events: loads, evictions, failures, clients",
         description="Print the events of the last minute, then new ones as they happen: cells loaded, "
-        "changed, evicted, "
-        "failed, retried; cells refused for lack of memory; reloads; clients that connect and leave; the "
-        "daemon's start and end.",
+        "changed, evicted, failed, retried; cells refused for lack of memory; reloads; clients that "
+        "connect and leave; the daemon's start and end.",
         json=_JSON,
     )
     parser.add_argument(

@@ -16,7 +16,7 @@ from shmmap.dividing.merge import merge
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
 from shmmap.formats import cloud
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from tests.support.clouds import Columns, rows_of, xyzircaedt
 from tests.support.pcd_files import read_pcd
 

@@ -16,7 +16,7 @@ from shmmap.dividing.report import DividedMap
 from shmmap.dividing.settings import DivideSettings
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import InstanceBusy
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from tests.support.clouds import Columns, expected_rows, map_rows, rows_of, xyzircaedt
 from tests.support.las_files import write_las
 

@@ -18,7 +18,7 @@ from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.settings import DivideSettings
 from shmmap.dividing.voxels import reduce_voxels
 from shmmap.errors import BadRequest
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 
 ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<u1"), ("label", "<u2")])
 

@@ -14,7 +14,7 @@ from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.formats.cloud import describe
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.single_pcd import load_single_pcd
 
 

@@ -98,7 +98,7 @@ def test_metadata_is_what_autoware_s_loader_reads(tmp_path: Path) -> None:
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 @pytest.mark.parametrize("dtype", ["<f4", "<f8"])
 def test_round_trip_through_the_project_s_reader(tmp_path: Path, encoding: str, dtype: str) -> None:
-    from shmmap.formats.pcd_reader import PcdReader
+    from shmmap.formats.pcd.reader import PcdReader
 
     columns = cloud(800, dtype=dtype)
     columns["normal"] = np.linspace(-1, 1, 800 * 3).astype(np.float32).reshape(-1, 3)

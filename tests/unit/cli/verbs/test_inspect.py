@@ -13,7 +13,7 @@ import pytest
 
 from shmmap.cli.entry import main
 from shmmap.formats.cloud import read_cloud
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd.writer import write_pcd
 
 
 def cloud(path: Path, corner: float, count: int = 10) -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from shmmap.errors.tree import PackageMissing
+from shmmap.errors import PackageMissing
 
 __all__ = ["needed_packages"]
 

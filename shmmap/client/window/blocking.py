@@ -6,9 +6,9 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from shmmap.client.window_follower import PENDING_WAIT_S
-from shmmap.client.window_refresh import WindowRefresher
-from shmmap.client.window_state import EMPTY, WindowState, moved
+from shmmap.client.window.follower import PENDING_WAIT_S
+from shmmap.client.window.refresh import WindowRefresher
+from shmmap.client.window.state import EMPTY, WindowState, moved
 from shmmap.errors import ShmmapError
 from shmmap.protocol.messages import Intent
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
 from shmmap.client.points_around import PointsAround, points_around
-from shmmap.client.pose import pose_intent
-from shmmap.client.retention import Retention, RetentionPolicy
-from shmmap.client.window_blocking import BlockingFollower
-from shmmap.client.window_follower import WindowFollower
-from shmmap.client.window_layers import layer_name
-from shmmap.client.window_refresh import WindowRefresher
-from shmmap.client.window_state import EMPTY, LayerKey, WindowUpdate, update_between
+from shmmap.client.window.blocking import BlockingFollower
+from shmmap.client.window.follower import WindowFollower
+from shmmap.client.window.layers import layer_name
+from shmmap.client.window.pose import pose_intent
+from shmmap.client.window.refresh import WindowRefresher
+from shmmap.client.window.retention import Retention, RetentionPolicy
+from shmmap.client.window.state import EMPTY, LayerKey, WindowUpdate, update_between
 from shmmap.errors import BadRequest, ConnectionLost, ShmmapError
 from shmmap.geometry import Circle, ZRange
 

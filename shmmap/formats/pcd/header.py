@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final, NoReturn
 
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_fields import FieldProblem, PcdField, parse_fields
+from shmmap.formats.pcd.fields import FieldProblem, PcdField, parse_fields
 
 __all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
 

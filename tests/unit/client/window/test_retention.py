@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.client.retention import Departed, Retention
+from shmmap.client.window.retention import Departed, Retention
 from shmmap.errors import BadRequest
 
 departed = st.lists(

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.formats import lzf
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_binary import check_sizes, field_arrays
-from shmmap.formats.pcd_fields import AXES
-from shmmap.formats.pcd_reader import PcdReader
-from shmmap.formats.pcd_table import coordinate_dtype
+from shmmap.formats.pcd import lzf
+from shmmap.formats.pcd.binary import check_sizes, field_arrays
+from shmmap.formats.pcd.fields import AXES
+from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.pcd.table import coordinate_dtype
 
 __all__ = ["expanded_blocks"]
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
-from shmmap.formats import lzf
 from shmmap.formats.durable_file import appearing_file
-from shmmap.formats.pcd_fields import PADDING
-from shmmap.formats.pcd_header import ENCODINGS, IDENTITY_VIEWPOINT
+from shmmap.formats.pcd import lzf
+from shmmap.formats.pcd.fields import PADDING
+from shmmap.formats.pcd.header import ENCODINGS, IDENTITY_VIEWPOINT
 
 __all__ = ["pcd_header", "pcd_rows", "write_pcd"]
 

@@ -9,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.formats import lzf
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_header import PcdHeader
-from shmmap.formats.pcd_table import FieldTable, RawBlock
+from shmmap.formats.pcd import lzf
+from shmmap.formats.pcd.header import PcdHeader
+from shmmap.formats.pcd.table import FieldTable, RawBlock
 from shmmap.formats.scratch import borrow_scratch
 from shmmap.formats.source_file import SourceFile
 

@@ -11,7 +11,7 @@ import pytest
 
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
-from shmmap.client.window_state import EMPTY, WindowState, moved, update_between
+from shmmap.client.window.state import EMPTY, WindowState, moved, update_between
 from shmmap.errors import CellError, LoadFailed, OverBudget
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.protocol.messages import Intent

@@ -12,8 +12,8 @@ from typing import Final
 
 from shmmap.client.attaching import Mapping
 from shmmap.client.session import Session
-from shmmap.client.window_refresh import WindowRefresher
-from shmmap.client.window_state import EMPTY, WindowState, moved
+from shmmap.client.window.refresh import WindowRefresher
+from shmmap.client.window.state import EMPTY, WindowState, moved
 from shmmap.errors import BadRequest, InternalError, ShmmapError
 from shmmap.protocol.messages import Intent
 

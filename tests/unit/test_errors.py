@@ -20,15 +20,15 @@ from shmmap.errors import (
     PackageMissing,
     ShmmapError,
     error_from_wire,
-    needed_packages,
 )
+from shmmap.needed_packages import needed_packages
 
 
 def kinds(root: type[ShmmapError] = ShmmapError) -> Iterator[type[ShmmapError]]:
     """The tree; other packages may have errors of their own."""
     yield root
     for kind in root.__subclasses__():
-        if kind.__module__.startswith("shmmap.errors."):
+        if kind.__module__ == "shmmap.errors":
             yield from kinds(kind)
 
 

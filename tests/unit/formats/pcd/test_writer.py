@@ -17,9 +17,9 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
-from shmmap.formats import pcd_writer
 from shmmap.formats.cloud import read_pcd
-from shmmap.formats.pcd_writer import write_pcd
+from shmmap.formats.pcd import writer as pcd_writer
+from shmmap.formats.pcd.writer import write_pcd
 from tests.support.pcd_bytes import lzf_decode
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")

@@ -14,9 +14,9 @@ from shmmap import geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client
-from shmmap.client.failed_boxes import FailedBoxes
-from shmmap.client.retention import Departed, RetentionPolicy
-from shmmap.client.window_state import EMPTY, LayerKey, WindowState
+from shmmap.client.window.failed_boxes import FailedBoxes
+from shmmap.client.window.retention import Departed, RetentionPolicy
+from shmmap.client.window.state import EMPTY, LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.geometry import distance_to_boxes
 from shmmap.protocol.messages import Intent

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_fields import AXES, PcdField
+from shmmap.formats.pcd.fields import AXES, PcdField
 
 __all__ = ["FieldTable", "RawBlock", "coordinate_dtype", "field_table"]
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
 from shmmap.formats.causes import refusal
-from shmmap.formats.pcd_header import PcdHeader
-from shmmap.formats.pcd_table import FieldTable, RawBlock
+from shmmap.formats.pcd.header import PcdHeader
+from shmmap.formats.pcd.table import FieldTable, RawBlock
 from shmmap.formats.source_file import SourceFile
 
 __all__ = ["ascii_blocks"]

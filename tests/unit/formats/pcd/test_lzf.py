@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError
-from shmmap.formats import lzf
-from shmmap.formats.pcd_reader import PcdReader
+from shmmap.formats.pcd import lzf
+from shmmap.formats.pcd.reader import PcdReader
 from tests.support.pcd_bytes import Field, column, header, lzf_decode, lzf_encode
 
 PLAIN = [
