@@ -9,10 +9,9 @@ import dataclasses
 import gc
 import os
 import signal
+import socket
 import time
 from typing import Final
-
-import zmq
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
@@ -35,11 +34,9 @@ from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import ServingLoop
 from shmmap.daemon.telemetry.sampler import Sampler
-from shmmap.daemon.transport.crowd_control import CrowdControl
 from shmmap.daemon.transport.inbox import Inbox
-from shmmap.daemon.transport.listen_gate import ListenGate
-from shmmap.daemon.transport.outbox import SEND_QUEUE, Outbox
-from shmmap.daemon.transport.socket_file import bind_socket, remove_socket
+from shmmap.daemon.transport.listener import Connections, Listener
+from shmmap.daemon.transport.socket_file import listen_at, remove_socket
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
@@ -49,8 +46,8 @@ from shmmap.protocol.events import Epoch
 
 __all__ = ["Service"]
 
-RECEIVE_QUEUE: Final = 32
-"""Requests that libzmq reads ahead from one connection, of up to `MAX_REQUEST_BYTES` each."""
+LAST_WORDS_S: Final = 0.2
+"""How long the end may take to deliver what was sent last."""
 
 
 class Service:
@@ -80,27 +77,19 @@ class Service:
         self._socket_path = socket_path
         self._gid = gid
         self._signals = signals
-        self._owns_socket = activated is None
+        self._activated = activated
         self._file_watch: FileWatch | None = None
         authorization = Authorization(config.admin_group)
-        take_slices(SERVING_SLICE_NS)  # ZeroMQ's thread inherits it
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket: zmq.Socket[bytes] = self._context.socket(zmq.ROUTER)
-        self._socket.setsockopt(zmq.LINGER, 200)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
-        self._socket.setsockopt(zmq.SNDHWM, SEND_QUEUE)
-        self._socket.setsockopt(zmq.RCVHWM, RECEIVE_QUEUE)
-        if activated is not None:
-            self._socket.setsockopt(zmq.USE_FD, activated.fd)  # libzmq closes it, and leaves its file
-        self._events = EventPublisher(self._context, memory.event_log.beat)
+        take_slices(SERVING_SLICE_NS)
+        self._connections = Connections()
+        self._listening = contextlib.ExitStack()
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
         quota, budget = config.session_quota, cache.ledger.budget_bytes
-        self._outbox = Outbox(self._socket, statistics)
         cells = CellRequests(
             cache, scheduler, statistics, epoch=memory.epoch,
             quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
-            send=self._outbox.send, clock=time.monotonic,
+            clock=time.monotonic,
         )  # fmt: skip
         sampler = Sampler(
             cache, scheduler, statistics, memory.rows, memory.event_log, sessions, cells, self._beat
@@ -110,25 +99,16 @@ class Service:
             config, cache, sessions, statistics, self._pins, memory.map_switch, scheduler.loads,
             epoch=memory.epoch, event_log=memory.event_log, events_path=events_path(socket_path),
         )  # fmt: skip
-        operators = OperatorRequests(cache, self._pins, reloader, self._outbox)
+        operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, watched)
         change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log, statistics)
         watched.watch(reloader.fd, change.collect)
-        dispatch = Dispatch(
-            sessions, handshake, cells, queries, operators, authorization, cache.survey, sampler, self._outbox
-        )
-        inbox = Inbox(self._socket, sessions, statistics, dispatch.refuse_unread)
-        self._gate = ListenGate(watched.watch, watched.unwatch)
-        self._crowd = CrowdControl(
-            self._gate,
-            waiting_bytes=inbox.waiting_bytes,
-            unread_bytes=lambda: self._outbox.unread(list(sessions)),
-            session_descriptors=lambda: [session.fd for session in sessions],
-        )
+        dispatch = Dispatch(handshake, cells, queries, operators, authorization, cache.survey, sampler)
+        self._handshake = handshake
+        self._inbox = Inbox(statistics, dispatch.refuse_unread)
         self._loop = ServingLoop(
-            self._socket, watched, inbox, dispatch, operators, cells, cache, scheduler, self._crowd, sampler,
-            statistics,
-        )  # fmt: skip
+            watched, self._inbox, dispatch, operators, cells, cache, scheduler, sampler, statistics
+        )
 
     def run(self, started_s: float) -> None:
         """Bind, say READY, answer requests until told to stop."""
@@ -137,14 +117,7 @@ class Service:
             self._watch_map()
             with contextlib.closing(ServingSignals()) as heard:
                 watched.watch(heard.fd, lambda: self._on_signals(heard))
-                bind_socket(self._socket, self._socket_path, self._gid, own=self._owns_socket)
-                step("daemon.bind")
-                bind_socket(self._events.socket, events_path(self._socket_path), self._gid)
-                self._gate.close_behind()
-                self._outbox.paths = self._gate.paths
-                self._crowd.begin()
-                watched.watch(self._events.fd, self._events.drain)
-                memory.event_log.send = self._events.send
+                self._listen()
                 self._tell_epoch("started")
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
@@ -158,23 +131,40 @@ class Service:
                 if self._signals.reload_wanted:
                     self._reload()
                 self._loop.run()
-                self._gate.release()
                 self._loop.answer_waiting()
         finally:
             self._end()
+
+    def _listen(self) -> None:
+        memory = self._memory
+        if self._activated is not None:
+            requests = socket.socket(fileno=self._activated.fd)
+        else:
+            requests = listen_at(self._socket_path, self._gid)
+        self._listening.enter_context(requests)
+        step("daemon.bind")
+        events = self._listening.enter_context(listen_at(events_path(self._socket_path), self._gid))
+        Listener(
+            requests, memory.watched, self._connections, memory.statistics, b"ROUTER", b"DEALER",
+            MAX_REQUEST_BYTES, self._inbox.hear, self._handshake.hung_up,
+        ).begin()  # fmt: skip
+        publisher = EventPublisher(
+            events, memory.watched, self._connections, memory.statistics, memory.event_log.standing
+        )
+        publisher.listener.begin()
+        memory.event_log.send = publisher.send
 
     def _end(self) -> None:
         keep = self._signals.keep
         self._manager.stopping("keeping memory for the next start" if keep else "freeing memory")
         self._tell_epoch("stopping")
         self._memory.event_log.send = nowhere
-        self._events.close()
-        self._socket.close()
-        self._context.term()
+        self._connections.deliver(LAST_WORDS_S)
+        self._listening.close()
         self._reloader.close()
         if self._file_watch is not None:
             self._file_watch.close()
-        if self._owns_socket:
+        if self._activated is None:
             remove_socket(self._socket_path)
         remove_socket(events_path(self._socket_path))
 
@@ -189,7 +179,6 @@ class Service:
         memory, now_s = self._memory, time.monotonic()
         self._manager.beat(now_s, self._status)
         self._pins.keep(now_s)
-        self._crowd.beat(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
         version = memory.cache.catalogue.map_version
@@ -254,7 +243,7 @@ class Service:
             signal.signal(again, signal.SIG_IGN)
         directory, instance = self._memory.directory, self._config.instance
         locks = (directory.path + lock_name(instance), lock_path(self._socket_path))
-        ours = [events_path(self._socket_path), *([self._socket_path] if self._owns_socket else [])]
+        ours = [events_path(self._socket_path), *([self._socket_path] if self._activated is None else [])]
         take_away(directory, instance, (*ours, *locks))
         os._exit(0)  # the loaders die with this process
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serving loop: one thread, one ROUTER socket, nothing in it that waits for a disk.
+"""The serving loop: one thread, and nothing in it that waits for a disk.
 
 Requests come first; between them the loop hears its loaders, watches its clients' processes and
 frees memory.  Files are read and layers built elsewhere (`shmmap.daemon.loading.worker_main`).
@@ -8,10 +8,8 @@ frees memory.  Files are read and layers built elsewhere (`shmmap.daemon.loading
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
-
-import zmq
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
@@ -19,7 +17,6 @@ from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.telemetry.sampler import BEAT_S, Sampler
-from shmmap.daemon.transport.crowd_control import CrowdControl
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.statistics.writer import StatisticsWriter
@@ -32,15 +29,8 @@ SERVE_S: Final = 0.002
 
 @dataclass(eq=False, slots=True)
 class ServingLoop:
-    """Serves one map until told to stop.
+    """Serves one map until told to stop."""
 
-    Parameters
-    ----------
-    socket
-        Bound ROUTER socket; closed by the caller.
-    """
-
-    socket: zmq.Socket[bytes]
     watched: WatchedDescriptors
     inbox: Inbox
     dispatch: Dispatch
@@ -48,16 +38,10 @@ class ServingLoop:
     cells: CellRequests
     cache: CellCache
     scheduler: Scheduler
-    crowd: CrowdControl
     sampler: Sampler
     statistics: StatisticsWriter
     stopping: bool = False
     _answer_at_end: bool = True
-    _poller: zmq.Poller = field(init=False, default_factory=zmq.Poller)
-
-    def __post_init__(self) -> None:
-        self._poller.register(self.socket, zmq.POLLIN)
-        self._poller.register(self.watched.fd, zmq.POLLIN)
 
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
@@ -67,7 +51,7 @@ class ServingLoop:
     def run(self) -> None:
         """Serve until `stop`; then answer those who still wait."""
         while not self.stopping:
-            self._turn(self._poller.poll(self._patience_ms()))
+            self._turn(self.watched.poll(self._patience_s()))
 
     def answer_waiting(self) -> None:
         """Answer those who still wait, unless they are left to the next life."""
@@ -76,9 +60,9 @@ class ServingLoop:
             while not self.cache.survey.idle:
                 self.cache.survey.step()
 
-    def _patience_ms(self) -> int:
+    def _patience_s(self) -> float:
         """How long nothing has to be done if nothing comes."""
-        if len(self.inbox) or not self.crowd.idle:
+        if len(self.inbox):
             return 0
         until_s = min(
             self.scheduler.next_event_s(),
@@ -86,16 +70,13 @@ class ServingLoop:
             self.sampler.next_s,
             self.cache.survey.next_step_s,
         )
-        wait_s = min(max(0.0, until_s - time.monotonic()), BEAT_S)
-        return -int(-wait_s * 1000 // 1)
+        return min(max(0.0, until_s - time.monotonic()), BEAT_S)
 
-    def _turn(self, ready: list[tuple[object, int]]) -> None:
-        for source, _events in ready:
-            if source is not self.socket:
-                for fd, _mask in self.watched.poll(0):
-                    callback = self.watched.callbacks.get(fd)
-                    if callback is not None:
-                        callback()
+    def _turn(self, ready: list[int]) -> None:
+        for fd in ready:
+            callback = self.watched.callbacks.get(fd)
+            if callback is not None:  # another one's may have ended it
+                callback()
         self.cache.tell_all()
         self._serve()
         self._look_after_the_rest(time.monotonic())
@@ -103,30 +84,22 @@ class ServingLoop:
         self.cache.tell_all()
 
     def _serve(self) -> None:
-        """Hear everybody, serve those whose turn it is; for a bounded time."""
+        """Serve those whose turn it is, for a bounded time."""
         start_s = time.monotonic()
         end_s = start_s + SERVE_S
-        more = True
-        while start_s < end_s:
-            more = more and self.inbox.hear()
-            heard = self.inbox.take()
-            if heard is None:
-                if not more:
-                    return
-                continue
+        while start_s < end_s and (heard := self.inbox.take()) is not None:
             self.dispatch.handle(heard)
             self.cache.tell_all()
             now_s = time.monotonic()
             self.inbox.served(heard, now_s - start_s)
             self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
-            start_s, more = now_s, True
+            start_s = now_s
 
     def _look_after_the_rest(self, now_s: float) -> None:
-        """What has its own time: deadlines, surveys, overload, statistics."""
+        """What has its own time: deadlines, surveys, statistics."""
         self.scheduler.lost.end_overdue(now_s)
         self.cells.answer_overdue(now_s)
         self.cache.survey.turn(now_s)
-        self.crowd.step()
         self.sampler.turn(now_s)
         if now_s >= self.operators.stop_by_s:
             self.stop()

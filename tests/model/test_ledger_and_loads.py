@@ -24,9 +24,10 @@ from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Outcome, Reclaimer
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.records import Failure, Key, Load, Resident
-from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import lock_slot, prepare_process
+from tests.support import connections
 
 PAGE = 4096
 KEYS = [Key(f"/map/{number}.pcd", "points") for number in range(4)]
@@ -76,7 +77,7 @@ class Machine(RuleBasedStateMachine):
         self.queue = Loads(self.ledger)
         self.ledger.overhead_bytes = OVERHEAD_PAGES * PAGE
         self.sessions = Sessions()
-        self.clients = [self.sessions.open(bytes([n]), Peer(), f"client {n}", 0.0) for n in range(2)]
+        self.clients = [self.sessions.open(connections.of(), f"client {n}", 0.0) for n in range(2)]
         self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, POLICIES[policy])
         self.names_retired: list[str] = []
         self.names_freed: list[str] = []

@@ -63,9 +63,13 @@ class EventLog:
         self._kept.append((now_ns, data))
         self.send(data)
 
+    def standing(self) -> bytes:
+        """Return the number of the last event, as an event."""
+        return encode_event(events.Beat(self.last, self.epoch, self._clock_ns()))
+
     def beat(self) -> None:
         """Send the number of the last event."""
-        self.send(encode_event(events.Beat(self.last, self.epoch, self._clock_ns())))
+        self.send(self.standing())
 
     def page(self, message: Recent) -> EventPage:
         """Answer who asks for events again."""

@@ -6,20 +6,22 @@ Whoever does not keep up loses events and notices by their numbers; nobody is wa
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 from typing import Final
 
-import zmq
-
-from shmmap.logfmt import log
+from shmmap.daemon.transport.connection import Connection
+from shmmap.daemon.transport.listener import Connections, Listener
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["EventPublisher", "events_path"]
 
-QUEUE: Final = 1024
-"""Events kept for a subscriber that does not read; further ones are lost to it."""
-LAST_WORDS_MS: Final = 100  # the end may take this long to deliver the last events
+MOST_UNREAD_BYTES: Final = 1 << 20
+"""Of events kept for a subscriber that does not read; further ones are lost to it."""
 MAX_SUBSCRIPTION_BYTES: Final = 64
-SUBSCRIPTIONS_AT_ONCE: Final = 64
+_SUBSCRIBE: Final = b"\x01"
+_UNSUBSCRIBE: Final = b"\x00"
 
 
 def events_path(request_path: str) -> str:
@@ -28,47 +30,44 @@ def events_path(request_path: str) -> str:
 
 
 class EventPublisher:
-    """An XPUB socket; bound by the caller.
+    """Sends each event to all who subscribed to everything; nothing else can be subscribed to.
 
     Parameters
     ----------
-    on_subscribed
-        Called when somebody subscribed; what it sends reaches them.
-
-    Attributes
-    ----------
-    fd : int
-        Readable when `drain` has something to do.
+    listening
+        A socket that listens.
+    beat
+        Gives what each new subscriber is told first: where the numbers stand.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], on_subscribed: Callable[[], None]) -> None:
-        self.socket: zmq.Socket[bytes] = context.socket(zmq.XPUB)
-        self.socket.setsockopt(zmq.LINGER, LAST_WORDS_MS)
-        self.socket.setsockopt(zmq.SNDHWM, QUEUE)
-        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)
-        self.socket.setsockopt(
-            zmq.XPUB_VERBOSE, 1
-        )  # each subscriber is told the last number, not only the first
-        self.fd = int(self.socket.getsockopt(zmq.FD))
-        self._on_subscribed = on_subscribed
+    def __init__(
+        self,
+        listening: socket.socket,
+        watched: WatchedDescriptors,
+        connections: Connections,
+        statistics: StatisticsWriter,
+        beat: Callable[[], bytes],
+    ) -> None:
+        self._beat = beat
+        self._subscribers: dict[Connection, None] = {}
+        self.listener = Listener(
+            listening, watched, connections, statistics, b"XPUB", b"SUB", MAX_SUBSCRIPTION_BYTES,
+            self._hear, self._leave,
+        )  # fmt: skip
 
     def send(self, data: bytes) -> None:
         """Give an event to all who subscribed and keep up."""
-        try:
-            self.socket.send(data, zmq.NOBLOCK)
-        except zmq.ZMQError as error:
-            log.warning("event not sent", error=error)
+        for one in self._subscribers:
+            one.tell(data, MOST_UNREAD_BYTES)
 
-    def drain(self) -> None:
-        """Hear who subscribed; they are told where the numbers stand."""
-        subscribed = False
-        for _ in range(SUBSCRIPTIONS_AT_ONCE):
-            if not self.socket.poll(0):
-                break
-            subscribed |= self.socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
-        if subscribed:
-            self._on_subscribed()
+    def _hear(self, connection: Connection, body: bytes, several: bool) -> None:
+        if several or body not in (_SUBSCRIBE, _UNSUBSCRIBE):
+            connection.cut("it subscribed to some of the events: only all can be subscribed to")
+        elif body == _SUBSCRIBE:
+            self._subscribers[connection] = None
+            connection.tell(self._beat(), MOST_UNREAD_BYTES)
+        else:
+            self._subscribers.pop(connection, None)
 
-    def close(self) -> None:
-        """Close it; libzmq removes its file."""
-        self.socket.close()
+    def _leave(self, connection: Connection) -> None:
+        self._subscribers.pop(connection, None)

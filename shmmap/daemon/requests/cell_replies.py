@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -35,19 +34,12 @@ class Answer:
 
 @dataclass(eq=False, slots=True)
 class CellReplies:
-    """Answers with what the cache has and what is being loaded.
-
-    Parameters
-    ----------
-    send
-        Called with a session and an encoded reply.
-    """
+    """Answers with what the cache has and what is being loaded."""
 
     cache: CellCache
     scheduler: Scheduler
     statistics: StatisticsWriter
     epoch: int
-    send: Callable[[Session, bytes], None]
 
     def answer(self, wanted: PendingRequest, now_s: float) -> None:
         """Send what there is by now of everything that is wanted."""
@@ -80,7 +72,7 @@ class CellReplies:
             request, self.epoch, self.cache.catalogue.map_version, answer.handles, removed, removed_packed,
             answer.pending, answer.failed,
         )  # fmt: skip
-        self.send(session, reply)
+        session.connection.reply(reply)
 
     def hand_out(self, session: Session, answer: Answer, now_s: float) -> None:
         """Note who has been given what."""

@@ -45,8 +45,6 @@ class CellRequests:
     ----------
     quota_bytes
         Most bytes one session may keep that no other session also holds.
-    send
-        Called with a session and an encoded reply.
     clock
         The serving loop's clock, seconds.
     """
@@ -59,7 +57,6 @@ class CellRequests:
         *,
         epoch: int,
         quota_bytes: int,
-        send: Callable[[Session, bytes], None],
         clock: Callable[[], float],
     ) -> None:
         self._cache = cache
@@ -68,7 +65,7 @@ class CellRequests:
         self._statistics = statistics
         self._now_s = clock
         self._quota = SessionQuota(quota_bytes, cache, statistics, clock)
-        self._answers = CellReplies(cache, scheduler, statistics, epoch=epoch, send=send)
+        self._answers = CellReplies(cache, scheduler, statistics, epoch=epoch)
         self._waiting: dict[Key, list[PendingRequest]] = {}
         self._patient = WaitingList()
 

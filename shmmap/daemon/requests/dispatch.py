@@ -7,8 +7,6 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-import zmq
-
 from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
@@ -17,9 +15,9 @@ from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
 from shmmap.daemon.telemetry.sampler import Sampler
-from shmmap.daemon.transport.inbox import Heard, peer_of
-from shmmap.daemon.transport.outbox import Outbox
-from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.daemon.transport.connection import Connection
+from shmmap.daemon.transport.inbox import Heard
+from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import messages
@@ -35,7 +33,6 @@ WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 class Dispatch:
     """Hands each request to what answers it; a defect met by one request does not end the others'."""
 
-    sessions: Sessions
     handshake: Handshake
     cells: CellRequests
     queries: MapQueries
@@ -43,38 +40,37 @@ class Dispatch:
     authorization: Authorization
     survey: Survey
     sampler: Sampler
-    outbox: Outbox
 
     def handle(self, heard: Heard) -> None:
         """Answer one request, or say why not."""
-        data = heard.frame.buffer
+        data = heard.body
         request = 0
         try:
             if heard.several_frames:
                 raise BadRequest("a request is one frame")
             message = decode_request(data)
             request = message.request
-            self._route(heard.identity, heard.frame, message)
+            self._route(heard.connection, message)
         except ShmmapError as error:
-            self.outbox.refuse(heard.identity, request or request_number(data), error)
+            heard.connection.refuse(request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
             log.exception("request failed", cause="a defect in shmmap")
-            self.outbox.refuse(heard.identity, request, InternalError("the daemon failed on this request"))
+            heard.connection.refuse(request, InternalError("the daemon failed on this request"))
 
     def refuse_unread(self, heard: Heard) -> None:
         """A process has too many requests waiting to have this one served, ever."""
-        data = heard.frame.buffer
+        data = heard.body
         if len(data) <= WORTH_AN_ANSWER_BYTES:
             error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
-            self.outbox.refuse(heard.identity, request_number(data), error)
+            heard.connection.refuse(request_number(data), error)
 
-    def _route(self, identity: bytes, frame: zmq.Frame, message: messages.Request) -> None:
+    def _route(self, connection: Connection, message: messages.Request) -> None:
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
-            entered = self.handshake.enter(identity, frame, message, now_s)
-            self.outbox.send(entered, encode(self.queries.welcome(entered, message)))
+            entered = self.handshake.enter(connection, message, now_s)
+            connection.reply(encode(self.queries.welcome(entered, message)))
             return
-        session = self.sessions.by_identity.get(identity)
+        session = connection.session
         if session is None:
             raise NoSession("this daemon does not know the session", hint="send hello first")
         session.requests += 1
@@ -91,17 +87,17 @@ class Dispatch:
         elif isinstance(message, messages.Release):
             versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
             self.cells.let_go(session.drop(versions))
-            self.outbox.send(session, encode(messages.Released(message.request)))
+            connection.reply(encode(messages.Released(message.request)))
         elif isinstance(message, messages.Bye):
             self.handshake.leave(session)
         elif isinstance(message, OPERATOR_REQUESTS):
-            self.authorization.require(peer_of(frame), now_s)
+            self.authorization.require(connection.peer, now_s)
             self.operators.handle(session, message, now_s)
         elif isinstance(message, messages.Stats):
             self.survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
         else:
-            self.outbox.send(session, encode(self.queries.answer(message)))
+            connection.reply(encode(self.queries.answer(message)))
 
     def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
         self.sampler.measure()
-        self.outbox.send(session, encode(self.queries.stats(message, usage, time.monotonic())))
+        session.connection.reply(encode(self.queries.stats(message, usage, time.monotonic())))

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clients come and go: a hello opens a session, a goodbye or the end of the client's process ends it."""
+"""Clients come and go: a hello opens a session; a goodbye, or the connection's or process's end, ends it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
-
-import zmq
 
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
-from shmmap.daemon.transport.inbox import peer_of
+from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch
@@ -21,8 +18,6 @@ from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Handshake"]
-
-_SOURCE: Final = 2  # ZMQ_SRCFD, deprecated and without a name in pyzmq
 
 
 @dataclass(eq=False, slots=True)
@@ -42,7 +37,7 @@ class Handshake:
     operators: OperatorRequests
     watched: WatchedDescriptors
 
-    def enter(self, identity: bytes, frame: zmq.Frame, message: Hello, now_s: float) -> Session:
+    def enter(self, connection: Connection, message: Hello, now_s: float) -> Session:
         """Return the session of who says hello.
 
         Raises
@@ -58,27 +53,34 @@ class Handshake:
                 f" daemon {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
                 hint="update the older of the two",
             )
-        peer = peer_of(frame)
-        old = self.sessions.by_identity.get(identity)
-        if old is not None:
-            if old.peer == peer:
-                return old  # a repeated hello: its answer was late or lost
-            self.leave(old)
+        if connection.session is not None:
+            return connection.session  # a repeated hello: its answer was late or lost
+        earlier = self.sessions.by_slot(message.session)
+        if earlier is not None and earlier.peer == connection.peer:
+            self.leave(
+                earlier
+            )  # the same client on a new connection, before the end of the old one was heard
         spare = self.sessions.spare() if self.sessions.full else None
         if spare is not None:
             self.leave(spare)
         if self.sessions.full:
             raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
-        session = self.sessions.open(identity, peer, message.client, now_s, slot=message.session)
-        session.fd = _descriptor(frame)
+        session = self.sessions.open(connection, message.client, now_s, slot=message.session)
         self.statistics.add("sessions_opened")
-        self.event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
+        self.event_log.publish(
+            events.Joined, session.slot, session.peer.pid, session.peer.uid, session.client
+        )
         if session.pidfd >= 0:
             self.watched.watch(session.pidfd, lambda: self.leave(session))
         return session
 
+    def hung_up(self, connection: Connection) -> None:
+        """A connection has ended."""
+        if connection.session is not None:
+            self.leave(connection.session)
+
     def leave(self, session: Session) -> None:
-        """A client's process ended, or it said goodbye: what it held may be free now."""
+        """A client is gone, or said goodbye: what it held may be free now."""
         held, pid = session.residents(), session.peer.pid
         if held:
             log.info("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
@@ -89,11 +91,3 @@ class Handshake:
         self.sessions.close(session)
         self.cells.let_go(held)
         self.operators.left(session)
-
-
-def _descriptor(frame: zmq.Frame) -> int:
-    """Descriptor of the connection that a message came on; -1 where libzmq does not tell."""
-    try:
-        return int(frame.get(_SOURCE))
-    except zmq.ZMQError:
-        return -1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is connected, according to the kernel, and what each of them holds."""
+"""Who has said hello, and what each of them holds."""
 
 from __future__ import annotations
 
@@ -13,33 +13,16 @@ from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.records import Resident
+from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.errors import NoSession
 from shmmap.geometry import Area
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["Peer", "Session", "Sessions", "predicted_path"]
+__all__ = ["Session", "Sessions", "predicted_path"]
 
 LOOK_AHEAD_S: Final = 5
 ROUTE_VERTICES: Final = 64
-
-
-@dataclass(frozen=True, slots=True)
-class Peer:
-    """Credentials of a connected process; -1 and 0 where the kernel does not tell."""
-
-    uid: int = -1
-    gid: int = -1
-    pid: int = 0
-
-    @classmethod
-    def parse(cls, address: str) -> Peer:
-        """Read libzmq's ``Peer-Address`` of an ipc connection, ``localhost:uid:gid:pid``."""
-        try:
-            uid, gid, pid = (int(part) for part in address.rsplit(":", 3)[-3:])
-        except ValueError:
-            return cls()
-        return cls(uid, gid, pid)
 
 
 @dataclass(eq=False, slots=True)
@@ -49,14 +32,12 @@ class Session:
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
     naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``says_where`` tells
     an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
-    asked for.  ``fd`` is the connection's descriptor (libzmq's own: never closed here),
-    ``unread_bytes`` what was sent since the client is known to have read everything.  ``asker`` is whose
-    turn its requests and loads count for: the process's, else the session's own.
+    asked for.  ``asker`` is whose turn its requests and loads count for: the process's, else the
+    session's own.
     """
 
     slot: int
-    identity: bytes
-    peer: Peer
+    connection: Connection
     client: str
     command: str
     pidfd: int
@@ -68,8 +49,11 @@ class Session:
     requests: int = 0
     last_request_s: float = 0.0
     asker: int = 0
-    fd: int = -1
-    unread_bytes: int = 0
+
+    @property
+    def peer(self) -> Peer:
+        """The client's process."""
+        return self.connection.peer
 
     def hold(self, residents: Iterable[Resident]) -> None:
         """The session was handed these segments."""
@@ -141,21 +125,15 @@ def command_of(pid: int) -> str:
 
 
 class Sessions:
-    """All sessions of this epoch, by routing identity and slot.
+    """All sessions of this epoch, by slot.
 
     Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
     it maps is locked under its slot, also when a later life of the daemon asks whose that is.
-
-    Attributes
-    ----------
-    by_identity : dict
-        Sessions by the routing identity of their connection.
     """
 
     LIMIT = 4096
 
     def __init__(self) -> None:
-        self.by_identity: dict[bytes, Session] = {}
         self._by_slot: dict[int, Session] = {}
 
     def __len__(self) -> int:
@@ -186,7 +164,7 @@ class Sessions:
         mine = [session for session in self if (session.peer.pid if session.pidfd >= 0 else 0) == owner]
         return min(mine, key=lambda session: session.last_request_s, default=None)
 
-    def open(self, identity: bytes, peer: Peer, client: str, now_s: float, *, slot: int = 0) -> Session:
+    def open(self, connection: Connection, client: str, now_s: float, *, slot: int = 0) -> Session:
         """Begin a session; ``pidfd`` is -1 where the process cannot be watched.
 
         ``slot`` is the one that the client had in an earlier life of the daemon and keeps, 0 for none.
@@ -198,7 +176,7 @@ class Sessions:
         """
         if not 0 < slot <= MAX_SLOT or slot in self._by_slot:
             slot = secrets.randbelow(MAX_SLOT) + 1
-        pidfd = -1
+        pidfd, peer = -1, connection.peer
         if peer.pid > 0:
             try:
                 pidfd = os.pidfd_open(peer.pid)
@@ -207,18 +185,17 @@ class Sessions:
             except OSError:
                 pidfd = -1  # a kernel without pidfds, or no descriptor left
         session = Session(
-            slot, identity, peer, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s,
+            slot, connection, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s,
             asker=peer.pid or -slot,
         )  # fmt: skip
-        self.by_identity[identity] = session
+        connection.session = session
         self._by_slot[slot] = session
         return session
 
     def close(self, session: Session) -> None:
         """End a session and its bookkeeping."""
         session.drop(list(session.held))
-        if self.by_identity.get(session.identity) is session:
-            del self.by_identity[session.identity]
+        session.connection.session = None
         self._by_slot.pop(session.slot, None)
         if session.pidfd >= 0:
             os.close(session.pidfd)

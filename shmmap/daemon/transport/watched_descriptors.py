@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptors that the serving loop hears besides its socket: loaders, clients' processes, the kernel."""
+"""Descriptors that the serving loop hears: clients' connections and processes, loaders, the kernel."""
 
 from __future__ import annotations
 
 import select
 from collections.abc import Callable
+from typing import Final
 
 __all__ = ["WatchedDescriptors"]
+
+AT_ONCE: Final = 16
+"""Descriptors looked at per turn; the kernel begins with those that were not looked at last time."""
 
 
 class WatchedDescriptors:
@@ -14,29 +18,38 @@ class WatchedDescriptors:
 
     Attributes
     ----------
-    fd : int
-        Readable when one of them is.
-    poll : callable
-        Gives those that are (`select.epoll.poll`).
     callbacks : dict
         What to call, by descriptor.
     """
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self.fd = self._epoll.fileno()
-        self.poll = self._epoll.poll
         self.callbacks: dict[int, Callable[[], None]] = {}
+        self._again: list[int] = []
 
     def watch(self, fd: int, callback: Callable[[], None]) -> None:
-        """Call ``callback`` from the loop whenever ``fd`` is readable."""
+        """Call ``callback`` from the loop whenever ``fd`` is readable, or its other end is closed."""
         self.callbacks[fd] = callback
         self._epoll.register(fd, select.EPOLLIN)
+
+    def watch_writing(self, fd: int, also: bool) -> None:
+        """Call its callback also when ``fd``, which is watched, can be written to."""
+        self._epoll.modify(fd, select.EPOLLIN | select.EPOLLOUT if also else select.EPOLLIN)
+
+    def call_again(self, fd: int) -> None:
+        """Call its callback in the next turn, whatever the kernel says."""
+        self._again.append(fd)
 
     def unwatch(self, fd: int) -> None:
         """Stop watching; before the descriptor is closed."""
         if self.callbacks.pop(fd, None) is not None:
             self._epoll.unregister(fd)
+
+    def poll(self, timeout_s: float) -> list[int]:
+        """Wait until descriptors are to be looked at, at most so long, and return them."""
+        again, self._again = self._again, []
+        ready = self._epoll.poll(0 if again else timeout_s, AT_ONCE)
+        return [*again, *(fd for fd, _events in ready)]
 
     def close(self) -> None:
         """Watch nothing any more; after everything watched is gone."""

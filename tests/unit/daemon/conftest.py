@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import pytest
 
 from tests.support.divided_map import DividedMap, make_map
 from tests.unit.daemon.inner_daemon import InnerDaemon
-from tests.unit.daemon.router import Router
 
 
 @pytest.fixture
@@ -32,13 +30,4 @@ def inner(tmp_path: Path) -> Iterator[Callable[..., InnerDaemon]]:
 
     yield factory
     for one in made:
-        one.close()
-
-
-@pytest.fixture
-def router() -> Iterator[Router]:
-    """Return a ROUTER with a loop and no client yet."""
-    with tempfile.TemporaryDirectory(dir="/tmp") as directory:
-        one = Router(directory)
-        yield one
         one.close()

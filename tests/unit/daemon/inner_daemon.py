@@ -31,7 +31,7 @@ from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.telemetry.cell_rows import CellRows
-from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
@@ -42,6 +42,7 @@ from shmmap.segment.names import segment_prefix
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.writer import StatisticsWriter
+from tests.support import connections
 
 EPOCH = 77
 PATIENCE_S = 30.0
@@ -111,7 +112,6 @@ class InnerDaemon:
             self.statistics,
             epoch=EPOCH,
             quota_bytes=quota_bytes,
-            send=lambda session, data: self.replies.append((session, decode_reply(data))),
             clock=self.now_s,
         )
         self.scheduler.on_settled = self._on_settled
@@ -136,11 +136,13 @@ class InnerDaemon:
 
     def session(self, name: str = "") -> Session:
         """Open a session of a process that nobody watches."""
-        return self.sessions.open(os.urandom(5), Peer(), name, self.now_s())
+        connection = connections.of(reply=lambda data: self.replies.append((session, decode_reply(data))))
+        session = self.sessions.open(connection, name, self.now_s())
+        return session
 
     def turn(self, timeout_s: float = 0.02) -> None:
         """One turn of the serving loop."""
-        for fd, _ in self.watched.poll(timeout_s):
+        for fd in self.watched.poll(timeout_s):
             callback = self.watched.callbacks.get(fd)
             if callback is not None:
                 callback()

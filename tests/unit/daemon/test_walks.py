@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Three walks a reader can take, and how many files of the daemon each enters on the loop's thread.
 
-Start-up, what has its own time (asked for by `ServingLoop._patience_ms`, done by `_look_after_the_rest`) and
+Start-up, what has its own time (asked for by `ServingLoop._patience_s`, done by `_look_after_the_rest`) and
 loader processes do not count.
 ``shmmap/ARCHITECTURE.md`` lists the files of each walk; the lists there are these sets.
 """
@@ -42,7 +42,7 @@ ARCHITECTURE = Path(DAEMON).with_name("ARCHITECTURE.md")
 HELLO = m.Hello(1, *m.PROTOCOL_VERSION, "walker")
 EVERYWHERE = m.BoxMessage(-1e4, -1e4, 1e4, 1e4)
 PATIENCE_S = 60.0
-TIMERS = {"_patience_ms", "_look_after_the_rest"}
+LEFT_OUT = {"poll", "_patience_s", "_look_after_the_rest"}
 
 
 class Walker:
@@ -72,7 +72,7 @@ class Walker:
         while above is not None:
             callers.append(above.f_code.co_name)
             above = above.f_back
-        if not TIMERS.intersection(callers) and (not self._under or self._under in callers):
+        if not LEFT_OUT.intersection(callers) and (not self._under or self._under in callers):
             self.files.add(str(Path(frame.f_code.co_filename).relative_to(DAEMON)))
 
 
@@ -95,7 +95,7 @@ class WholeDaemon:
         self.service = Service(
             config, self.memory, Reloader(origin), ServiceManager(), path, -1, signals, activated=None
         )
-        self.service._socket.bind(f"ipc://{path}")
+        self.service._listen()
         self._context: zmq.Context[Any] = zmq.Context()
         self._client = self._context.socket(zmq.DEALER)
         self._client.linger = 0
@@ -103,7 +103,7 @@ class WholeDaemon:
 
     def turn(self) -> None:
         loop = self.service._loop
-        loop._turn(loop._poller.poll(loop._patience_ms()))
+        loop._turn(loop.watched.poll(loop._patience_s()))
 
     def turn_until(self, done: Callable[[], object]) -> None:
         end_s = time.monotonic() + PATIENCE_S
@@ -157,7 +157,7 @@ def test_warm_differential(whole: Callable[..., WholeDaemon], small_map: Divided
     one = whole(small_map)
     cells = one.ask(m.Area(2, EVERYWHERE, wait=30.0)).cells
     held = [cell.version for cell in cells[:8]]
-    walker = Walker(until="_send_to")
+    walker = Walker(until="reply")
     named = tuple(m.HeldCell(cell.id, cell.version) for cell in cells[8:10])
     reply = one.ask(m.Differential(3, EVERYWHERE, held=named, packed=pack_versions(held)), walker)
     assert len(reply.cells) == 6
@@ -168,7 +168,7 @@ def test_warm_differential(whole: Callable[..., WholeDaemon], small_map: Divided
 def test_cold_load(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> None:
     one = whole(small_map)
     held = one.ask(m.Selected(2, ("0_0.pcd",), wait=30.0)).cells  # a loader has started
-    walker = Walker(until="_send_to")
+    walker = Walker(until="reply")
     area = m.BoxMessage(21.0, 21.0, 22.0, 22.0)
     reply = one.ask(m.Differential(3, area, packed=pack_versions([held[0].version]), wait=30.0), walker)
     assert [Path(cell.id).name for cell in reply.cells] == ["20_20.pcd"]

@@ -12,7 +12,7 @@ import pwd
 from typing import Final
 
 from shmmap.daemon.host.groups import group_id
-from shmmap.daemon.transport.sessions import Peer
+from shmmap.daemon.transport.connection import Peer
 from shmmap.errors import NotPermitted
 
 __all__ = ["Authorization"]

@@ -10,7 +10,6 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
-from shmmap.daemon.transport.outbox import Outbox
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
@@ -30,7 +29,7 @@ OPERATOR_REQUESTS: Final = (
 
 
 FAREWELL_S: Final = 1.0
-"""How long a stop waits for the one who asked for it: libzmq drops a reply that was not read when the
+"""How long a stop waits for the one who asked for it: its libzmq drops a reply that was not read when the
 connection ends (ZMQ_IMMEDIATE)."""
 
 
@@ -47,7 +46,6 @@ class OperatorRequests:
     cache: CellCache
     pins: OperatorPins
     reloader: Reloader
-    outbox: Outbox
     stop_by_s: float = math.inf
     _asked_to_stop: Session | None = None
 
@@ -56,14 +54,14 @@ class OperatorRequests:
         if isinstance(message, messages.Reload):
             self._reload(session, message)
         elif isinstance(message, messages.Evict):
-            self.outbox.send(session, encode(self._evict(message, now_s)))
+            session.connection.reply(encode(self._evict(message, now_s)))
         elif isinstance(message, messages.Pin):
-            self.outbox.send(session, encode(self.pins.pin(message, now_s)))
+            session.connection.reply(encode(self.pins.pin(message, now_s)))
         elif isinstance(message, messages.Unpin):
-            self.outbox.send(session, encode(self.pins.unpin(message)))
+            session.connection.reply(encode(self.pins.unpin(message)))
         elif isinstance(message, messages.Shutdown):
             log.info("stopping", requested_by_pid=session.peer.pid, uid=session.peer.uid)
-            self.outbox.send(session, encode(messages.Stopping(message.request)))
+            session.connection.reply(encode(messages.Stopping(message.request)))
             self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
     def left(self, session: Session) -> None:
@@ -76,12 +74,12 @@ class OperatorRequests:
 
         def answer(result: Catalogue | ShmmapError) -> None:
             if isinstance(result, ShmmapError):
-                self.outbox.refuse(session.identity, message.request, result)
+                session.connection.refuse(message.request, result)
                 return
             change = compare(before, result)
             counts = len(change.changed), len(change.added), len(change.removed)
             reloaded = messages.Reloaded(message.request, result.map_version, *counts, result.problems)
-            self.outbox.send(session, encode(reloaded))
+            session.connection.reply(encode(reloaded))
 
         self.reloader.ask(answer)
 

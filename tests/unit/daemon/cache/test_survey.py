@@ -11,8 +11,9 @@ from shmmap.daemon.cache.holders import UNKNOWN_SLOT, Holders
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.survey import LOOKS_AT_ONCE, MOST_ASKED, Survey, Usage
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import Busy
+from tests.support import connections
 
 SEGMENTS = 3 * LOOKS_AT_ONCE
 
@@ -52,7 +53,7 @@ def survey_of(memory: Memory, *, superseded: frozenset[str] = frozenset()) -> Su
 
 
 def session() -> Session:
-    return Sessions().open(b"12345", Peer(), "", 0.0)
+    return Sessions().open(connections.of(), "", 0.0)
 
 
 def test_the_gauges_follow_one_walk_behind() -> None:

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.requests.pending_request import MOST_OF_A_SESSION, PendingRequest, WaitingList
-from shmmap.daemon.transport.sessions import Peer, Session, Sessions
+from shmmap.daemon.transport.sessions import Session, Sessions
+from tests.support import connections
 
 
 def waiting_request(session: Session, deadline_s: float) -> PendingRequest:
@@ -16,7 +17,7 @@ def waiting_request(session: Session, deadline_s: float) -> PendingRequest:
 
 def sessions(count: int) -> list[Session]:
     opened = Sessions()
-    return [opened.open(bytes([n]), Peer(), "", 0.0) for n in range(count)]
+    return [opened.open(connections.of(), "", 0.0) for n in range(count)]
 
 
 def test_one_session_has_its_share() -> None:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.cell_requests import note_area
+from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import (
     ROUTE_VERTICES,
-    Peer,
     Session,
     Sessions,
     command_of,
@@ -25,6 +25,7 @@ from shmmap.daemon.transport.sessions import (
 from shmmap.errors import NoSession
 from shmmap.geometry import Circle
 from shmmap.protocol.messages import Intent
+from tests.support import connections
 
 
 def resident(number: int, version: int, nbytes: int) -> Resident:
@@ -43,7 +44,7 @@ def resident(number: int, version: int, nbytes: int) -> Resident:
 def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
     """Two segments share each version; what nobody has changes nothing."""
     sessions = Sessions()
-    clients = [sessions.open(bytes([n]), Peer(), str(n), 0.0) for n in range(3)]
+    clients = [sessions.open(connections.of(), str(n), 0.0) for n in range(3)]
     segments = [resident(n, n // 2 + 1, 10**n) for n in range(8)]
     model: list[set[int]] = [set(), set(), set()]
     for what, who, number in steps:
@@ -77,31 +78,20 @@ def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
     assert all(not segment.sessions for segment in segments)
 
 
-@pytest.mark.parametrize(
-    ("address", "peer"),
-    [
-        ("localhost:1000:1001:4321", Peer(1000, 1001, 4321)),
-        ("a:b:c:1:2:3", Peer(1, 2, 3)),
-        ("localhost", Peer()), ("", Peer()), ("x:y:z", Peer()), ("localhost:1:2:z", Peer()), ("1:2", Peer()),
-    ],
-)  # fmt: skip
-def test_what_the_kernel_says_of_a_peer(address: str, peer: Peer) -> None:
-    assert Peer.parse(address) == peer
-
-
 def test_a_watched_process() -> None:
     """The descriptor belongs to the process, and goes with the session."""
     sessions = Sessions()
-    session = sessions.open(b"1", Peer(0, 0, os.getpid()), "x" * 100, 1.0)
+    connection = connections.of(Peer(0, 0, os.getpid()))
+    session = sessions.open(connection, "x" * 100, 1.0)
     pidfd = session.pidfd
     assert f"Pid:\t{os.getpid()}" in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
     assert session.client == "x" * 64
     assert session.command == command_of(os.getpid()) != ""
-    assert sessions.by_identity.get(b"1") is sessions.by_slot(session.slot) is session
+    assert connection.session is sessions.by_slot(session.slot) is session
     sessions.close(session)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(pidfd)
-    assert (sessions.by_identity.get(b"1"), sessions.by_slot(session.slot)) == (None, None)
+    assert [connection.session, sessions.by_slot(session.slot)] == [None, None]
     sessions.close(session)  # twice does no harm
 
 
@@ -111,13 +101,13 @@ def test_a_process_that_has_ended_gets_no_session() -> None:
     process.wait()
     sessions = Sessions()
     with pytest.raises(NoSession):
-        sessions.open(b"1", Peer(0, 0, process.pid), "", 0.0)
+        sessions.open(connections.of(Peer(0, 0, process.pid)), "", 0.0)
     assert len(sessions) == 0
 
 
 def test_slots_are_never_alike() -> None:
     sessions = Sessions()
-    opened = [sessions.open(bytes([n]), Peer(), "", 0.0) for n in range(200)]
+    opened = [sessions.open(connections.of(), "", 0.0) for n in range(200)]
     assert len({session.slot for session in opened}) == 200
     assert all(0 < session.slot < 1 << 62 for session in opened)
     assert {type(session) for session in sessions} == {Session}
@@ -126,13 +116,13 @@ def test_slots_are_never_alike() -> None:
 def test_who_gives_way() -> None:
     sessions = Sessions()
     assert sessions.spare() is None
-    watched = sessions.open(b"w", Peer(0, 0, os.getpid()), "", 0.0)
+    watched = sessions.open(connections.of(Peer(0, 0, os.getpid())), "", 0.0)
     assert sessions.spare() is None
-    busy = sessions.open(b"1", Peer(), "", 9.0)
-    idle = sessions.open(b"2", Peer(), "", 3.0)
+    busy = sessions.open(connections.of(), "", 9.0)
+    idle = sessions.open(connections.of(), "", 3.0)
     assert sessions.spare() is idle
     sessions.close(idle)
-    hoarded = [sessions.open(bytes([n]), Peer(0, 0, os.getpid()), "", float(n)) for n in range(3, 6)]
+    hoarded = [sessions.open(connections.of(Peer(0, 0, os.getpid())), "", float(n)) for n in range(3, 6)]
     assert sessions.spare() is watched  # the process that has most gives its idlest
     for session in (watched, *hoarded):
         sessions.close(session)
@@ -142,8 +132,8 @@ def test_who_gives_way() -> None:
 def test_where_a_client_is() -> None:
     """The middle of what it asks for, until it says so itself."""
     sessions = Sessions()
-    session = sessions.open(b"1", Peer(), "", 0.0)
-    sessions.open(b"2", Peer(), "", 0.0)
+    session = sessions.open(connections.of(), "", 0.0)
+    sessions.open(connections.of(), "", 0.0)
     assert sessions.poses() == []
     for at in ((1.0, 2.0), (300.0, 4.0)):
         note_area(session, Circle(*at, 5.0))
@@ -167,7 +157,7 @@ def test_where_a_client_is_going_counts() -> None:
 
 def test_eviction_is_told_where_clients_are_going() -> None:
     sessions = Sessions()
-    session = sessions.open(b"1", Peer(), "", 0.0)
+    session = sessions.open(connections.of(), "", 0.0)
     session.says_where = True
     session.intent = Intent(1.0, 2.0, route=((50.0, 60.0), (70.0, 80.0)))
     assert sessions.poses() == [(1.0, 2.0), (50.0, 60.0), (70.0, 80.0)]

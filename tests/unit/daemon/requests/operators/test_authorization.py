@@ -9,7 +9,7 @@ import pwd
 import pytest
 
 from shmmap.daemon.requests.operators.authorization import Authorization
-from shmmap.daemon.transport.sessions import Peer
+from shmmap.daemon.transport.connection import Peer
 from shmmap.errors import ConfigError, NotPermitted
 
 ADMINS, OTHERS = 61010, 61011
