@@ -100,7 +100,7 @@ class Service:
             epoch=memory.epoch, event_log=memory.event_log, events_path=events_path(socket_path),
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader)
-        handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, watched)
+        handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, cache.survey)
         change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log, statistics)
         watched.watch(reloader.fd, change.collect)
         dispatch = Dispatch(handshake, cells, queries, operators, authorization, cache.survey, sampler)
@@ -178,6 +178,7 @@ class Service:
         """A few times a second, from the loop itself: whoever is hung does not beat."""
         memory, now_s = self._memory, time.monotonic()
         self._manager.beat(now_s, self._status)
+        self._handshake.beat()
         self._pins.keep(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()

@@ -38,7 +38,7 @@ def check_pins(patient: Patient) -> Finding:
             f"{patient.shm_dir} grants none: memory in use is known from {found.source.value} only",
             "name a directory on a tmpfs with shm_dir",
         )
-    parts = {"locks": found.locks, "inotify": found.close_events, "pidfds": found.process_ends}
+    parts = {"locks": found.locks, "inotify": found.close_events}
     if lacking := ", ".join(f"no {part}" for part, works in parts.items() if not works):
         return warn(
             name,

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from shmmap.daemon.cache.reclaimer import Reclaimer
+from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.records import Resident
 from shmmap.protocol.messages import Holder
 from shmmap.segment.pins import LOADER_SLOT, holders
@@ -25,6 +26,11 @@ class Holders:
 
     def __init__(self, reclaimer: Reclaimer) -> None:
         self._reclaimer = reclaimer
+
+    @property
+    def by_slot(self) -> bool:
+        """Whether the kernel tells which sessions use a segment."""
+        return self._reclaimer.pins.source is not PinSource.SESSIONS
 
     def slots_of(self, resident: Resident) -> list[int] | None:
         """Slots that have a segment locked; None if its name is gone."""

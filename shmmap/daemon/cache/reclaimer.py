@@ -4,7 +4,7 @@
 Renaming first means that nobody new can open the segment; looking again on a later tick catches
 whoever was just opening it.  A retired segment that is still mapped stays in the ledger, and is
 looked at again when its reader says that it let go, when the kernel reports that somebody closed it,
-or when a client's process ends; on a timer only as a precaution.
+or when a client's session ends; on a timer only as a precaution.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Share:
 class Usage:
     """What the segments come to that somebody maps; ``unknown`` ones are mapped by nobody who told.
 
-    ``shares`` goes by the slots of the sessions that map anything.
+    ``shares`` goes by the slots of the sessions that map anything; without ``by_slot`` that cannot be told.
     """
 
     count: int = 0
@@ -59,6 +59,7 @@ class Usage:
     unknown: int = 0
     unknown_bytes: int = 0
     shares: dict[int, Share] = field(default_factory=dict)
+    by_slot: bool = True
 
 
 Answer = Callable[[Usage], None]
@@ -142,7 +143,7 @@ class Survey:
 
     def _begin(self, most: int | None) -> None:
         self._left = self._ledger.everything()[:most]
-        self._found = Usage()
+        self._found = Usage(by_slot=self._holders.by_slot)
         self._asking_s = 0.0
 
     def _slots_of(self, resident: Resident) -> list[int]:

@@ -44,14 +44,11 @@ class PinSupport(NamedTuple):
         A lock on an open file lasts as long as its mapping, and shows.
     close_events
         inotify tells when somebody let go of a file.
-    process_ends
-        Processes can be watched for their end (pidfd).
     """
 
     leases: bool
     locks: bool
     close_events: bool
-    process_ends: bool
 
     @property
     def source(self) -> PinSource:
@@ -75,7 +72,7 @@ def probe_pins(directory: ShmDirectory) -> PinSupport:
         events = _works(_closing_tells, path)
     finally:
         os.close(fd)
-    return PinSupport(leases, locks, events, _works(_processes_can_be_watched))
+    return PinSupport(leases, locks, events)
 
 
 def _works(way: Callable[..., bool], *arguments: object) -> bool:
@@ -114,8 +111,3 @@ def _closing_tells(path: str) -> bool:
         events.add(path, CLOSED)
         os.close(os.open(path, os.O_RDONLY | os.O_CLOEXEC))
         return any(event.mask & CLOSED for event in events.read())
-
-
-def _processes_can_be_watched() -> bool:
-    os.close(os.pidfd_open(os.getpid()))
-    return True

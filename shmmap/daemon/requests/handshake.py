@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clients come and go: a hello opens a session; a goodbye, or the connection's or process's end, ends it."""
+"""Clients come and go: a hello opens a session; a goodbye, or the end of the connection, ends it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 
+from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch
 from shmmap.logfmt import log
 from shmmap.protocol import events
@@ -35,7 +36,9 @@ class Handshake:
     statistics: StatisticsWriter
     event_log: EventLog
     operators: OperatorRequests
-    watched: WatchedDescriptors
+    survey: Survey
+    _seen: Usage | None = None
+    _departed_before: list[Session] = field(default_factory=list)
 
     def enter(self, connection: Connection, message: Hello, now_s: float) -> Session:
         """Return the session of who says hello.
@@ -57,9 +60,9 @@ class Handshake:
             return connection.session  # a repeated hello: its answer was late or lost
         earlier = self.sessions.by_slot(message.session)
         if earlier is not None and earlier.peer == connection.peer:
-            self.leave(
-                earlier
-            )  # the same client on a new connection, before the end of the old one was heard
+            self.sessions.departed.pop(earlier.slot, None)
+            earlier.connect(connection)
+            return earlier
         spare = self.sessions.spare() if self.sessions.full else None
         if spare is not None:
             self.leave(spare)
@@ -70,14 +73,35 @@ class Handshake:
         self.event_log.publish(
             events.Joined, session.slot, session.peer.pid, session.peer.uid, session.client
         )
-        if session.pidfd >= 0:
-            self.watched.watch(session.pidfd, lambda: self.leave(session))
         return session
 
     def hung_up(self, connection: Connection) -> None:
-        """A connection has ended."""
-        if connection.session is not None:
-            self.leave(connection.session)
+        """A connection has ended; its session ends when the kernel says that it maps nothing."""
+        session = connection.session
+        if session is None:
+            return
+        session.disconnect()
+        self.cells.forget(session)
+        self.sessions.departed[session.slot] = session
+        if session.held:
+            self.survey.ask(session, lambda usage: self._settle(session, usage))
+        else:
+            self.leave(session)
+
+    def beat(self) -> None:
+        """End those who had departed before the last survey began and map nothing."""
+        if self.survey.usage is not self._seen:
+            self._seen = self.survey.usage
+            for session in self._departed_before:
+                self._settle(session, self._seen)
+            self._departed_before = list(self.sessions.departed.values())
+
+    def _settle(self, session: Session, usage: Usage) -> None:
+        if session.slot not in self.sessions.departed or session.slot in usage.shares:
+            return
+        if not usage.by_slot and os.path.exists(f"/proc/{session.peer.pid}"):
+            return  # nobody can tell what it maps, but that it is there
+        self.leave(session)
 
     def leave(self, session: Session) -> None:
         """A client is gone, or said goodbye: what it held may be free now."""
@@ -86,8 +110,6 @@ class Handshake:
             log.info("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
         self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
         self.cells.forget(session)
-        if session.pidfd >= 0:
-            self.watched.unwatch(session.pidfd)
         self.sessions.close(session)
         self.cells.let_go(held)
         self.operators.left(session)

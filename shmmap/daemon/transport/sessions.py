@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -14,7 +13,6 @@ from typing import Final
 
 from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.connection import Connection, Peer
-from shmmap.errors import NoSession
 from shmmap.geometry import Area
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
@@ -40,7 +38,6 @@ class Session:
     connection: Connection
     client: str
     command: str
-    pidfd: int
     held: dict[int, list[Resident]] = field(default_factory=dict)
     held_bytes: int = 0
     intent: Intent | None = None
@@ -54,6 +51,16 @@ class Session:
     def peer(self) -> Peer:
         """The client's process."""
         return self.connection.peer
+
+    def connect(self, connection: Connection) -> None:
+        """The session goes on on this connection."""
+        self.disconnect()
+        self.connection, connection.session = connection, self
+
+    def disconnect(self) -> None:
+        """The session has no connection; what it said of where it is does not count any more."""
+        self.connection.session = self.intent = self.area = None
+        self.says_where = False
 
     def hold(self, residents: Iterable[Resident]) -> None:
         """The session was handed these segments."""
@@ -129,12 +136,18 @@ class Sessions:
 
     Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
     it maps is locked under its slot, also when a later life of the daemon asks whose that is.
+
+    Attributes
+    ----------
+    departed : dict
+        By slot, those whose connection has ended and who may still map what they were handed.
     """
 
     LIMIT = 4096
 
     def __init__(self) -> None:
         self._by_slot: dict[int, Session] = {}
+        self.departed: dict[int, Session] = {}
 
     def __len__(self) -> int:
         return len(self._by_slot)
@@ -154,40 +167,28 @@ class Sessions:
     def spare(self) -> Session | None:
         """The session to give up when there are too many; None when everybody has just one.
 
-        It belongs to whoever has most: a process, or all those together whose end nobody tells us.
-        Should it still be alive, it is told ``no_session`` and opens another.
+        It belongs to the process that has most (those whom the kernel does not name are one).  It is told
+        ``no_session`` and may open another.
         """
-        sessions_of = Counter(session.peer.pid if session.pidfd >= 0 else 0 for session in self)
+        sessions_of = Counter(session.peer.pid for session in self)
         owner, count = max(sessions_of.items(), key=lambda item: item[1], default=(0, 0))
         if owner and count < 2:
             return None
-        mine = [session for session in self if (session.peer.pid if session.pidfd >= 0 else 0) == owner]
+        mine = [session for session in self if session.peer.pid == owner]
         return min(mine, key=lambda session: session.last_request_s, default=None)
 
     def open(self, connection: Connection, client: str, now_s: float, *, slot: int = 0) -> Session:
-        """Begin a session; ``pidfd`` is -1 where the process cannot be watched.
+        """Begin a session.
 
-        ``slot`` is the one that the client had in an earlier life of the daemon and keeps, 0 for none.
-
-        Raises
-        ------
-        NoSession
-            The process has ended already: nobody would ever end its session.
+        ``slot`` is the one that the client had before, on another connection or in an earlier life of the
+        daemon, and keeps; 0 for none.
         """
         if not 0 < slot <= MAX_SLOT or slot in self._by_slot:
             slot = secrets.randbelow(MAX_SLOT) + 1
-        pidfd, peer = -1, connection.peer
-        if peer.pid > 0:
-            try:
-                pidfd = os.pidfd_open(peer.pid)
-            except ProcessLookupError:
-                raise NoSession(f"process {peer.pid} has ended") from None
-            except OSError:
-                pidfd = -1  # a kernel without pidfds, or no descriptor left
+        pid = connection.peer.pid
         session = Session(
-            slot, connection, client[:64], command_of(peer.pid), pidfd, last_request_s=now_s,
-            asker=peer.pid or -slot,
-        )  # fmt: skip
+            slot, connection, client[:64], command_of(pid), last_request_s=now_s, asker=pid or -slot
+        )
         connection.session = session
         self._by_slot[slot] = session
         return session
@@ -195,11 +196,9 @@ class Sessions:
     def close(self, session: Session) -> None:
         """End a session and its bookkeeping."""
         session.drop(list(session.held))
-        session.connection.session = None
+        session.disconnect()
         self._by_slot.pop(session.slot, None)
-        if session.pidfd >= 0:
-            os.close(session.pidfd)
-            session.pidfd = -1
+        self.departed.pop(session.slot, None)
 
     def poses(self) -> list[tuple[float, float]]:
         """Where the clients are and are going to be, metres, map frame."""

@@ -31,6 +31,7 @@ class Memory:
         self.segments = [resident(number) for number in range(count)]
         self.users: dict[str, list[int]] = {}
         self.looked = 0
+        self.by_slot = True
 
     def everything(self) -> list[Resident]:
         return sorted(self.segments, key=lambda one: -one.nbytes)

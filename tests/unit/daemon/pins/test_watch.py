@@ -35,7 +35,7 @@ def reported(fd: int, timeout_s: float = 10.0) -> bool:
 
 def test_this_machine_tells_everything(directory: ShmDirectory) -> None:
     support = probe_pins(directory)
-    assert support == PinSupport(True, True, True, True)
+    assert support == PinSupport(True, True, True)
     assert support.source is PinSource.LEASES
     assert os.listdir(directory.path) == [NAME[1:]]
 

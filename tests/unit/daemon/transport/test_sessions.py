@@ -4,11 +4,7 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,7 +18,6 @@ from shmmap.daemon.transport.sessions import (
     command_of,
     predicted_path,
 )
-from shmmap.errors import NoSession
 from shmmap.geometry import Circle
 from shmmap.protocol.messages import Intent
 from tests.support import connections
@@ -78,31 +73,31 @@ def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
     assert all(not segment.sessions for segment in segments)
 
 
-def test_a_watched_process() -> None:
-    """The descriptor belongs to the process, and goes with the session."""
+def test_a_session_and_its_connections() -> None:
+    """It can change its connection, and says nothing of where it is meanwhile."""
     sessions = Sessions()
-    connection = connections.of(Peer(0, 0, os.getpid()))
-    session = sessions.open(connection, "x" * 100, 1.0)
-    pidfd = session.pidfd
-    assert f"Pid:\t{os.getpid()}" in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
+    first, second = connections.of(Peer(0, 0, os.getpid())), connections.of(Peer(0, 0, os.getpid()))
+    session = sessions.open(first, "x" * 100, 1.0)
     assert session.client == "x" * 64
     assert session.command == command_of(os.getpid()) != ""
-    assert connection.session is sessions.by_slot(session.slot) is session
+    assert first.session is sessions.by_slot(session.slot) is session
+    note_area(session, Circle(1.0, 2.0, 5.0))
+    session.connect(second)
+    assert [first.session, second.session] == [None, session]
+    assert session.connection is second
+    assert sessions.poses() == []
+    sessions.departed[session.slot] = session
     sessions.close(session)
-    with pytest.raises(OSError, match="Bad file descriptor"):
-        os.fstat(pidfd)
-    assert [connection.session, sessions.by_slot(session.slot)] == [None, None]
+    assert [second.session, sessions.by_slot(session.slot), sessions.departed] == [None, None, {}]
     sessions.close(session)  # twice does no harm
 
 
-def test_a_process_that_has_ended_gets_no_session() -> None:
-    """Nobody would ever tell that it may be closed."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
+def test_a_slot_is_kept_or_new() -> None:
     sessions = Sessions()
-    with pytest.raises(NoSession):
-        sessions.open(connections.of(Peer(0, 0, process.pid)), "", 0.0)
-    assert len(sessions) == 0
+    kept = sessions.open(connections.of(), "", 0.0, slot=1234)
+    assert kept.slot == 1234
+    others = [sessions.open(connections.of(), "", 0.0, slot=slot) for slot in (1234, 0, -1, 1 << 62)]
+    assert len({1234, *(other.slot for other in others)}) == 5
 
 
 def test_slots_are_never_alike() -> None:

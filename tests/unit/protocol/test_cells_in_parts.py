@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Outbox put together from handles encoded earlier are byte for byte what encoding them at once gives."""
+"""Replies put together from handles encoded earlier are byte for byte what encoding them at once gives."""
 
 from __future__ import annotations
 

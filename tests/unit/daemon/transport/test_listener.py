@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Connections of libzmq and of raw sockets: who they are, what is kept for them, and who loses them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import socket
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, cast
+
+import pytest
+import zmq
+
+from shmmap.daemon.transport.connection import MOST_UNREAD_BYTES, READ_BYTES, Connection, Peer
+from shmmap.daemon.transport.listener import LEAST_SHARE, MEMORY_ALLOWANCE_BYTES, Connections, Listener
+from shmmap.daemon.transport.socket_file import listen_at
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.transport.zmtp import GREETING, framed
+from shmmap.errors import Busy
+from shmmap.protocol.codec import decode_reply
+from shmmap.statistics.writer import StatisticsWriter
+from tests.support.patience import Patience
+
+LONGEST = 1 << 20
+_READER = """
+import socket
+one, total = socket.socket(fileno=0), 0
+while data := one.recv(1 << 16):
+    total += len(data)
+print(total)
+"""
+READY = framed(b"\x05READY\x0bSocket-Type\0\0\0\x06DEALER\x08Identity\0\0\0\0", 4)
+_OTHER = """
+import socket, sys
+held = [socket.socket(socket.AF_UNIX) for _ in range(int(sys.argv[2]))]
+for one in held:
+    one.connect(sys.argv[1])
+print("in", flush=True)
+sys.stdin.read()
+"""
+
+
+class Counts(Counter[str]):
+    """What connections add to the statistics."""
+
+    def add(self, name: str, value: int = 1) -> None:
+        self[name] += value
+
+
+class Loop:
+    """A listener and the turns of a loop; keeps what is heard."""
+
+    def __init__(self, directory: str) -> None:
+        self.path = f"{directory}/s.sock"
+        self.watched = WatchedDescriptors()
+        self.connections = Connections()
+        self.counts = Counts()
+        self.heard: list[tuple[Connection, bytes, bool]] = []
+        self.ended: list[Connection] = []
+        self.socket = listen_at(self.path, -1)
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.held: list[socket.socket] = []
+        self.listener = Listener(
+            self.socket, self.watched, self.connections, cast("StatisticsWriter", self.counts), b"ROUTER",
+            b"DEALER", LONGEST, lambda *message: self.heard.append(message), self.ended.append,
+        )  # fmt: skip
+        self.listener.begin()
+
+    def turn(self, timeout_s: float = 0.02) -> int:
+        """One turn; returns how many descriptors were looked at."""
+        ready = self.watched.poll(timeout_s)
+        for fd in ready:
+            callback = self.watched.callbacks.get(fd)
+            if callback is not None:
+                callback()
+        return len(ready)
+
+    def settle(self) -> None:
+        """Turn until there is nothing to do."""
+        waiting = Patience()
+        while waiting(self.turn(0) > 0):
+            pass
+
+    def raw(self, data: bytes = b"") -> socket.socket:
+        """Connect a bare socket that has said this."""
+        one = socket.socket(socket.AF_UNIX)
+        one.settimeout(30.0)
+        one.connect(self.path)
+        self.held.append(one)
+        one.sendall(data)
+        self.settle()
+        return one
+
+    def send(self, one: socket.socket, data: bytes) -> None:
+        """Have a bare socket say more than the kernel keeps."""
+        one.setblocking(False)
+        waiting = Patience()
+        while waiting(len(data) > 0):
+            with contextlib.suppress(BlockingIOError):
+                data = data[one.send(data) :]
+            self.turn(0)
+        self.settle()
+
+    def dealer(self) -> Any:
+        one = self.context.socket(zmq.DEALER)
+        one.linger = 0
+        one.connect(f"ipc://{self.path}")
+        return one
+
+    def of(self, pid: int) -> list[Connection]:
+        return [one for one in self.connections if one.peer.pid == pid]
+
+    def close(self) -> None:
+        self.connections.deliver(0)
+        for one in self.held:
+            one.close()
+        self.context.destroy(linger=0)
+        self.socket.close()
+        self.watched.close()
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    with tempfile.TemporaryDirectory(dir="/tmp") as directory:
+        one = Loop(directory)
+        yield one
+        one.close()
+
+
+@pytest.fixture
+def other(loop: Loop) -> Iterator[int]:
+    """Return a process with three connections that say nothing."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", _OTHER, loop.path, "3"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"in\n"
+    loop.settle()
+    assert len(loop.of(process.pid)) == 3
+    yield process.pid
+    process.kill()
+    process.communicate()
+
+
+def test_libzmq_s_client(loop: Loop) -> None:
+    """Requests and replies of all lengths, and who is there: the kernel says."""
+    one = loop.dealer()
+    sizes = (0, 1, 255, 256, 300_000)
+    for size in sizes:
+        one.send(bytes(size))
+    one.send_multipart([b"first", b"second"])
+    waiting = Patience()
+    while waiting(len(loop.heard) < len(sizes) + 1):
+        loop.turn()
+    assert [(len(body), several) for _, body, several in loop.heard] == [
+        *((size, False) for size in sizes), (5, True)
+    ]  # fmt: skip
+    connection = loop.heard[0][0]
+    assert connection.peer == Peer(os.getuid(), os.getgid(), os.getpid())
+    for size in sizes:
+        connection.reply(bytes(size))
+    connection.refuse(7, Busy("later"))
+    received: list[bytes] = []
+    while waiting(len(received) < len(sizes) + 1):
+        loop.turn()
+        while one.poll(0):
+            received.append(one.recv())
+    assert [len(data) for data in received[:-1]] == list(sizes)
+    assert getattr(decode_reply(received[-1]), "code", "") == "busy"
+    assert (loop.counts["replies"], loop.counts["errors_returned"]) == (len(sizes) + 1, 1)
+    one.close()
+    while waiting(not loop.ended):
+        loop.turn()
+    assert loop.ended == [connection]
+    connection.reply(b"to nobody")
+    assert loop.connections.count == 0
+
+
+def test_the_wrong_type_of_socket(loop: Loop) -> None:
+    one = loop.raw(GREETING + READY.replace(b"DEALER", b"REQ" + bytes(3)))
+    assert loop.connections.count == 0
+    while one.recv(4096):
+        pass
+
+
+def test_a_turn_does_little(loop: Loop) -> None:
+    """Whatever one connection sends, a turn looks at some of it; the rest is not forgotten."""
+    one = loop.raw(GREETING + READY)
+    one.sendall(framed(b"x") * 1000)
+    most = 0
+    waiting = Patience()
+    while waiting(len(loop.heard) < 1000):
+        before = len(loop.heard)
+        loop.turn()
+        most = max(most, len(loop.heard) - before)
+    assert most == 16
+
+
+def test_many_connections_take_turns(loop: Loop) -> None:
+    for _ in range(40):
+        loop.raw(GREETING + READY)
+    for one in loop.held:
+        one.sendall(framed(b"x"))
+    assert [loop.turn() for _ in range(3)] == [16, 16, 8]
+    assert len({connection for connection, _, _ in loop.heard}) == 40
+
+
+def test_replies_that_are_not_read(loop: Loop) -> None:
+    """They are kept up to a limit, whole; beyond it they and the connection are lost."""
+    one = loop.raw(GREETING + READY)
+    (connection,) = loop.connections
+    sent = [bytes([n]) * 300_000 for n in range(20)]
+    for body in sent:
+        connection.reply(body)
+    assert loop.connections.nbytes == connection.unsent_bytes > 5_000_000
+    expected = GREETING + framed(b"\x05READY\x0bSocket-Type\0\0\0\x06ROUTER\x08Identity\0\0\0\0", 4)
+    expected += b"".join(map(framed, sent))
+    received = bytearray()
+    waiting = Patience()
+    while waiting(len(received) < len(expected)):
+        received += one.recv(1 << 20)
+        loop.settle()
+    assert received == expected
+    assert (connection.unsent_bytes, loop.connections.nbytes) == (0, 0)
+    for _ in range(MOST_UNREAD_BYTES // 300_000 + 2):
+        connection.reply(sent[0])
+    assert connection.unsent_bytes == 0
+    loop.settle()
+    assert loop.ended == [connection]
+    assert (loop.connections.count, loop.connections.nbytes) == (0, 0)
+
+
+def test_half_a_message_from_each(loop: Loop, other: int) -> None:
+    """All together are too much: the process that sent most loses its connections, the others nothing."""
+    half = framed(bytes(LONGEST - 100))[:-1]
+    while loop.connections.nbytes + len(half) <= MEMORY_ALLOWANCE_BYTES:
+        loop.send(loop.raw(GREETING + READY), half)
+    mine = loop.of(os.getpid())
+    assert loop.ended == []
+    with contextlib.suppress(BrokenPipeError):
+        loop.send(loop.raw(GREETING + READY), half)
+    loop.settle()
+    assert set(loop.ended) > set(mine)
+    assert {one.peer.pid for one in loop.connections} == {other}
+    assert loop.connections.nbytes == 0
+    assert loop.connections.ended == len(mine) + 1
+
+
+def test_a_message_that_is_too_long(loop: Loop) -> None:
+    one = loop.raw(GREETING + READY)
+    one.sendall(b"\x02" + (LONGEST + 1).to_bytes(8, "big"))
+    loop.settle()
+    assert (len(loop.ended), loop.heard) == (1, [])
+
+
+def test_more_connections_than_descriptors(loop: Loop, other: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has most keeps a share, with a session first; others lose nothing."""
+    for _ in range(LEAST_SHARE + 4):
+        loop.raw()
+    mine = loop.of(os.getpid())
+    with_session = mine[:LEAST_SHARE]
+    for one in with_session:
+        one.session = cast("Any", "a session")
+    highest = max(one.fd for one in loop.connections)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (highest + 49, highest + 49))
+    loop.raw()
+    assert set(loop.of(os.getpid())) == set(with_session)
+    assert len(loop.of(other)) == 3
+    assert loop.connections.ended == len(loop.ended) == 5
+    assert not loop.connections.short
+
+
+def test_newcomers_wait_where_nobody_has_many(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = loop.raw()
+    highest = max(one.fd for one in loop.connections)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (highest + 49, highest + 49))
+    loop.raw()
+    assert (loop.connections.count, loop.connections.short) == (2, True)
+    loop.raw(GREETING)
+    assert (loop.connections.count, loop.ended) == (2, [])
+    first.close()
+    loop.settle()
+    assert (loop.connections.count, len(loop.ended)) == (2, 1)
+
+
+def test_what_was_said_last_is_delivered(loop: Loop) -> None:
+    one = loop.raw(GREETING + READY)
+    (connection,) = loop.connections
+    connection.reply(bytes(READ_BYTES * 8))
+    one.setblocking(True)
+    reader = subprocess.Popen(
+        [sys.executable, "-c", _READER], stdin=one.fileno(), stdout=subprocess.PIPE,
+    )  # fmt: skip
+    loop.connections.deliver(30.0)
+    total, _ = reader.communicate()
+    assert int(total) > READ_BYTES * 8
