@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mutated bytes against what reads bytes of others: the protocol's codec, attaching a segment, PCD.
+"""Mutated bytes against what reads bytes of others: connections, the protocol's codec, a segment, PCD.
 
-    python -m tests.benchmarks.fuzz [protocol segment pcd] [--seconds 60] [--seed N]
+    python -m tests.benchmarks.fuzz [zmtp protocol segment pcd] [--seconds 60] [--seed N]
 
 Starts from the inputs in ``tests/corpus``.  Each target runs in child processes under a limit of
 address space, so that an allocation which the input does not justify is a finding; so is every

@@ -31,6 +31,8 @@ from shmmap.errors import (
 from shmmap.segment.attach import attach
 from tests.support.daemon_process import DaemonProcess, open_files
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.patience import Patience
+from tests.support.process_costs import descriptors
 from tests.support.served_cells import names
 
 Factory = Callable[..., DaemonProcess]
@@ -440,6 +442,28 @@ def test_closing_ends_the_session_unless_something_is_held(daemon: Factory, divi
         keeper.close()
         assert {row.client for row in watcher.stats().sessions} == {program_name(), "keeper"}
         assert kept.complete
+
+
+def test_who_left_without_a_goodbye(daemon: Factory, divided_map: DividedMap) -> None:
+    """The daemon keeps no descriptor and no pose of it, and its name while the kernel says that it maps."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, name="watcher") as watcher:
+        watcher.stats()
+        before = descriptors(one.pid)
+        kept = []
+        for number in range(20):
+            keeper = shmmap.connect(one.endpoint, name=f"keeper {number}")
+            kept.append(keeper.around(0, 0, 10))
+            keeper.close()
+        waiting = Patience()
+        while waiting(descriptors(one.pid) > before):
+            watcher.stats()
+        rows = {row.client: row for row in watcher.stats().sessions}
+        assert set(rows) == {"watcher", *(f"keeper {number}" for number in range(20))}
+        assert all(rows[name].mapped_bytes and rows[name].pose is None for name in rows if name != "watcher")
+        kept.clear()
+        while waiting(len(watcher.stats().sessions) > 1):
+            pass
 
 
 def test_a_client_that_nobody_closes_leaves_no_descriptor(daemon: Factory, divided_map: DividedMap) -> None:

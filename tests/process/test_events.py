@@ -226,3 +226,27 @@ def test_permissions_are_those_of_requests(daemon: DaemonFactory, divided_map: D
     assert len({(stat.S_IMODE(m.st_mode), m.st_uid, m.st_gid) for m in modes}) == 1
     assert one.stop() == 0
     assert not [path for path in paths if os.path.exists(path)]
+
+
+def test_only_everything_can_be_subscribed_to(
+    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+) -> None:
+    """Who subscribes to prefixes, each of which would be kept, loses the connection; others hear on."""
+    one = daemon(divided_map.root)
+    client, stream = connect(one), listen(one)
+    context: zmq.Context[Any] = zmq.Context()
+    greedy = context.socket(zmq.SUB)
+    try:
+        greedy.linger = 0
+        greedy.reconnect_ivl = -1
+        monitor = greedy.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        for number in range(1000):
+            greedy.subscribe(b"prefix %d" % number)
+        greedy.connect("ipc://" + one.endpoint.removesuffix(".sock") + ".events.sock")
+        assert monitor.poll(30_000), "the connection stays"
+    finally:
+        greedy.disable_monitor()
+        context.destroy(linger=0)
+    assert f"connections ended pid={os.getpid()} count=1" in one.log
+    client.selected(["0_0.pcd"])
+    until(stream, lambda h: isinstance(h, e.Loaded))

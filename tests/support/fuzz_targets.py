@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from shmmap.daemon.transport.zmtp import Incoming
 from shmmap.errors import BadRequest, MapDataError, ProtocolMismatch, SegmentError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd.reader import PcdReader
@@ -66,6 +67,33 @@ def check_protocol(data: bytes) -> str:
     except ProtocolMismatch:
         outcome.append("refused")
     return "/".join(outcome)
+
+
+# --- zmtp ---------------------------------------------------------------------------------------
+
+
+def check_zmtp(data: bytes) -> str:
+    """What comes on a connection: messages or one of two errors, the same however it is cut into pieces."""
+    outcomes = []
+    for piece, at_once in ((len(data) or 1, 10_000), (7, 10_000), (64, 3)):
+        incoming = Incoming(b"ROUTER", b"DEALER", 4096, lambda _said: None)
+        heard: list[tuple[bytes, bool]] = []
+        outcome = "silence"
+        try:
+            for at in range(0, len(data), piece):
+                incoming.add(data[at : at + piece])
+                heard += incoming.messages(at_once)
+                while incoming.more:
+                    heard += incoming.messages(at_once)
+            outcome = "messages" if heard else outcome
+        except (ProtocolMismatch, BadRequest) as error:
+            outcome = type(error).__name__
+        outcomes.append(outcome)
+        if sum(len(body) for body, _ in heard) + len(incoming) > len(data):
+            raise AssertionError("more is kept than came")
+    if len(set(outcomes)) > 1:
+        raise AssertionError(f"it depends on the pieces: {outcomes}")
+    return outcomes[0]
 
 
 # --- segment ------------------------------------------------------------------------------------
@@ -157,6 +185,7 @@ def mutate_protocol(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes
 
 TARGETS: Final = {
     "protocol": Target(mutate_protocol, check_protocol),
+    "zmtp": Target(mutate_bytes, check_zmtp),
     "segment": Target(mutate_segment, check_segment),
     "pcd": Target(mutate_bytes, check_pcd),
 }
