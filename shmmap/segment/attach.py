@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import ctypes
 import os
+import stat
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
@@ -33,6 +35,10 @@ if TYPE_CHECKING:
 __all__ = ["AttachedSegment", "Unmap", "attach", "unmap"]
 
 Unmap = Callable[[int, int], object]
+
+LEASE_S: Final = 0.2
+"""How long a lease may keep an open waiting; the daemon holds one for microseconds."""
+LEASE_RETRY_S: Final = 0.0002
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 _mmap: Final = _libc.mmap
@@ -148,12 +154,23 @@ class AttachedSegment:
 
 
 def _open(name: str, shm_dir: str) -> int:
-    if shm_dir == DEFAULT_SHM_DIR:
-        # no size=: passing one would resize the segment under everybody's feet
-        return int(posix_ipc.SharedMemory(name, read_only=True).fd)
-    # as shm_open does it; a pipe of that name would keep the opener waiting
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    return os.open(f"{shm_dir}/{name.lstrip('/')}", flags)
+    """Open a segment, never waiting: a pipe that has its name by now would make the opener wait for ever.
+
+    So an open that meets the daemon's lease, held for a moment to see whether anybody uses the segment, is
+    tried again.
+    """
+    end_s = time.monotonic() + LEASE_S
+    while True:
+        try:
+            if shm_dir == DEFAULT_SHM_DIR:
+                # no size=: passing one would resize the segment under everybody's feet
+                return int(posix_ipc.SharedMemory(name, flags=os.O_NONBLOCK, read_only=True).fd)
+            flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+            return os.open(f"{shm_dir}/{name.lstrip('/')}", flags)
+        except BlockingIOError:  # noqa: PERF203  it is the only way to find out
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(LEASE_RETRY_S)
 
 
 def attach(
@@ -191,7 +208,7 @@ def attach(
     Raises
     ------
     StaleHandle
-        The segment is gone, or what has its name is somebody else's.
+        The segment is gone, or what has its name is something else or somebody else's.
     SegmentCorrupt
         Its bytes are not a segment of a layout this program reads.
     SegmentError
@@ -206,12 +223,16 @@ def attach(
             f"segment {name}: this user may not read it",
             hint="join the group that the daemon was started with (--group)",
         ) from error
+    except BlockingIOError as error:
+        raise StaleHandle(
+            f"segment {name} cannot be opened: its lease is not given back", hint="ask the daemon again"
+        ) from error
     except OSError as error:
         raise SegmentError(f"segment {name}: {error.strerror}") from error
     try:
         step("client.open")
         status = os.fstat(fd)
-        if owner is not None and status.st_uid != owner:
+        if not stat.S_ISREG(status.st_mode) or owner not in (None, status.st_uid):
             raise StaleHandle(
                 f"segment {name} is gone: its name is that of a file of user {status.st_uid} now",
                 hint="ask the daemon again",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import os
 import resource
@@ -14,8 +15,10 @@ import numpy as np
 import pytest
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.segment import attach as attach_module
 from shmmap.segment.attach import attach, unmap
-from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
+from shmmap.segment.pins import prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from tests.support.process_costs import mappings_under
 from tests.support.segment_reader import read_segment
@@ -204,3 +207,32 @@ def test_populated_pages_are_there_at_once(shm: ShmDirectory, publish: Publish) 
     after_reading = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     assert after_reading - after_attach < pages / 4
     assert after_attach >= faults
+
+
+@pytest.mark.parametrize("usual", [True, False])
+def test_a_name_that_something_else_has_by_now(shm: ShmDirectory, usual: bool) -> None:
+    """A pipe would keep who opens it waiting, were it not for O_NONBLOCK."""
+    directory = DEFAULT_SHM_DIR if usual else shm.path
+    path = f"{directory}/unit-{os.getpid()}.pipe"
+    os.mkfifo(path)
+    try:
+        with pytest.raises(StaleHandle):
+            attach(f"/unit-{os.getpid()}.pipe", shm_dir=directory)
+    finally:
+        os.unlink(path)
+
+
+def test_a_lease_that_is_not_given_back(
+    shm: ShmDirectory, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon was stopped in the middle of a look: the client is told to ask again, and not held up."""
+    prepare_process()  # a lease that somebody wants back is told by a signal
+    name = publish()
+    fd = shm.open(name)
+    try:
+        fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+        monkeypatch.setattr(attach_module, "LEASE_S", 0.01)
+        with pytest.raises(StaleHandle, match="lease"):
+            attach(name, shm_dir=shm.path)
+    finally:
+        os.close(fd)

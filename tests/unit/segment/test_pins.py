@@ -81,24 +81,30 @@ _READER: Final = """
 import sys
 from shmmap.segment.attach import attach
 sys.stdin.readline()
-print(len(attach(sys.argv[1], slot=5).columns), flush=True)
+print(len(attach(sys.argv[1], shm_dir=sys.argv[2], slot=5).columns), flush=True)
 """
 
 
-def test_looking_does_not_disturb_whoever_opens_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An open that meets a lease waits until the lease is given back, and succeeds.
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_looking_does_not_disturb_whoever_opens_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, shm: ShmDirectory, elsewhere: bool
+) -> None:
+    """An open that meets a lease is tried until the lease is given back, and succeeds.
 
     The one who looks holds the lease until the kernel says that somebody is breaking it: the reader is in
-    the middle of its open then.  In the usual directory, as clients open there.
+    the middle of its open then.  In the usual directory, and in another.
     """
-    directory = ShmDirectory()
+    directory = ShmDirectory(shm.path) if elsewhere else ShmDirectory()
     columns: dict[str, NDArray[Any]] = {"xyz": np.zeros((9, 3), np.float32)}
     name, _ = publish_segment(directory, columns, block=PublishBlock(7, 8), instance=f"unit-{os.getpid()}")
     fd = directory.open(name)
     met: list[int] = []
     try:
         with subprocess.Popen(
-            [sys.executable, "-c", _READER, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", _READER, name, directory.path],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         ) as reader:
             assert reader.stdin is not None
             assert reader.stdout is not None
