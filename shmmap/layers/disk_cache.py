@@ -96,7 +96,7 @@ class LayerCache:
             status = os.fstat(fd)
             if status.st_uid in (0, os.geteuid()) and not status.st_mode & 0o022:
                 header = _read_header(fd, status.st_size)
-                if header.layer == str(key.spec) and header.builder_version == key.spec.builder_version:
+                if _is_of(header, key):
                     if time.time() - status.st_mtime > _TOUCH_AGE_S:
                         with contextlib.suppress(OSError):
                             os.utime(fd)
@@ -260,6 +260,12 @@ class LayerCache:
                 self._remove(path)
             total -= size
         return total
+
+
+def _is_of(header: SegmentHeader, key: CacheKey) -> bool:
+    """Whether an entry is what its name says; a cell's id may differ: a copied map's entries are used."""
+    same_layer = header.layer == str(key.spec) and header.builder_version == key.spec.builder_version
+    return same_layer and header.box == key.box
 
 
 def _read_header(fd: int, available: int) -> SegmentHeader:

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EntryCollector", "MapMetadata"]
+__all__ = ["MOST_NAME_BYTES", "EntryCollector", "MapMetadata", "shortened"]
 
 # yaml-cpp reads integers as C++ streams do: a leading 0x is hexadecimal, a leading 0 octal
 _INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)")
@@ -31,10 +31,16 @@ _INT32 = range(-(2**31), 2**31)
 _RESOLUTIONS = (b"x_resolution", b"y_resolution")
 _FLUSH_ENTRIES = 1 << 14
 _NAMED_IN_PROBLEMS = 3
+_MOST_DIGITS = 64
+MOST_NAME_BYTES = 255
+"""What a file system takes; the table of names has room for the longest in each row."""
+_SHOWN = 80
 
 
 def _read_corner(text: str, *, strict: bool) -> float | None:
     """Value of one corner coordinate in metres, or None if these rules do not take it."""
+    if len(text) > _MOST_DIGITS:
+        return None
     if _INTEGER.fullmatch(text):
         digits = text.lstrip("+-")
         base = 16 if digits[:2] in ("0x", "0X") else 8 if digits.startswith("0") else 10
@@ -95,7 +101,7 @@ class EntryCollector:
 
     def entry(self, key: bytes, x: str, y: str) -> bool:
         """Take ``key: [x, y]``."""
-        if key in _RESOLUTIONS:
+        if key in _RESOLUTIONS or len(key) > MOST_NAME_BYTES:
             return False
         corner_x, corner_y = _read_corner(x, strict=self.strict), _read_corner(y, strict=self.strict)
         if corner_x is None or corner_y is None:
@@ -119,7 +125,7 @@ class EntryCollector:
 
     def report(self, what: str, key: bytes) -> None:
         """Note an oddity of the entry ``key``."""
-        self._oddities.setdefault(what, []).append(key.decode("utf-8", "replace"))
+        self._oddities.setdefault(what, []).append(shortened(key.decode("utf-8", "replace")))
 
     def metadata(self) -> MapMetadata | None:
         """Everything taken, or None while a resolution is missing.  A repeated key: the last one counts."""
@@ -148,6 +154,11 @@ class EntryCollector:
             self._name_blocks.append(np.array(self._names, dtype=np.bytes_))
             self._corner_blocks.append(np.array(self._corners, dtype=np.float64))
             self._names, self._corners = [], []
+
+
+def shortened(text: str) -> str:
+    """Return a text from a file as far as a message needs it."""
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}... ({len(text):,} characters)"
 
 
 def list_some(names: list[str]) -> str:

@@ -14,7 +14,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.origin.metadata_entries import EntryCollector
+from shmmap.origin.metadata_entries import MOST_NAME_BYTES, EntryCollector
 
 __all__ = ["collect_lines"]
 
@@ -93,6 +93,8 @@ def _collect_exact(block: bytes, entries: EntryCollector) -> bool:
         return False
     x, y = _integers(text, opens + 1, commas), _integers(text, commas + 2, closes)
     if x is None or y is None:
+        return False
+    if int((colons - starts).max(initial=0)) > MOST_NAME_BYTES:
         return False
     return entries.block(_gather_names(text, starts, colons), np.column_stack((x, y)))
 

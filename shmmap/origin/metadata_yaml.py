@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from shmmap.errors import MapDataError, MapMissing
-from shmmap.origin.metadata_entries import EntryCollector, MapMetadata
+from shmmap.origin.metadata_entries import MOST_NAME_BYTES, EntryCollector, MapMetadata, shortened
 from shmmap.origin.metadata_lines import collect_lines
 
 __all__ = ["parse_metadata", "read_metadata"]
@@ -109,12 +109,14 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
 
 
 def _take(entries: EntryCollector, key: str, value: list[str] | str | None, refuse: Any, mark: Any) -> None:
-    name = key.encode()
+    name, key = key.encode(), shortened(key)
     if isinstance(value, str):
         if entries.scalar(name, value):
             return
         if key in ("x_resolution", "y_resolution"):
-            raise refuse(f"{key} must be a positive number of metres, not {value!r}", mark, "no_resolution")
+            raise refuse(
+                f"{key} must be a positive number of metres, not {shortened(value)!r}", mark, "no_resolution"
+            )
         raise refuse(f"{key} is not an [x, y] corner", mark, "unknown_key")
     if value is None:
         if entries.strict:
@@ -126,9 +128,13 @@ def _take(entries: EntryCollector, key: str, value: list[str] | str | None, refu
     if len(value) > 2:
         entries.report("values after x and y ignored", name)
     if not entries.entry(name, value[0], value[1]):
+        if len(name) > MOST_NAME_BYTES:
+            raise refuse(f"{key}: no file has so long a name", mark, "bad_corner")
         kind = "integers" if entries.strict else "numbers"
         raise refuse(
-            f"{key}: the corner must be two {kind}, not [{', '.join(value[:2])}]", mark, "bad_corner"
+            f"{key}: the corner must be two {kind}, not [{', '.join(map(shortened, value[:2]))}]",
+            mark,
+            "bad_corner",
         )
 
 

@@ -14,6 +14,7 @@ from typing import Final
 from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.geometry import Area
+from shmmap.logfmt import escaped
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
@@ -127,7 +128,7 @@ def command_of(pid: int) -> str:
     if pid <= 0:
         return ""
     with contextlib.suppress(OSError):
-        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+        return escaped(Path(f"/proc/{pid}/comm").read_text(errors="replace").strip())
     return ""
 
 
@@ -187,7 +188,7 @@ class Sessions:
             slot = secrets.randbelow(MAX_SLOT) + 1
         pid = connection.peer.pid
         session = Session(
-            slot, connection, client[:64], command_of(pid), last_request_s=now_s, asker=pid or -slot
+            slot, connection, escaped(client)[:64], command_of(pid), last_request_s=now_s, asker=pid or -slot
         )
         connection.session = session
         self._by_slot[slot] = session

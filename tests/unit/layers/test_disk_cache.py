@@ -137,6 +137,21 @@ def test_what_others_could_have_written_is_not_used(one: Bench) -> None:
     assert not one.cache.has(one.key(layer))
 
 
+def test_another_cell_s_entry_in_its_place_is_not_used(one: Bench) -> None:
+    """All its checksums are right."""
+    layer = LAYERS[1]
+    _, true = one.make(layer)
+    there = replace(one.job, box=(20.0, 0.0, 40.0, 20.0))
+    one.make(layer, there)
+    key, other = one.key(layer), cache_key(parse_layer(layer), there)
+    assert other is not None
+    shutil.copyfile(one.cache._state_path(other.state_name()), one.cache._state_path(key.state_name()))
+    assert not one.cache.has(key)
+    made, data = one.make(layer)
+    assert not made.cached
+    assert data == true
+
+
 @pytest.mark.root
 def test_a_stranger_s_file_is_not_used(one: Bench) -> None:
     one.make(LAYERS[1])

@@ -178,6 +178,12 @@ def test_the_last_of_repeated_entries_counts() -> None:
         (HEAD + "a.pcd: [1e999, 2]\n", "two numbers", "bad_corner"),
         (HEAD + "a.pcd: [1_0, 2]\n", "two numbers", "bad_corner"),
         (HEAD + "a.pcd: [089, 2]\n", "", ""),
+        (HEAD + f"a.pcd: [{'9' * 10_000}, 2]\n", "two numbers, not .9999.*10,000 characters", "bad_corner"),
+        (
+            HEAD + f"{'a' * 10_000}.pcd: [1, 2]\n",
+            "line 3: aaa.*10,004 characters.*so long a name",
+            "bad_corner",
+        ),
         (HEAD + "a.pcd: [1, 2\nb.pcd: [3, 4]\n", "line 4: no YAML", "bad_yaml"),
         (HEAD + "a.pcd: [1, 2]]\n", "no YAML", "bad_yaml"),
         (HEAD + "a.pcd: *b\n", "line 3: aliases", "bad_yaml"),
@@ -197,6 +203,12 @@ def test_refusals_name_file_line_and_cause(text: str, message: str, cause: str) 
     assert caught.value.cause == cause
     assert caught.value.path == "some/m.yaml"
     assert str(caught.value).startswith("some/m.yaml: ")
+
+
+def test_a_problem_is_short_however_long_the_key() -> None:
+    (problem,) = read(HEAD + "k" * 100_000 + ": 1\na.pcd: [1, 2]\n").problems
+    assert problem.startswith("unknown key ignored: kkk")
+    assert len(problem) < 200
 
 
 def test_bytes_that_are_no_text() -> None:

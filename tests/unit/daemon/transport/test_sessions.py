@@ -92,6 +92,10 @@ def test_a_session_and_its_connections() -> None:
     sessions.close(session)  # twice does no harm
 
 
+def test_a_client_s_name_cannot_move_a_terminal_s_cursor() -> None:
+    assert Sessions().open(connections.of(), "a\x1b[2Jb\n", 0.0).client == "a\\x1b[2Jb\\n"
+
+
 def test_a_slot_is_kept_or_new() -> None:
     sessions = Sessions()
     kept = sessions.open(connections.of(), "", 0.0, slot=1234)
