@@ -30,6 +30,7 @@ Points: TypeAlias = NDArray[Any]
 
 _PATIENCE_S: Final = 30.0
 _COUNTED_METRES: Final = 20.0  # around the vehicle: the points that a control loop reads
+_UPDATE_METRES: Final = 20.0  # how far a vehicle drives before it wants other cells, as in Autoware
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,9 @@ class SharedMap:
         import shmmap
 
         self.clouds: dict[str, Cloud] = {}
-        self._window = shmmap.MapWindow(endpoint, radius, update_distance=0.0, name="demo consumer")
+        self._window = shmmap.MapWindow(
+            endpoint, radius, update_distance=_UPDATE_METRES, name="demo consumer"
+        )
 
     def follow(self, pose: Pose) -> None:
         """Tell the window where the vehicle is; its thread does the rest."""
@@ -148,11 +151,16 @@ class PrivateMap:
         self._new: list[Cloud] = []
         self._catalogue = open_map(map_path).load()
         self._radius = radius
+        self._asked: Pose | None = None
 
     def follow(self, pose: Pose) -> None:
-        """Drop what is out of reach, read what is new."""
+        """Drop what is out of reach and read what is new, where the vehicle has come far enough for that."""
         from shmmap.formats.cloud import read_pcd
 
+        asked = self._asked
+        if asked is not None and math.hypot(pose.x - asked.x, pose.y - asked.y) < _UPDATE_METRES:
+            return
+        self._asked = pose
         before, self.clouds = self.clouds, {}
         for index in self._catalogue.query(Circle(pose.x, pose.y, self._radius)).tolist():
             cell_id = self._catalogue.id(index)

@@ -18,7 +18,7 @@ from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
 from shmmap.cli.screens.demo_progress import QuietProgress
-from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from tests.support.daemon_process import ROOT, DaemonProcess, processes_marked, wait_ended
 from tests.support.patience import Patience
@@ -106,7 +106,7 @@ def test_the_full_demonstration(tmp_path: Path) -> None:
 
 INTERRUPTED = """
 from shmmap.cli.screens.demo_progress import PlainProgress
-from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.processes.interrupts import signals_interrupt
 

@@ -15,12 +15,13 @@ from shmmap.cli.screens.demo_report import print_report
 from shmmap.demo.consumer import Pose
 from shmmap.demo.demo import DemoResult, Round
 from shmmap.demo.demo_town import DemoSettings, TownMap
-from shmmap.demo.drive import DriveResult, Traffic
+from shmmap.demo.drive import DriveResult
 from shmmap.demo.fleet import StepReport
 from shmmap.demo.localization import LocalizationResult
 from shmmap.demo.outage import OutageResult
 from shmmap.demo.process_memory import ProcessMemory
 from shmmap.demo.three_programs import ThreeProgramsResult
+from shmmap.demo.watched_daemon import Traffic
 
 MIB = 1 << 20
 REPORT = StepReport("road at 1.23 m", 1e-4, 4e-3, 2, 9, 105, 7, 8, True, 0, 0.1)
@@ -41,7 +42,7 @@ def result() -> DemoResult:
         8: Round(replace(drive(8, 220, 140), follow_max_s=0.002, cpu_s=6.0), drive(8, 920, 0)),
     }
     outage = OutageResult(8, 1.7, 17, (1_500_000,) * 8, 0.001, 0.104, 0.1, 0.3, 144, 143)
-    found = LocalizationResult(41, 41, 0.0094, 0.0142, 0.008, 117, 1.5, {})
+    found = LocalizationResult(41, 41, 0.0094, 0.0142, 0.008, 2.9, 117, 1.5, {})
     return DemoResult(DemoSettings(), town, rounds, outage, Traffic(1, 2, 3, 4), [], localization=found)
 
 
