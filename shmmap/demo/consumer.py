@@ -192,8 +192,11 @@ def _near(clouds: Iterable[Cloud], pose: Pose, radius: float) -> Points:
     parts = [np.empty((0, 3), dtype=np.float32)]
     for cloud, distance in zip(chosen, distances.tolist(), strict=True):
         if distance <= radius:
-            dx, dy = cloud.xyz[:, 0] - np.float32(pose.x), cloud.xyz[:, 1] - np.float32(pose.y)
-            parts.append(cloud.xyz[dx * dx + dy * dy <= radius * radius])
+            squared, dy = cloud.xyz[:, 0] - np.float32(pose.x), cloud.xyz[:, 1] - np.float32(pose.y)
+            squared *= squared
+            dy *= dy
+            squared += dy
+            parts.append(cloud.xyz.compress(squared <= radius * radius, axis=0))
     return np.concatenate(parts)
 
 

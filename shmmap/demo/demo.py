@@ -145,15 +145,13 @@ def run_demo(
         show = _Show(settings, town, options, progress)
         rounds = {count: Round(*show.compare(count)) for count in settings.counts if count != many}
         private = show.private(many)
-        with (
-            DaemonProcess(town.path, *options) as daemon,
-            Fleet("shared", daemon.endpoint, settings.radius, many) as fleet,
-        ):
+        with DaemonProcess(town.path, *options) as daemon:
             watched = WatchedDaemon(daemon)
-            rounds[many] = Round(show.shared(fleet, watched), private)
-            traffic, resident = watched.traffic(), statistics_now(daemon).cells
-            progress.stage(f"Killing the daemon while {many} processes keep driving", len(town.onward))
-            outage = drive_through_outage(fleet, daemon, town.onward, progress)
+            with Fleet("shared", daemon.endpoint, settings.radius, many) as fleet:
+                rounds[many] = Round(show.shared(fleet, watched), private)
+                traffic, resident = watched.traffic(), statistics_now(daemon).cells
+                progress.stage(f"Killing the daemon while {many} processes keep driving", len(town.onward))
+                outage = drive_through_outage(fleet, daemon, town.onward, progress)
         result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
         if localization is None:
             with DaemonProcess(town.path, *options) as daemon:
@@ -176,11 +174,10 @@ class _Show:
     def compare(self, count: int) -> tuple[DriveResult, DriveResult]:
         """Drive with a copy each, then on a daemon of their own; returns shared, private."""
         private = self.private(count)
-        with (
-            DaemonProcess(self._town.path, *self._options) as daemon,
-            Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet,
-        ):
-            return self.shared(fleet, WatchedDaemon(daemon)), private
+        with DaemonProcess(self._town.path, *self._options) as daemon:
+            watched = WatchedDaemon(daemon)
+            with Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet:
+                return self.shared(fleet, watched), private
 
     def private(self, count: int) -> DriveResult:
         """Drive with a copy each."""

@@ -45,6 +45,8 @@ class DriveResult:
         Columns that all consumers got in the drive, summed.
     cpu_s
         Processor time of all processes since they were started, user and system.
+    daemon_start_cpu_s
+        The part of it that the daemon used before there was a client; 0 without a daemon.
     memory
         Of all processes at the end, as the kernel counts it.
     shm_bytes
@@ -65,6 +67,7 @@ class DriveResult:
     warm_complete_s: float
     handed_bytes: int
     cpu_s: float
+    daemon_start_cpu_s: float
     memory: ProcessMemory
     shm_bytes: int
 
@@ -122,6 +125,7 @@ def drive(
         warm_complete_s=_median([report.complete_s for report in warm]),
         handed_bytes=handed_bytes,
         cpu_s=cpu_seconds(pids),
+        daemon_start_cpu_s=daemon.start_cpu_s if daemon else 0.0,
         memory=sum_memory(pids),
         shm_bytes=daemon.process.shm_bytes() if daemon else 0,
     )

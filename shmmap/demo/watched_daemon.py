@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+from shmmap.demo.process_cpu import cpu_seconds
 from shmmap.demo.process_memory import descendants
 from shmmap.statistics.reader import Snapshot, read_statistics
 from shmmap.testing.daemon_process import DaemonProcess
@@ -31,11 +32,18 @@ class Traffic:
 
 
 class WatchedDaemon:
-    """A daemon from now on."""
+    """A daemon from now on.
+
+    Attributes
+    ----------
+    start_cpu_s
+        Processor time that it and its workers have used so far, seconds.
+    """
 
     def __init__(self, process: DaemonProcess) -> None:
         self.process = process
         self._first = statistics_now(process).counters
+        self.start_cpu_s = cpu_seconds(self.pids())
 
     @property
     def counters(self) -> dict[str, int]:

@@ -122,7 +122,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_as_json(result, str(picture), duration_s))
     else:
-        print_report(result, str(picture), duration_s)
+        near = os.path.relpath(picture)
+        print_report(result, str(picture) if near.startswith("..") else near, duration_s)
         if args.keep_map:
             print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
     return 0 if _complete(result) else 1
