@@ -123,7 +123,7 @@ def _one_more(result: DemoResult) -> str:
 def _waiting(result: DemoResult) -> str:
     shared, private = result.many.shared, result.many.private
     return (
-        f"new cells stop a loop for up to {format_duration(private.follow_max_s)}; with shmmap:"
+        f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; with shmmap:"
         f" {format_duration(shared.follow_max_s)}"
     )
 
@@ -132,9 +132,8 @@ def _cpu(result: DemoResult) -> str:
     count = max(result.rounds)
     last = result.rounds[count]
     return (
-        f"{count} copies: {format_duration(last.private.cpu_s)}; with shmmap:"
-        f" {format_duration(last.shared.cpu_s)}, the daemon's start"
-        f" {format_duration(last.shared.daemon_start_cpu_s)}"
+        f"{count} copies: {format_duration(last.private.cpu_s)}; shmmap: {format_duration(last.shared.cpu_s)},"
+        f" {format_duration(last.shared.daemon_start_cpu_s)} of it to start the daemon"
     )
 
 
