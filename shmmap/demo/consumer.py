@@ -206,15 +206,16 @@ def _ground_height(clouds: dict[str, Cloud], pose: Pose) -> str:
 
 
 def _free_road(clouds: dict[str, Cloud], pose: Pose) -> str:
-    reach = 25.0
+    reach, half_width = 25.0, 1.2
     near = _near(clouds.values(), pose, reach)
-    dx, dy = near[:, 0] - pose.x, near[:, 1] - pose.y
-    ahead = dx * math.cos(pose.heading) + dy * math.sin(pose.heading)
-    aside = dy * math.cos(pose.heading) - dx * math.sin(pose.heading)
-    lane = (ahead > 0.0) & (np.abs(aside) < 1.2)
-    road = near[lane & (ahead < 3.0), 2]
+    aside = near[:, 1] - np.float32(pose.y)
+    aside *= math.cos(pose.heading)
+    aside -= (near[:, 0] - np.float32(pose.x)) * np.float32(math.sin(pose.heading))
+    strip = near.compress(np.abs(aside, out=aside) < half_width, axis=0)
+    ahead = (strip[:, 0] - pose.x) * math.cos(pose.heading) + (strip[:, 1] - pose.y) * math.sin(pose.heading)
+    road = strip[(ahead > 0.0) & (ahead < 3.0), 2]
     ground = float(np.median(road)) if len(road) else 0.0
-    raised = lane & (near[:, 2] > ground + 1.0) & (near[:, 2] < ground + 2.5)
+    raised = (ahead > 0.0) & (strip[:, 2] > ground + 1.0) & (strip[:, 2] < ground + 2.5)
     return f"road free for {ahead[raised].min(initial=reach):.0f} m"
 
 

@@ -123,7 +123,7 @@ def _one_more(result: DemoResult) -> str:
 def _waiting(result: DemoResult) -> str:
     shared, private = result.many.shared, result.many.private
     return (
-        f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; with shmmap:"
+        f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; shmmap:"
         f" {format_duration(shared.follow_max_s)}"
     )
 
@@ -132,15 +132,15 @@ def _cpu(result: DemoResult) -> str:
     count = max(result.rounds)
     last = result.rounds[count]
     return (
-        f"{count} copies: {format_duration(last.private.cpu_s)}; shmmap: {format_duration(last.shared.cpu_s)},"
-        f" {format_duration(last.shared.daemon_start_cpu_s)} of it to start the daemon"
+        f"{count} copies: {format_duration(last.private.cpu_s)}; shmmap:"
+        f" {format_duration(last.shared.cpu_s)}, {format_duration(last.shared.daemon_start_cpu_s)} of it to start the daemon"
     )
 
 
 def _outage(result: DemoResult) -> str:
     out = result.outage
     return (
-        f"{format_duration(out.down_s)} without a daemon: {out.consumers} processes read on, no pause over"
+        f"{format_duration(out.down_s)} without daemon: {out.consumers} processes read on, no pause over"
         f" {format_duration(out.longest_pause_s)}"
     )
 

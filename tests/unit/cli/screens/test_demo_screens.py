@@ -63,10 +63,10 @@ def test_lines_with_what_was_measured(capsys: pytest.CaptureFixture[str]) -> Non
     assert lines["memory"] == "8 processes, a private copy each: 920 MiB; with shmmap: 360 MiB"
     # (920 - 115) / 7 and (360 - 220) / 7
     assert lines["one more"] == "each further process: 115 MiB with a copy, 20.0 MiB with shmmap"
-    assert "up to 78.0 ms for new cells; with shmmap: 2.0 ms" in lines["waiting"]
+    assert "up to 78.0 ms for new cells; shmmap: 2.0 ms" in lines["waiting"]
     assert lines["CPU"] == "8 copies: 4.1 s; shmmap: 6.0 s, 600.0 ms of it to start the daemon"
     assert "117 cells: 1.5 s" in lines["layers"]
-    assert lines["kill -9"] == "1.7 s without a daemon: 8 processes read on, no pause over 104.0 ms"
+    assert lines["kill -9"] == "1.7 s without daemon: 8 processes read on, no pause over 104.0 ms"
     assert "143 of 144" in lines["restart"]
     assert lines["position"] == "41 LiDAR scans localized: 0.9 cm off on average, 1.4 cm at most"
     assert "2.9 s after starting" in lines["start"]
