@@ -133,7 +133,8 @@ def _cpu(result: DemoResult) -> str:
     last = result.rounds[count]
     return (
         f"{count} copies: {format_duration(last.private.cpu_s)}; shmmap:"
-        f" {format_duration(last.shared.cpu_s)}, {format_duration(last.shared.daemon_start_cpu_s)} of it to start the daemon"
+        f" {format_duration(last.shared.cpu_s)}, {format_duration(last.shared.daemon_start_cpu_s)} of it"
+        " to start the daemon"
     )
 
 
