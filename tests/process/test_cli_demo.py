@@ -178,9 +178,9 @@ def test_without_numba_the_demo_says_what_is_left_out(
     print_report(result, "town.svg", 1.0)
     lines = [line for line in capsys.readouterr().out.splitlines() if line[:1].islower() or line[:3] == "CPU"]
     assert [line.split("  ")[0] for line in lines] == [
-        "town", "memory", "one more", "waiting", "CPU", "kill -9", "restart", "position", "duration",
+        "town", "memory", "one more", "waiting", "CPU", "kill -9", "position", "duration",
     ]  # fmt: skip
-    assert "the package numba is not installed" in lines[7]
+    assert "the package numba is not installed" in lines[6]
 
 
 def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Path) -> None:

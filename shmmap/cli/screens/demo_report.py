@@ -68,7 +68,6 @@ def _lines(result: DemoResult) -> list[tuple[str, str]]:
         ("waiting", _waiting(result)),
         ("CPU", _cpu(result)),
         ("kill -9", _outage(result)),
-        ("restart", _restart(result)),
     ]
     if result.programs is not None:
         document = result.programs.document
@@ -81,7 +80,7 @@ def _lines(result: DemoResult) -> list[tuple[str, str]]:
     found = result.localization
     if found is None:
         return [*lines, ("position", f"left out: the package {result.missing} is not installed")]
-    return [*lines, ("position", _position(found)), ("start", _start(found)), ("layers", _layers(found))]
+    return [*lines, ("position", _position(found))]
 
 
 def _town(result: DemoResult) -> str:
@@ -141,31 +140,15 @@ def _cpu(result: DemoResult) -> str:
 def _outage(result: DemoResult) -> str:
     out = result.outage
     return (
-        f"{format_duration(out.down_s)} without daemon: {out.consumers} processes read on, no pause over"
-        f" {format_duration(out.longest_pause_s)}"
+        f"back in {format_duration(out.down_s)} with {out.adopted} of {out.segments} cells;"
+        f" no process paused over {format_duration(out.longest_pause_s)}"
     )
-
-
-def _restart(result: DemoResult) -> str:
-    out = result.outage
-    return f"the next daemon took over {out.adopted} of {out.segments} cells in shared memory"
 
 
 def _position(found: LocalizationResult) -> str:
     return (
-        f"{found.scans} LiDAR scans localized: {_cm(found.error_m)} off on average,"
-        f" {_cm(found.error_max_m)} at most"
-    )
-
-
-def _start(found: LocalizationResult) -> str:
-    return f"first pose {format_duration(found.first_pose_s)} after starting daemon and localization"
-
-
-def _layers(found: LocalizationResult) -> str:
-    return (
-        f"NDT voxels of {found.layers} cells: {format_duration(found.layers_cpu_s)} of CPU, once for all"
-        " programs"
+        f"{found.scans} LiDAR scans: {_cm(found.error_m)} off, {_cm(found.error_max_m)} at most;"
+        f" first pose after {format_duration(found.first_pose_s)}"
     )
 
 
