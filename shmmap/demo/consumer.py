@@ -30,6 +30,7 @@ Points: TypeAlias = NDArray[Any]
 
 _PATIENCE_S: Final = 30.0
 _COUNTED_METRES: Final = 20.0  # around the vehicle: the points that a control loop reads
+_UPDATE_METRES: Final = 20.0  # how far a vehicle drives before it wants other cells, as in Autoware
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,9 @@ class SharedMap:
         import shmmap
 
         self.clouds: dict[str, Cloud] = {}
-        self._window = shmmap.MapWindow(endpoint, radius, update_distance=0.0, name="demo consumer")
+        self._window = shmmap.MapWindow(
+            endpoint, radius, update_distance=_UPDATE_METRES, name="demo consumer"
+        )
 
     def follow(self, pose: Pose) -> None:
         """Tell the window where the vehicle is; its thread does the rest."""
@@ -148,11 +151,16 @@ class PrivateMap:
         self._new: list[Cloud] = []
         self._catalogue = open_map(map_path).load()
         self._radius = radius
+        self._asked: Pose | None = None
 
     def follow(self, pose: Pose) -> None:
-        """Drop what is out of reach, read what is new."""
+        """Drop what is out of reach and read what is new, where the vehicle has come far enough for that."""
         from shmmap.formats.cloud import read_pcd
 
+        asked = self._asked
+        if asked is not None and math.hypot(pose.x - asked.x, pose.y - asked.y) < _UPDATE_METRES:
+            return
+        self._asked = pose
         before, self.clouds = self.clouds, {}
         for index in self._catalogue.query(Circle(pose.x, pose.y, self._radius)).tolist():
             cell_id = self._catalogue.id(index)
@@ -184,8 +192,11 @@ def _near(clouds: Iterable[Cloud], pose: Pose, radius: float) -> Points:
     parts = [np.empty((0, 3), dtype=np.float32)]
     for cloud, distance in zip(chosen, distances.tolist(), strict=True):
         if distance <= radius:
-            dx, dy = cloud.xyz[:, 0] - np.float32(pose.x), cloud.xyz[:, 1] - np.float32(pose.y)
-            parts.append(cloud.xyz[dx * dx + dy * dy <= radius * radius])
+            squared, dy = cloud.xyz[:, 0] - np.float32(pose.x), cloud.xyz[:, 1] - np.float32(pose.y)
+            squared *= squared
+            dy *= dy
+            squared += dy
+            parts.append(cloud.xyz.compress(squared <= radius * radius, axis=0))
     return np.concatenate(parts)
 
 
@@ -195,15 +206,16 @@ def _ground_height(clouds: dict[str, Cloud], pose: Pose) -> str:
 
 
 def _free_road(clouds: dict[str, Cloud], pose: Pose) -> str:
-    reach = 25.0
+    reach, half_width = 25.0, 1.2
     near = _near(clouds.values(), pose, reach)
-    dx, dy = near[:, 0] - pose.x, near[:, 1] - pose.y
-    ahead = dx * math.cos(pose.heading) + dy * math.sin(pose.heading)
-    aside = dy * math.cos(pose.heading) - dx * math.sin(pose.heading)
-    lane = (ahead > 0.0) & (np.abs(aside) < 1.2)
-    road = near[lane & (ahead < 3.0), 2]
+    aside = near[:, 1] - np.float32(pose.y)
+    aside *= math.cos(pose.heading)
+    aside -= (near[:, 0] - np.float32(pose.x)) * np.float32(math.sin(pose.heading))
+    strip = near.compress(np.abs(aside, out=aside) < half_width, axis=0)
+    ahead = (strip[:, 0] - pose.x) * math.cos(pose.heading) + (strip[:, 1] - pose.y) * math.sin(pose.heading)
+    road = strip[(ahead > 0.0) & (ahead < 3.0), 2]
     ground = float(np.median(road)) if len(road) else 0.0
-    raised = lane & (near[:, 2] > ground + 1.0) & (near[:, 2] < ground + 2.5)
+    raised = (ahead > 0.0) & (strip[:, 2] > ground + 1.0) & (strip[:, 2] < ground + 2.5)
     return f"road free for {ahead[raised].min(initial=reach):.0f} m"
 
 

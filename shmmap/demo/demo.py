@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shmmap.client import connect
 from shmmap.demo.demo_town import (
     DemoSettings,
     Progress,
@@ -25,26 +23,21 @@ from shmmap.demo.demo_town import (
     free_bytes,
     free_memory_bytes,
 )
-from shmmap.demo.drive import DriveResult, Traffic, WatchedDaemon, drive
+from shmmap.demo.drive import DriveResult, drive
 from shmmap.demo.fleet import Fleet
 from shmmap.demo.localization import Localization, LocalizationResult
 from shmmap.demo.outage import OutageResult, drive_through_outage
 from shmmap.demo.three_programs import ThreeProgramsResult, run_three_programs
+from shmmap.demo.watched_daemon import Traffic, WatchedDaemon, statistics_now
 from shmmap.processes.interrupts import scratch_directory
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.statistics.cell_rows import CellRow
-from shmmap.statistics.reader import read_statistics
 from shmmap.testing.daemon_process import DaemonProcess
 
-__all__ = ["COUNTS", "FULL_COUNTS", "MANY", "DemoResult", "Round", "run_demo"]
+__all__ = ["FULL_COUNTS", "DemoResult", "Round", "run_demo"]
 
-MANY: Final = 8
-"""Processes that keep driving while there is no daemon."""
-
-COUNTS: Final = (1, MANY)
-"""Processes that drive together, one drive after the other."""
-
-FULL_COUNTS: Final = (1, 2, 4, MANY, 16)
+FULL_COUNTS: Final = (1, 2, 4, 8, 16)
+"""Processes that drive together in a full demonstration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +57,9 @@ class DemoResult:
     rounds
         By how many processes drove.
     outage
-        Of the daemon, with `MANY` processes.
+        Of the daemon, with ``settings.many`` processes.
     traffic, resident
-        Messages of the shared drive of `MANY` processes, and the cells in shared memory at its end.
+        Messages of the shared drive of that many processes, and the cells in shared memory at its end.
     localization
         None where a package is missing, see ``missing``; in a full demonstration ``programs`` holds it.
     missing
@@ -87,8 +80,8 @@ class DemoResult:
 
     @property
     def many(self) -> Round:
-        """The drives of `MANY` processes."""
-        return self.rounds[MANY]
+        """The drives of ``settings.many`` processes."""
+        return self.rounds[self.settings.many]
 
     @property
     def one_more_bytes(self) -> tuple[float, float]:
@@ -109,7 +102,6 @@ def run_demo(
     progress: Progress,
     *,
     map_dir: str | None = None,
-    counts: Sequence[int] = COUNTS,
     full: bool = False,
 ) -> DemoResult:
     """Build, drive, measure, clean up.
@@ -118,8 +110,6 @@ def run_demo(
     ----------
     map_dir
         Where the map is built and stays; by default in a temporary directory that is removed.
-    counts
-        How many processes drive together; one of them is `MANY`.
     full
         Whether three programs drive in the end, and not just the localization.
 
@@ -132,6 +122,7 @@ def run_demo(
     InternalError
         A process failed.
     """
+    many = settings.many
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
         map_dir = os.path.abspath(map_dir or scratch / "map")
@@ -142,7 +133,7 @@ def run_demo(
             shm_bytes=free_bytes(DEFAULT_SHM_DIR),
             disk_bytes=free_bytes(str(parent)),
             memory_bytes=free_memory_bytes(),
-            copies=max(counts),
+            copies=max(settings.counts),
         )
         options = ["--budget", str(budget_bytes), "--workers", "2", "--cache-dir", str(scratch / "cache")]
         localization = None if full else stack.enter_context(Localization(settings, scratch))
@@ -152,25 +143,23 @@ def run_demo(
             localization.wait_prepared()
             progress.step()
         show = _Show(settings, town, options, progress)
-        rounds = {count: Round(*show.compare(count)) for count in counts if count != MANY}
-        private = show.private(MANY)
-        with (
-            DaemonProcess(town.path, *options) as daemon,
-            connect(daemon.endpoint, name="demo") as client,
-        ):
-            with Fleet("shared", daemon.endpoint, settings.radius, MANY) as fleet:
-                watched = WatchedDaemon(daemon, client)
-                rounds[MANY] = Round(show.shared(fleet, watched), private)
-                traffic, resident = watched.traffic(), _resident_now(daemon)
-                progress.stage(f"Killing the daemon while {MANY} processes keep driving", len(town.onward))
-                outage = drive_through_outage(fleet, daemon, client, town.onward, progress)
-            result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
-            if localization is None:
+        rounds = {count: Round(*show.compare(count)) for count in settings.counts if count != many}
+        private = show.private(many)
+        with DaemonProcess(town.path, *options) as daemon:
+            watched = WatchedDaemon(daemon)
+            with Fleet("shared", daemon.endpoint, settings.radius, many) as fleet:
+                rounds[many] = Round(show.shared(fleet, watched), private)
+                traffic, resident = watched.traffic(), statistics_now(daemon).cells
+                progress.stage(f"Killing the daemon while {many} processes keep driving", len(town.onward))
+                outage = drive_through_outage(fleet, daemon, town.onward, progress)
+        result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
+        if localization is None:
+            with DaemonProcess(town.path, *options) as daemon:
                 result.programs = run_three_programs(settings, daemon, scratch, progress)
-            elif localization.missing:
-                result.missing = localization.missing
-            else:
-                result.localization = localization.run(watched, progress)
+        elif localization.missing:
+            result.missing = localization.missing
+        else:
+            result.localization = localization.run(town.path, options, progress)
         return result
 
 
@@ -185,12 +174,10 @@ class _Show:
     def compare(self, count: int) -> tuple[DriveResult, DriveResult]:
         """Drive with a copy each, then on a daemon of their own; returns shared, private."""
         private = self.private(count)
-        with (
-            DaemonProcess(self._town.path, *self._options) as daemon,
-            connect(daemon.endpoint, name="demo") as client,
-            Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet,
-        ):
-            return self.shared(fleet, WatchedDaemon(daemon, client)), private
+        with DaemonProcess(self._town.path, *self._options) as daemon:
+            watched = WatchedDaemon(daemon)
+            with Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet:
+                return self.shared(fleet, watched), private
 
     def private(self, count: int) -> DriveResult:
         """Drive with a copy each."""
@@ -211,13 +198,3 @@ class _Show:
 
 def _processes(count: int) -> str:
     return f"{count} process" + ("es" if count > 1 else "")
-
-
-def _resident_now(daemon: DaemonProcess) -> list[CellRow]:
-    """Read the table of resident cells as it is now or later: the daemon writes it four times a second."""
-    asked_s = time.monotonic()
-    while True:
-        found = read_statistics(daemon.instance, daemon.shm_dir)
-        if found.beat_age_s < time.monotonic() - asked_s or found.state != "healthy":
-            return found.cells
-        time.sleep(0.02)

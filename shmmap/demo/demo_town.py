@@ -49,10 +49,14 @@ class DemoSettings:
         Of the drive that is measured, metres.
     onward
         How far it continues after that, a metre at a time: the drive without a daemon.
-    scanned
-        Length of the drive with three programs, metres.
+    localized, scanned
+        Length of the drives of the localization alone, and of three programs, metres.
     pace_s
         Least time per step.
+    counts
+        How many processes drive together, one drive after the other.
+    many
+        One of the counts: these also drive while there is no daemon.
     seed
         Which town.
     """
@@ -63,8 +67,11 @@ class DemoSettings:
     length: float = 250.0
     step: float = 5.0
     onward: int = 50
+    localized: float = 80.0
     scanned: float = 160.0
     pace_s: float = 0.04
+    counts: tuple[int, ...] = (1, 8)
+    many: int = 8
     seed: int = 4
 
 

@@ -9,17 +9,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from shmmap.client import Client
 from shmmap.demo.consumer import Pose
 from shmmap.demo.demo_town import Progress
 from shmmap.demo.fleet import Fleet, StepReport
 from shmmap.demo.process_cpu import cpu_seconds
-from shmmap.demo.process_memory import ProcessMemory, descendants, sum_memory
-from shmmap.protocol.codec import encode
-from shmmap.protocol.messages import Stats
-from shmmap.testing.daemon_process import DaemonProcess
+from shmmap.demo.process_memory import ProcessMemory, sum_memory
+from shmmap.demo.watched_daemon import WatchedDaemon
 
-__all__ = ["DriveResult", "Traffic", "WatchedDaemon", "drive", "paced"]
+__all__ = ["DriveResult", "drive", "paced"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +45,8 @@ class DriveResult:
         Columns that all consumers got in the drive, summed.
     cpu_s
         Processor time of all processes since they were started, user and system.
+    daemon_start_cpu_s
+        The part of it that the daemon used before there was a client; 0 without a daemon.
     memory
         Of all processes at the end, as the kernel counts it.
     shm_bytes
@@ -68,6 +67,7 @@ class DriveResult:
     warm_complete_s: float
     handed_bytes: int
     cpu_s: float
+    daemon_start_cpu_s: float
     memory: ProcessMemory
     shm_bytes: int
 
@@ -75,59 +75,6 @@ class DriveResult:
     def total_bytes(self) -> int:
         """All memory: what processes have for themselves, and shared memory once."""
         return self.memory.own_bytes + self.shm_bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Traffic:
-    """Messages between consumers and daemon in a drive: how many requests, bytes, handles in replies."""
-
-    requests: int
-    request_bytes: int
-    reply_bytes: int
-    handles: int
-
-
-class WatchedDaemon:
-    """A daemon, and a client that reads its counters; what that itself costs is left out."""
-
-    def __init__(self, process: DaemonProcess, client: Client) -> None:
-        self.process = process
-        self._client = client
-        self._own = Traffic(0, 0, 0, 0)
-        self.counters = self._first = self._ask()
-
-    def _ask(self) -> dict[str, int]:
-        reply = self._client.stats()
-        # a reply's own bytes are in the next one's counters
-        asked, answered = len(encode(Stats(reply.request))), len(encode(reply))
-        own = self._own
-        self._own = Traffic(own.requests + 1, own.request_bytes + asked, own.reply_bytes + answered, 0)
-        return reply.counters
-
-    def pids(self) -> list[int]:
-        """Return the daemon and its workers."""
-        return descendants(self.process.pid)
-
-    def loads(self) -> int:
-        """Read the counters; returns how many loads began so far."""
-        self.counters = self._ask()
-        return self.counters["loads_started"]
-
-    def layers_computed(self) -> int:
-        """Read the counters; returns how many layers its present life has computed."""
-        return self._ask()["layers_computed"]
-
-    def traffic(self) -> Traffic:
-        """Return what others sent and got since the beginning."""
-        start = self._own
-        now = self._ask()
-        grown = {name: now[name] - self._first[name] for name in now}
-        return Traffic(
-            requests=grown["requests"] - start.requests,
-            request_bytes=grown["bytes_received"] - start.request_bytes,
-            reply_bytes=grown["bytes_sent"] - start.reply_bytes,
-            handles=grown["handles_sent"],
-        )
 
 
 def drive(
@@ -147,17 +94,17 @@ def drive(
     handed_bytes = 0
     start_s = 0.0
     reports: list[StepReport] = []
-    loaded = daemon.loads() if daemon else 0
+    loaded = daemon.loaded() if daemon else set()
     for pose, started_s in paced(route, pace_s):
         first, loaded_before = not reports, loaded
         reports = fleet.move_to(pose)
         if first:
             start_s = time.perf_counter() - started_s
-        loaded = daemon.loads() if daemon else 0
+        loaded = daemon.loaded() if daemon else set()
         if not first:
             with_new = [report for report in reports if report.new]
             updates += with_new
-            if daemon and loaded == loaded_before:
+            if daemon and loaded <= loaded_before:
                 warm += with_new
         handed_bytes += sum(report.new_bytes for report in reports)
         progress.step(reports, daemon.counters if daemon else None)
@@ -178,6 +125,7 @@ def drive(
         warm_complete_s=_median([report.complete_s for report in warm]),
         handed_bytes=handed_bytes,
         cpu_s=cpu_seconds(pids),
+        daemon_start_cpu_s=daemon.start_cpu_s if daemon else 0.0,
         memory=sum_memory(pids),
         shm_bytes=daemon.process.shm_bytes() if daemon else 0,
     )

@@ -6,23 +6,27 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import math
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
 from shmmap.demo.demo_town import DemoSettings, Progress
-from shmmap.demo.drive import WatchedDaemon
 from shmmap.demo.process_cpu import cpu_seconds
+from shmmap.demo.process_memory import descendants
 from shmmap.demo.program import Program
 from shmmap.demo.scans import SEEN_METRES
+from shmmap.demo.watched_daemon import statistics_now
 from shmmap.errors import InternalError
+from shmmap.testing.daemon_process import DaemonProcess
 
 __all__ = ["Localization", "LocalizationResult"]
 
 _PROGRAM: Final = "shmmap_clients.ndt_scan_matcher"
 _WINDOW_METRES: Final = 80.0
-_LENGTH_METRES: Final = 80.0
 _PATIENCE_S: Final = 300.0  # for a compiler on a slow machine
 
 
@@ -38,6 +42,8 @@ class LocalizationResult:
         Distance of the found positions from the true ones: mean and largest, metres.
     scan_s
         From having a scan to having its pose, median.
+    first_pose_s
+        From starting the daemon, and then the program, until the first scan's pose was known.
     layers, layers_cpu_s
         NDT layers that the daemon computed for it, and the processor time of the daemon and its loaders
         meanwhile.
@@ -50,6 +56,7 @@ class LocalizationResult:
     error_m: float
     error_max_m: float
     scan_s: float
+    first_pose_s: float
     layers: int
     layers_cpu_s: float
     document: dict[str, Any]
@@ -74,7 +81,7 @@ class Localization:
     def __init__(self, settings: DemoSettings, work: Path) -> None:
         self.missing = next((name for name in ("numba",) if importlib.util.find_spec(name) is None), "")
         self._work = work
-        words = [str(work), str(settings.seed), *map(str, settings.blocks), str(_LENGTH_METRES)]
+        words = [str(work), str(settings.seed), *map(str, settings.blocks), str(settings.localized)]
         self._makers = [
             Program("simulated-scans", "shmmap.demo.scans", words, work),
             Program("shmmap-ndt-warmup", _PROGRAM, ["warmup"], work),
@@ -105,34 +112,40 @@ class Localization:
             if code := maker.wait(_PATIENCE_S):
                 raise InternalError(f"{maker.name} ended with {code}: {maker.last_words()}")
 
-    def run(self, daemon: WatchedDaemon, progress: Progress) -> LocalizationResult:
-        """Localize all scans on the daemon's map.
+    def run(self, map_path: str, options: Sequence[str], progress: Progress) -> LocalizationResult:
+        """Localize all scans, on a daemon that has yet to start and has nothing in memory.
+
+        Parameters
+        ----------
+        options
+            Of the daemon.
 
         Raises
         ------
         InternalError
             The program failed.
         """
-        words = [
-            "follow", "--scans", str(self._work / "scans"), "--truth", str(self._work / "truth.txt"),
-            "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.process.endpoint, "--json",
-            "--json-lines", "/dev/stdout", "--quiet",
-            "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(SEEN_METRES),
-            "--update-distance", "10",
-        ]  # fmt: skip
-        computed, cpu_s = daemon.layers_computed(), cpu_seconds(daemon.pids())
         scans = sorted((self._work / "scans").iterdir())
         progress.stage("Localizing simulated LiDAR scans with shmmap-ndt", len(scans))
-        with Program("shmmap-ndt", _PROGRAM, words, self._work, piped=True) as program:
+        started_s = time.perf_counter()
+        first_pose_s = math.nan
+        with contextlib.ExitStack() as stack:
+            daemon = stack.enter_context(DaemonProcess(map_path, *options))
+            before_s = cpu_seconds(descendants(daemon.pid))
+            program = Program("shmmap-ndt", _PROGRAM, self._words(daemon), self._work, piped=True)
             document: dict[str, Any] = {}
-            for line in program.lines(_PATIENCE_S):
+            for line in stack.enter_context(program).lines(_PATIENCE_S):
                 document = json.loads(line)
                 if "error_m" in document:
+                    if math.isnan(first_pose_s):
+                        first_pose_s = time.perf_counter() - started_s
                     progress.step(
                         note=f"{document['name']}: {document['error_m'] * 100:.1f} cm from the truth"
                     )
             if "frames" not in document:
                 raise InternalError(f"shmmap-ndt ended early: {program.last_words()}")
+            layers_cpu_s = cpu_seconds(descendants(daemon.pid)) - before_s
+            layers = statistics_now(daemon).counters["layers_computed"]
         errors_m = document["errors"]["ate_m"]
         return LocalizationResult(
             scans=document["frames"],
@@ -140,7 +153,17 @@ class Localization:
             error_m=errors_m["mean"],
             error_max_m=errors_m["max"],
             scan_s=document["latency_ms"]["p50"] / 1e3,
-            layers=daemon.layers_computed() - computed,
-            layers_cpu_s=cpu_seconds(daemon.pids()) - cpu_s,
+            first_pose_s=first_pose_s,
+            layers=layers,
+            layers_cpu_s=layers_cpu_s,
             document=document,
         )
+
+    def _words(self, daemon: DaemonProcess) -> list[str]:
+        return [
+            "follow", "--scans", str(self._work / "scans"), "--truth", str(self._work / "truth.txt"),
+            "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.endpoint, "--json",
+            "--json-lines", "/dev/stdout", "--quiet",
+            "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(SEEN_METRES),
+            "--update-distance", "10",
+        ]  # fmt: skip

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from shmmap.client import Client
 from shmmap.demo.consumer import Pose
 from shmmap.demo.demo_town import Progress
 from shmmap.demo.fleet import Fleet, StepReport
+from shmmap.demo.watched_daemon import statistics_now
 from shmmap.errors import NoAnswer
 from shmmap.testing.daemon_process import DaemonProcess
 
@@ -64,7 +64,6 @@ class OutageResult:
 def drive_through_outage(
     fleet: Fleet,
     daemon: DaemonProcess,
-    client: Client,
     route: Sequence[Pose],
     progress: Progress,
     *,
@@ -74,8 +73,6 @@ def drive_through_outage(
 
     Parameters
     ----------
-    client
-        Connected to the daemon; it finds its next life by itself.
     route
         If it is too short the vehicle waits at its end.
 
@@ -114,7 +111,7 @@ def drive_through_outage(
         if time.perf_counter() - ready_s > _PATIENCE_S:
             raise NoAnswer(f"a window is not complete {_PATIENCE_S:g} s after the daemon's return")
     current_s = time.perf_counter() - ready_s
-    adopted = client.stats().counters["adopted"]
+    adopted = statistics_now(daemon).counters["adopted"]
     progress.event(f"It is back with {adopted} of {segments} segments that were in shared memory")
     result = OutageResult(
         consumers=len(before),

@@ -9,6 +9,7 @@ import secrets
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,22 +17,33 @@ import pytest
 
 from shmmap.cli.screens.demo_progress import QuietProgress
 from shmmap.cli.screens.demo_report import print_report
-from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.errors import BadRequest
 from tests.support.daemon_process import ROOT, processes_marked, wait_ended
+from tests.support.small_demo import SMALL
 
 
 class Demo:
-    """A demonstration in its own process, with marked descendants and a temporary directory of its own."""
+    """A demonstration in its own process, with marked descendants and a temporary directory of its own.
 
-    def __init__(self, cwd: Path, *words: str) -> None:
+    Parameters
+    ----------
+    *words
+        What the demonstration is told.
+    command
+        The module, and its words.
+    """
+
+    def __init__(
+        self, cwd: Path, *words: str, command: Sequence[str] = ("tests.support.small_demo",)
+    ) -> None:
         self.mark = secrets.token_hex(8)
         self.cwd = cwd
         self.scratch = cwd / "tmp"
         self.scratch.mkdir()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "shmmap.cli", "demo", "--density", "4", *words],
+            [sys.executable, "-m", *command, *words],
             cwd=cwd,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -51,7 +63,8 @@ class Demo:
 
 
 def test_demo_measures_and_draws(tmp_path: Path) -> None:
-    demo = Demo(tmp_path, "--json", "--svg", "picture.svg", "--keep-map", "town")
+    words = ("--density", "4", "--json", "--svg", "picture.svg", "--keep-map", "town")
+    demo = Demo(tmp_path, *words, command=("shmmap.cli", "demo"))
     out, err = demo.process.communicate()
     assert (demo.process.returncode, err) == (0, "")
     told = json.loads(out)
@@ -85,6 +98,7 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     found = told["localization"]
     assert found["scans"] == found["trustworthy"] == found["ndt"]["frames"] == 41
     assert 0.0 < found["error_m"] <= found["error_max_m"] < 0.1
+    assert found["scan_s"] < found["first_pose_s"] < told["seconds"]
     assert told["svg"] == str(tmp_path / "picture.svg")
     picture = ElementTree.parse(told["svg"]).getroot()
     squares = [e.get("class") or "" for e in picture.iter("{http://www.w3.org/2000/svg}rect")]
@@ -111,7 +125,7 @@ STAGES = (
     "Building a town",
     "Simulating",
     "Driving, 1 process, private copy",
-    "Driving, 8 processes on the copy",
+    "Driving, 2 processes on the copy",
     "  The daemon is killed",
     "  The daemon starts again",
     "Localizing",
@@ -159,11 +173,10 @@ def test_without_numba_the_demo_says_what_is_left_out(
 ) -> None:
     """A client-only install has no compiler, and so no localization; all else is shown."""
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    settings = DemoSettings(blocks=(3, 2), density=4.0, radius=60.0, length=20.0, onward=12)
-    result = run_demo(settings, QuietProgress(), counts=(1, MANY))
+    result = run_demo(SMALL, QuietProgress())
     assert (result.localization, result.missing) == (None, "numba")
     print_report(result, "town.svg", 1.0)
-    lines = capsys.readouterr().out.splitlines()[-8:]
+    lines = [line for line in capsys.readouterr().out.splitlines() if line[:1].islower() or line[:3] == "CPU"]
     assert [line.split("  ")[0] for line in lines] == [
         "town", "memory", "one more", "waiting", "CPU", "kill -9", "position", "duration",
     ]  # fmt: skip

@@ -523,6 +523,7 @@ SWAP = """
 import os, sys, threading
 import shmmap
 endpoint, length = sys.argv[1], float(sys.argv[2])
+sys.setswitchinterval(1e-5)  # this loop never rests: the window's thread would wait 5 ms after every call
 window = shmmap.MapWindow(endpoint, 180, update_distance=0, refresh_interval=1e6)
 def drive(rounds):
     most = 0

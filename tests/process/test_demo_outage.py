@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import shmmap
 from shmmap.cli.screens.demo_progress import QuietProgress
 from shmmap.demo.consumer import Pose
 from shmmap.demo.fleet import Fleet, StepReport
@@ -45,10 +44,10 @@ def test_consumers_go_on_without_the_daemon(daemon: Callable[..., DaemonProcess]
     first_life = one.pid
     route = [Pose(*pose) for pose in town.route(length=40.0, step=1.0).tolist()]
     witness = Witness(one)
-    with shmmap.connect(one.endpoint) as client, Fleet("shared", one.endpoint, 60.0, 3) as fleet:
+    with Fleet("shared", one.endpoint, 60.0, 3) as fleet:
         fleet.move_to(route[0])
         held = one.segments()
-        result = drive_through_outage(fleet, one, client, route, witness, pace_s=0.02)
+        result = drive_through_outage(fleet, one, route, witness, pace_s=0.02)
     assert one.pid != first_life
     # every control loop read more points with every pose of the outage
     assert len(witness.alone) >= 10

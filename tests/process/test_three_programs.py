@@ -18,7 +18,7 @@ from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
 from shmmap.cli.screens.demo_progress import QuietProgress
-from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from tests.support.daemon_process import ROOT, DaemonProcess, processes_marked, wait_ended
 from tests.support.patience import Patience
@@ -81,10 +81,12 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
 
 def test_the_full_demonstration(tmp_path: Path) -> None:
     before = set(os.listdir("/dev/shm"))
-    settings = DemoSettings(blocks=(3, 2), density=8.0, radius=90.0, length=20.0, onward=12, scanned=12.0)
-    result = run_demo(settings, QuietProgress(), map_dir=str(tmp_path / "town"), counts=(2, MANY), full=True)
+    settings = DemoSettings(
+        blocks=(3, 2), density=8.0, radius=90.0, length=20.0, onward=12, scanned=12.0, counts=(2, 3), many=3
+    )
+    result = run_demo(settings, QuietProgress(), map_dir=str(tmp_path / "town"), full=True)
     assert (tmp_path / "town" / "pointcloud_map_metadata.yaml").exists()
-    assert [each.shared.consumers for each in result.rounds.values()] == [2, MANY]
+    assert [each.shared.consumers for each in result.rounds.values()] == [2, 3]
     assert result.localization is None
     programs = result.programs
     assert programs is not None
@@ -106,13 +108,15 @@ def test_the_full_demonstration(tmp_path: Path) -> None:
 
 INTERRUPTED = """
 from shmmap.cli.screens.demo_progress import PlainProgress
-from shmmap.demo.demo import MANY, run_demo
+from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.processes.interrupts import signals_interrupt
 
-settings = DemoSettings(blocks=(3, 2), density=8.0, radius=90.0, length=10.0, onward=12, scanned=160.0)
+settings = DemoSettings(
+    blocks=(3, 2), density=8.0, radius=90.0, length=10.0, onward=12, scanned=160.0, counts=(1, 2), many=2
+)
 with signals_interrupt():
-    run_demo(settings, PlainProgress(), counts=(1, MANY), full=True)
+    run_demo(settings, PlainProgress(), full=True)
 """
 
 

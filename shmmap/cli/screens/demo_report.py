@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap demo`` says in the end: a table of what was measured, and eight lines of what it means."""
+"""What ``shmmap demo`` says in the end: a table of what was measured, and some lines of what it means."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import shutil
+import sys
+import textwrap
+from typing import TYPE_CHECKING, Any, Final
 
-from shmmap.cli.screens.output import (
-    Column,
-    format_bytes,
-    format_duration,
-    print_line,
-    print_pairs,
-    print_table,
-)
+from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_line, print_table
 
 if TYPE_CHECKING:
     from shmmap.demo.demo import DemoResult
     from shmmap.demo.drive import DriveResult
+    from shmmap.demo.localization import LocalizationResult
 
 __all__ = ["draw", "print_report"]
+
+_WIDTH: Final = 79  # columns, of which every line has to make do
+_NARROWEST: Final = 30
+_NAMES: Final = 10  # columns, in front of the lines
 
 
 def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
@@ -26,7 +27,18 @@ def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
     print_line()
     _print_table(result)
     print_line()
-    print_pairs([*_lines(result), ("duration", f"{format_duration(duration_s)}; picture: {picture}")])
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
+    for name, text in [*_lines(result), ("duration", f"{format_duration(duration_s)}; picture: {picture}")]:
+        # in a pipe, too: what reads along is a log or a page
+        for line in textwrap.wrap(
+            text,
+            max(min(width, _WIDTH), _NARROWEST),
+            initial_indent=f"{name:{_NAMES}}",
+            subsequent_indent=" " * _NAMES,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ):
+            print_line(line)
 
 
 def _print_table(result: DemoResult) -> None:
@@ -57,22 +69,25 @@ def _lines(result: DemoResult) -> list[tuple[str, str]]:
         ("CPU", _cpu(result)),
         ("kill -9", _outage(result)),
     ]
-    if result.programs is None:
-        return [*lines, ("position", _position(result))]
-    document = result.programs.document
-    return [
-        *lines,
-        ("position", _all_positions(document)),
-        ("moving", _moving(document["errors"]["compare"])),
-        ("ground", _ground(document["errors"]["elevation"])),
-    ]
+    if result.programs is not None:
+        document = result.programs.document
+        return [
+            *lines,
+            ("position", _all_positions(document)),
+            ("moving", _moving(document["errors"]["compare"])),
+            ("ground", _ground(document["errors"]["elevation"])),
+        ]
+    found = result.localization
+    if found is None:
+        return [*lines, ("position", f"left out: the package {result.missing} is not installed")]
+    return [*lines, ("position", _position(found))]
 
 
 def _town(result: DemoResult) -> str:
     town, one = result.town, result.many.shared
     return (
-        f"{town.cells} cells, {town.points / 1e6:.1f} million points; each process keeps the {one.cells}"
-        f" cells around the vehicle, {format_bytes(one.map_bytes)}."
+        f"{town.cells} cells, {town.points / 1e6:.1f} million points; a process needs {one.cells} cells,"
+        f" {format_bytes(one.map_bytes)}"
     )
 
 
@@ -80,8 +95,8 @@ def _memory(result: DemoResult) -> str:
     count = max(result.rounds)
     last = result.rounds[count]
     return (
-        f"{count} processes with a private copy each: {format_bytes(last.private.total_bytes)}; with shmmap:"
-        f" {format_bytes(last.shared.total_bytes)}.{_too_small(result)}"
+        f"{count} processes, a private copy each: {format_bytes(last.private.total_bytes)}; with shmmap:"
+        f" {format_bytes(last.shared.total_bytes)}{_too_small(result)}"
     )
 
 
@@ -91,83 +106,71 @@ def _too_small(result: DemoResult) -> str:
     if last.shared.total_bytes < last.private.total_bytes:
         return ""
     return (
-        f" The map around the vehicle ({format_bytes(last.shared.map_bytes)}) is too small to gain"
-        " from sharing; --density 100 makes a larger one."
+        f". The map around the vehicle ({format_bytes(last.shared.map_bytes)}) is too small to gain"
+        " from sharing; --density 100 makes a larger one"
     )
 
 
 def _one_more(result: DemoResult) -> str:
     shared_bytes, private_bytes = result.one_more_bytes
     return (
-        f"Each further process costs {format_bytes(private_bytes)} with a private copy,"
-        f" {format_bytes(shared_bytes)} with shmmap."
+        f"each further process: {format_bytes(private_bytes)} with a copy, {format_bytes(shared_bytes)}"
+        " with shmmap"
     )
 
 
 def _waiting(result: DemoResult) -> str:
     shared, private = result.many.shared, result.many.private
     return (
-        f"New cells held a control loop up for {format_duration(private.follow_max_s)} at worst with private"
-        f" copies, {format_duration(shared.follow_max_s)} with shmmap, which gets them in the background (in"
-        f" {format_duration(shared.complete_s)}, median)."
+        f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; shmmap:"
+        f" {format_duration(shared.follow_max_s)}"
     )
 
 
 def _cpu(result: DemoResult) -> str:
     count = max(result.rounds)
-    last, found = result.rounds[count], result.localization
-    text = (
-        f"{count} private copies: {format_duration(last.private.cpu_s)}; with shmmap:"
-        f" {format_duration(last.shared.cpu_s)}, its daemon and loaders included."
-    )
-    if found is None:
-        return text
+    last = result.rounds[count]
     return (
-        f"{text} The NDT voxels of {found.layers} cells: {format_duration(found.layers_cpu_s)}, once for"
-        " all programs."
+        f"{count} copies: {format_duration(last.private.cpu_s)}; shmmap:"
+        f" {format_duration(last.shared.cpu_s)}, {format_duration(last.shared.daemon_start_cpu_s)} of it"
+        " to start the daemon"
     )
 
 
 def _outage(result: DemoResult) -> str:
     out = result.outage
-    millions = sum(out.counted) / len(out.counted) / 1e6
-    adopted = f"The new daemon took over {out.adopted} of {out.segments} segments."
     return (
-        f"There was no daemon for {format_duration(out.down_s)}, and {out.consumers} processes continued to"
-        f" read the map {1 / out.pace_s:.0f} times a second, at most {format_duration(out.longest_pause_s)}"
-        f" apart, {millions:.1f} million points each. {adopted}"
+        f"back in {format_duration(out.down_s)} with {out.adopted} of {out.segments} cells;"
+        f" no process paused over {format_duration(out.longest_pause_s)}"
     )
 
 
-def _position(result: DemoResult) -> str:
-    found = result.localization
-    if found is None:
-        return f"shmmap-ndt was left out: the package {result.missing} is not installed."
+def _position(found: LocalizationResult) -> str:
     return (
-        f"shmmap-ndt found where {found.scans} simulated LiDAR scans were taken: {_cm(found.error_m)} from"
-        f" the truth on average, {_cm(found.error_max_m)} at most."
+        f"{found.scans} LiDAR scans: {_cm(found.error_m)} off, {_cm(found.error_max_m)} at most;"
+        f" first pose after {format_duration(found.first_pose_s)}"
     )
 
 
 def _all_positions(document: dict[str, Any]) -> str:
     errors = document["errors"]["ndt"]
     return (
-        f"shmmap-ndt found where {document['programs']['ndt']['frames']} of {document['scans']} scans were"
-        f" taken: {_cm(errors['mean_m'])} from the truth on average, {_cm(errors['max_m'])} at most."
+        f"{document['programs']['ndt']['frames']} of {document['scans']} LiDAR scans localized:"
+        f" {_cm(errors['mean_m'])} off on average, {_cm(errors['max_m'])} at most"
     )
 
 
 def _moving(errors: dict[str, float]) -> str:
     return (
-        f"shmmap-compare kept {errors['moving_kept']:.0%} of the points on moving cars and people, and"
-        f" {errors['still_kept']:.1%} of all others."
+        f"shmmap-compare kept {errors['moving_kept']:.0%} of points on cars and people,"
+        f" {errors['still_kept']:.1%} of others"
     )
 
 
 def _ground(errors: dict[str, Any]) -> str:
     return (
-        f"shmmap-elevation's height of the road is {_cm(errors['mean_m'])} from the truth on average,"
-        f" {_cm(errors['max_m'])} at most."
+        f"shmmap-elevation: road height {_cm(errors['mean_m'])} off on average, {_cm(errors['max_m'])}"
+        " at most"
     )
 
 

@@ -31,8 +31,9 @@ _JSON = """\
               "pace_s": between poses, "current_s": from ready until all had all their cells,
               "segments": in shared memory before, "adopted": taken over},
    "localization": {"scans", "trustworthy", "error_m", "error_max_m": from the truth, mean and
-                    largest, "scan_s": per scan, median, "layers", "layers_cpu_s": that the daemon
-                    computed for it, and its CPU time, "ndt": what shmmap-ndt says} or null,
+                    largest, "scan_s": per scan, median, "first_pose_s": from starting the daemon,
+                    and then shmmap-ndt, "layers", "layers_cpu_s": that the daemon computed for it,
+                    and its CPU time, "ndt": what shmmap-ndt says} or null,
    "wire": {"requests", "request_bytes", "reply_bytes", "handles"}, "svg": path, "seconds"}
   DRIVE: {"consumers", "processes": with the daemon and its workers,
           "cells", "points", "map_bytes": of one consumer's window,
@@ -99,25 +100,30 @@ def _density(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Run the demonstration and print what it measured."""
     import time
+    from dataclasses import replace
 
     from shmmap.cli.screens.demo_progress import progress_for
     from shmmap.cli.screens.demo_report import draw, print_report
-    from shmmap.demo.demo import COUNTS, FULL_COUNTS, run_demo
+    from shmmap.demo.demo import FULL_COUNTS, run_demo
     from shmmap.demo.demo_town import DemoSettings
     from shmmap.processes.interrupts import signals_interrupt
 
     picture = _picture_path(args.svg, "shmmap-demo-full.svg" if args.full else "shmmap-demo.svg")
     started_s = time.monotonic()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
-        settings = DemoSettings() if args.density is None else DemoSettings(density=args.density)
-        counts = FULL_COUNTS if args.full else COUNTS
-        result = run_demo(settings, progress, map_dir=args.keep_map, counts=counts, full=args.full)
+        settings = DemoSettings()
+        if args.density is not None:
+            settings = replace(settings, density=args.density)
+        if args.full:
+            settings = replace(settings, counts=FULL_COUNTS)
+        result = run_demo(settings, progress, map_dir=args.keep_map, full=args.full)
     duration_s = time.monotonic() - started_s
     picture.write_text(result.programs.picture_svg if result.programs else draw(result), encoding="utf-8")
     if args.json:
         print_json(_as_json(result, str(picture), duration_s))
     else:
-        print_report(result, str(picture), duration_s)
+        near = os.path.relpath(picture)
+        print_report(result, str(picture) if near.startswith("..") else near, duration_s)
         if args.keep_map:
             print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
     return 0 if _complete(result) else 1
@@ -159,6 +165,7 @@ def _as_json(result: DemoResult, picture: str, duration_s: float) -> dict[str, o
             "error_m": found.error_m,
             "error_max_m": found.error_max_m,
             "scan_s": round(found.scan_s, 6),
+            "first_pose_s": round(found.first_pose_s, 3),
             "layers": found.layers,
             "layers_cpu_s": round(found.layers_cpu_s, 3),
             "ndt": found.document,
