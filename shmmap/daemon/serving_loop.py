@@ -8,10 +8,12 @@ frees memory.  Files are read and layers built elsewhere (`shmmap.daemon.loading
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.dispatch import Dispatch
@@ -40,6 +42,7 @@ class ServingLoop:
     scheduler: Scheduler
     sampler: Sampler
     statistics: StatisticsWriter
+    defects: Defects
     stopping: bool = False
     _answer_at_end: bool = True
 
@@ -76,12 +79,20 @@ class ServingLoop:
         for fd in ready:
             callback = self.watched.callbacks.get(fd)
             if callback is not None:  # another one's may have ended it
-                callback()
-        self.cache.tell_all()
-        self._serve()
+                self._guarded(callback)
+        self._guarded(self.cache.tell_all)
+        self._guarded(self._serve)
         self._look_after_the_rest(time.monotonic())
-        self.scheduler.pump(time.monotonic())
-        self.cache.tell_all()
+        self._guarded(self.scheduler.pump, time.monotonic())
+        self._guarded(self.cache.tell_all)
+
+    def _guarded(self, call: Callable[..., object], *arguments: object) -> None:
+        """Call what must not end the daemon if it fails, unless that happens again and again."""
+        try:
+            call(*arguments)
+        except Exception:  # a defect: one client's trouble must not be everybody's
+            if self.defects.met():
+                raise
 
     def _serve(self) -> None:
         """Serve those whose turn it is, for a bounded time."""
@@ -97,9 +108,9 @@ class ServingLoop:
 
     def _look_after_the_rest(self, now_s: float) -> None:
         """What has its own time: deadlines, surveys, statistics."""
-        self.scheduler.lost.end_overdue(now_s)
-        self.cells.answer_overdue(now_s)
-        self.cache.survey.turn(now_s)
-        self.sampler.turn(now_s)
+        self._guarded(self.scheduler.lost.end_overdue, now_s)
+        self._guarded(self.cells.answer_overdue, now_s)
+        self._guarded(self.cache.survey.turn, now_s)
+        self._guarded(self.sampler.turn, now_s)
         if now_s >= self.operators.stop_by_s:
             self.stop()

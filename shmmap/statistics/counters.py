@@ -85,6 +85,7 @@ COUNTERS: Final = (
     Counter("loads_from_cache", "counter", "", "Loads that found their layer in the disk cache"),
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
+    Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
     *(
         Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")
         for name, text in WINDOWED.items()

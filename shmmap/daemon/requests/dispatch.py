@@ -54,7 +54,7 @@ class Dispatch:
         except ShmmapError as error:
             heard.connection.refuse(request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
-            log.exception("request failed", cause="a defect in shmmap")
+            self.defects.met()
             heard.connection.refuse(request, InternalError("the daemon failed on this request"))
 
     def refuse_unread(self, heard: Heard) -> None:
