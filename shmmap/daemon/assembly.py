@@ -102,9 +102,7 @@ class Service:
             quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
             send=self._outbox.send, clock=time.monotonic,
         )  # fmt: skip
-        sampler = Sampler(
-            cache, scheduler, statistics, memory.rows, memory.event_log, sessions, cells, self._beat
-        )
+        sampler = Sampler(cache, scheduler, statistics, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
             config, cache, sessions, statistics, self._pins, memory.map_switch, scheduler.loads,

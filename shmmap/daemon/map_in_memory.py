@@ -23,7 +23,6 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import ConfigError
@@ -88,11 +87,9 @@ class MapInMemory:
         self.event_log = EventLog(self.epoch)
         self.sessions = Sessions()
         reclaimer = Reclaimer(ledger, directory, self.sessions, POLICIES[config.eviction], pins)
-        self.rows = CellRows(self.statistics, catalogue.id_prefix, segment_prefix(config.instance))
         self.cache = CellCache(
             catalogue, ledger, reclaimer, directory, self.statistics,
-            instance=config.instance, epoch=self.epoch, mode=mode, gid=gid, rows=self.rows,
-            event_log=self.event_log,
+            instance=config.instance, mode=mode, gid=gid, event_log=self.event_log,
         )  # fmt: skip
         self.watched = WatchedDescriptors()
         pool = WorkerPool(

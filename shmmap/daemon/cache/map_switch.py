@@ -93,7 +93,7 @@ class MapSwitch:
         for resident in list(cache.ledger.residents()):
             index = cache.index_of(resident.key.cell_id)
             if index is None or resident.key.cell_id in gone or resident.key.cell_id in moved:
-                cache.evict(resident, now_s, "map")
+                cache.reclaimer.retire(resident, now_s, "map")
                 if resident.key.cell_id not in gone:
                     cache.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
@@ -101,7 +101,7 @@ class MapSwitch:
             if resident.checked or cache.is_current(resident):
                 cache.enter(resident, index)
             else:
-                cache.evict(resident, now_s, "map")
+                cache.reclaimer.retire(resident, now_s, "map")
         return change
 
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.reclaimer import Outcome
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.worker_messages import Grant, Need, Refuse
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
@@ -38,7 +37,7 @@ class Room:
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
-        if self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back():
+        if self.cache.reclaimer.free(shortage, now_s) or self._may_be_given_back():
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
@@ -57,9 +56,7 @@ class Room:
             elif load is not None:
                 hopeless = nbytes + ledger.overhead_bytes > ledger.budget_bytes
                 shortage = ledger.shortage(nbytes - load.reserved)
-                if not hopeless and (
-                    self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back()
-                ):
+                if not hopeless and (self.cache.reclaimer.free(shortage, now_s) or self._may_be_given_back()):
                     continue
                 answer = Refuse(number)
             del self.hungry[number]

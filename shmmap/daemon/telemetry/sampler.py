@@ -14,7 +14,6 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import client_row
 from shmmap.daemon.transport.sessions import Sessions
@@ -49,7 +48,6 @@ class Sampler:
     cache: CellCache
     scheduler: Scheduler
     statistics: StatisticsWriter
-    rows: CellRows
     event_log: EventLog
     sessions: Sessions
     waiting: Sized
@@ -115,7 +113,7 @@ class Sampler:
         for _ in range(min(USED_ROWS_A_BEAT, len(cache.used))):
             resident = cache.used.pop()
             if cache.ledger.resident_named(resident.name) is resident:
-                self.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
+                cache.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
 
     def _beat(self, now_s: float) -> None:
         self.measure()

@@ -90,6 +90,6 @@ class OperatorRequests:
         residents = self.cache.ledger.residents()
         chosen = [r for r in residents if message.ids is None or r.key.cell_id in cells]
         loose = [resident for resident in chosen if resident.key not in self.pins]
-        freed = sum(self.cache.evict(resident, now_s) for resident in loose)
+        freed = sum(self.cache.reclaimer.retire(resident, now_s) for resident in loose)
         kept = len(chosen) - len(loose)
         return messages.Evicted(message.request, freed, len(loose) - freed, unknown, kept)

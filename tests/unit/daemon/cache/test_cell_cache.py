@@ -301,7 +301,7 @@ def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     one.cells.area(one.session(), Area(1, EVERYWHERE, wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 16
     for resident in list(one.ledger.residents()):
-        one.cache.evict(resident, one.now_s())
+        one.reclaimer.retire(resident, one.now_s())
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     lowest = os.dup(0)
     os.close(lowest)

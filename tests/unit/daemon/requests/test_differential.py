@@ -63,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     inner.reload()
     after = ask(inner, 2, EVERYWHERE)
     names = sorted(made.corners)
-    inner.cache.evict(inner.cache.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
+    inner.reclaimer.retire(inner.cache.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
     inner.run_until(lambda: not inner.ledger.retired)
     assert set(before) == set(names)
     assert set(after) == set(names) - {BROKEN}
