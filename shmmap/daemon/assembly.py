@@ -98,19 +98,18 @@ class Service:
         quota, budget = config.session_quota, cache.ledger.budget_bytes
         self._outbox = Outbox(self._socket, statistics)
         cells = CellRequests(
-            cache, scheduler, statistics, epoch=memory.epoch,
-            quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
+            cache, scheduler, quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
             send=self._outbox.send, clock=time.monotonic,
         )  # fmt: skip
-        sampler = Sampler(cache, scheduler, statistics, memory.event_log, sessions, cells, self._beat)
+        sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
-            config, cache, sessions, statistics, self._pins, memory.map_switch, scheduler.loads,
-            epoch=memory.epoch, event_log=memory.event_log, events_path=events_path(socket_path),
+            config, cache, sessions, self._pins, memory.map_switch, scheduler.loads, memory.event_log,
+            events_path(socket_path),
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader, self._outbox)
         handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, watched)
-        change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log, statistics)
+        change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log)
         watched.watch(reloader.fd, change.collect)
         dispatch = Dispatch(
             sessions, handshake, cells, queries, operators, authorization, cache.survey, sampler, self._outbox

@@ -237,7 +237,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule()
     def memory_came_back(self) -> None:
-        self.queue.clear_failures(frozenset({"over_budget"}))
+        self.queue.forget_refusals()
         self.failures = {key: code for key, code in self.failures.items() if code != "over_budget"}
 
     @rule(key=st.sampled_from(KEYS), more=st.booleans())

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 from shmmap.daemon.cache.cell_rows import CellRows
 from shmmap.daemon.cache.holders import Holders
-from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
 from shmmap.daemon.cache.survey import Survey
@@ -29,7 +28,6 @@ from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
-from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.statistics.writer import StatisticsWriter
@@ -71,32 +69,30 @@ class CellCache:
     def __init__(
         self,
         catalogue: Catalogue,
-        ledger: Ledger,
         reclaimer: Reclaimer,
-        directory: ShmDirectory,
         statistics: StatisticsWriter,
+        event_log: EventLog,
         *,
         instance: str,
         mode: int,
         gid: int,
-        event_log: EventLog,
     ) -> None:
         self.catalogue = catalogue
-        self.ledger = ledger
         self.reclaimer = reclaimer
+        self.ledger = reclaimer.ledger
+        self.directory = reclaimer.directory
         self.layers = LayerVersions(lambda: self.catalogue)
         self.holders = Holders(reclaimer)
-        self.survey = Survey(ledger, self.holders, in_service=self.is_in_service)
-        self.warm = WarmIndex(lambda: len(self.catalogue))
+        self.survey = Survey(self.ledger, self.holders, in_service=self.is_in_service)
+        self.warm = WarmIndex()
         self.id_prefix = catalogue.id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
-        self.names = SegmentNameWatch(directory.path, self.segment_prefix)
+        self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
         self.events = CellEvents(event_log, statistics, self.wire_id, PressureEvents(event_log, self._memory))
         self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
-        self.directory = directory
         self.statistics = statistics
         self.instance = instance
         self.epoch = event_log.epoch
@@ -223,7 +219,7 @@ class CellCache:
             self.warm.encode(resident, self.wire_id(resident.key.cell_id), segment)
             current = resident.version == self.layers.version(index, resident.key.layer)
             if current:
-                self.warm.enter(resident, index)
+                self.warm.enter(resident, index, len(self.catalogue))
                 self.heights[index] = (resident.z_min, resident.z_max)
             self._indices[self.wire_id(resident.key.cell_id)] = index
         self.tell(self.rows.show, resident, "resident" if current else "stale")

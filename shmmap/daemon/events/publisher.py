@@ -46,9 +46,8 @@ class EventPublisher:
         self.socket.setsockopt(zmq.LINGER, LAST_WORDS_MS)
         self.socket.setsockopt(zmq.SNDHWM, QUEUE)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)
-        self.socket.setsockopt(
-            zmq.XPUB_VERBOSE, 1
-        )  # each subscriber is told the last number, not only the first
+        # each subscriber is told the last number, not only the first
+        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)
         self.fd = int(self.socket.getsockopt(zmq.FD))
         self._on_subscribed = on_subscribed
 

@@ -23,7 +23,6 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.pins.watch import PinWatch
@@ -94,22 +93,18 @@ class InnerDaemon:
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
-            catalogue, self.ledger, self.reclaimer, self.directory, self.statistics,
-            instance="inner", mode=0o400, gid=-1, event_log=self.event_log,
+            catalogue, self.reclaimer, self.statistics, self.event_log,
+            instance="inner", mode=0o400, gid=-1,
         )  # fmt: skip
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
-        self.loads = Loads(self.ledger)
         self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(
-            self.cache, self.loads, self.map_switch, self.pool, self.statistics, clock=self.now_s
-        )
+        self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
+        self.loads = self.scheduler.loads
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.cache,
             self.scheduler,
-            self.statistics,
-            epoch=EPOCH,
             quota_bytes=quota_bytes,
             send=lambda session, data: self.replies.append((session, decode_reply(data))),
             clock=self.now_s,
@@ -117,8 +112,8 @@ class InnerDaemon:
         self.scheduler.on_settled = self._on_settled
         self.queries = MapQueries(
             DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir), self.cache,
-            self.sessions, self.statistics, OperatorPins(self.cache, self.scheduler), self.map_switch,
-            self.loads, epoch=EPOCH, event_log=self.event_log,
+            self.sessions, OperatorPins(self.cache, self.scheduler), self.map_switch, self.loads,
+            self.event_log,
         )  # fmt: skip
 
     def _on_settled(self, key: Key) -> None:

@@ -20,15 +20,7 @@ from shmmap.protocol.codec import encode
 
 __all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
 
-OPERATOR_REQUESTS: Final = (
-    messages.Reload,
-    messages.Evict,
-    messages.Pin,
-    messages.Unpin,
-    messages.Shutdown,
-)
-
-
+OPERATOR_REQUESTS: Final = (messages.Reload, messages.Evict, messages.Pin, messages.Unpin, messages.Shutdown)
 FAREWELL_S: Final = 1.0
 """How long a stop waits for the one who asked for it: libzmq drops a reply that was not read when the
 connection ends (ZMQ_IMMEDIATE)."""
