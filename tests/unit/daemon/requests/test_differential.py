@@ -184,12 +184,16 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
     """A cell held in another layer only is still new in this one."""
     name = "-20_-20.pcd"
     index = served.names.index(name)
-    for layers, lacks in (((), [(index, "points")]), (("points",), []), (("points", "points"), [])):
+    for layers, lacks in (
+        (("voxel(leaf=1.0)",), [(index, "points")]),
+        (("points",), []),
+        (("points", "points"), []),
+        (("voxel(leaf=1.0)", "points"), []),
+    ):
         message = Differential(1, EVERYWHERE, ("points",), (HeldCell(name, served.current[name], layers),))
-        if layers:
-            found = difference(served.inner.cache, message, [index], ("points",))
-            assert found.cells == lacks
-            assert found.removed == ()
+        found = difference(served.inner.cache, message, [index], ("points",))
+        assert found.cells == lacks
+        assert found.removed == ()
 
 
 @pytest.mark.parametrize("packed", [b"1234567", b"123456789"])
