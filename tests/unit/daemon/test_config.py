@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,13 @@ def test_quotas_are_parts_or_bytes() -> None:
     assert load({"session_quota": "1"}).session_quota == 1.0
     assert load({"session_quota": "64M"}).session_quota == float(64 << 20)
     assert load({"session_quota": 1}).session_quota == 1.0
+
+
+def test_a_processor_is_left_for_who_is_being_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    for processors, loaders in ((1, 1), (2, 1), (4, 3), (64, 4)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, count=processors: set(range(count)))
+        assert DaemonConfig().loaders() == loaders
+    assert DaemonConfig(workers=9).loaders() == 9
 
 
 def test_the_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
