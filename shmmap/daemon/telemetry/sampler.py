@@ -51,9 +51,7 @@ class Sampler:
     waiting: Sized
     on_beat: Callable[[], None]
     next_s: float = 0.0
-    _recent: RecentCounts = field(
-        init=False, default_factory=lambda: RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
-    )
+    _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _looked_s: float = float("-inf")
     _told_s: float = float("-inf")
     _last_s: float = 0.0
