@@ -16,6 +16,7 @@ from typing import Final
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
 from shmmap.daemon.events.publisher import EventPublisher, events_path
+from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.host.instance_names import lock_name, lock_path, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import KEEP_SIGNAL, RELOAD_SIGNAL, STOP_SIGNALS, ServingSignals, StartSignals
@@ -87,27 +88,27 @@ class Service:
         scheduler, watched = memory.scheduler, memory.watched
         quota, budget = config.session_quota, cache.ledger.budget_bytes
         cells = CellRequests(
-            cache, scheduler, statistics, epoch=memory.epoch,
-            quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
+            cache, scheduler, quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
             clock=time.monotonic,
         )  # fmt: skip
-        sampler = Sampler(
-            cache, scheduler, statistics, memory.rows, memory.event_log, sessions, cells, self._beat
-        )
+        sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
-            config, cache, sessions, statistics, self._pins, memory.map_switch, scheduler.loads,
-            epoch=memory.epoch, event_log=memory.event_log, events_path=events_path(socket_path),
+            config, cache, sessions, self._pins, memory.map_switch, scheduler.loads, memory.event_log,
+            events_path(socket_path),
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, cache.survey)
-        change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log, statistics)
+        change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log)
         watched.watch(reloader.fd, change.collect)
-        dispatch = Dispatch(handshake, cells, queries, operators, authorization, cache.survey, sampler)
+        defects = Defects(statistics)
+        dispatch = Dispatch(
+            handshake, cells, queries, operators, authorization, cache.survey, sampler, defects
+        )
         self._handshake = handshake
         self._inbox = Inbox(statistics, dispatch.refuse_unread)
         self._loop = ServingLoop(
-            watched, self._inbox, dispatch, operators, cells, cache, scheduler, sampler, statistics
+            watched, self._inbox, dispatch, operators, cells, cache, scheduler, sampler, statistics, defects
         )
 
     def run(self, started_s: float) -> None:

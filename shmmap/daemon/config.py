@@ -9,9 +9,9 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from shmmap.daemon.config_file import read_settings_file
+from shmmap.daemon.config_file import Setting, read_settings_file
 from shmmap.errors import BadRequest, ConfigError
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
@@ -23,19 +23,25 @@ from shmmap.protocol.endpoint import (
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import check_instance
 
-__all__ = ["FILE_NAMES", "DaemonConfig", "Setting", "load_config", "parse_bytes", "trace_settings"]
+__all__ = ["FILE_NAMES", "DaemonConfig", "load_config", "parse_bytes", "trace_settings"]
 
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 LARGEST_BYTES: Final = 1 << 62
 _ENVIRONMENT: Final = "SHMMAP_"
 _TRUTHS: Final = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_RANGES: Final = {
-    "session_quota": "a part of the budget, up to 1, or at least 1M",
-    "workers": "0 to 64; 0: one less than there are processors",
-    "load_timeout_s": "seconds, more than 0 and at most a day",
-    "eviction": "distance or lru",
+_RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
+    "session_quota": (
+        lambda value: 0 < value <= 1 or 1 << 20 <= value <= LARGEST_BYTES,
+        "a part of the budget, up to 1, or at least 1M",
+    ),
+    "workers": (lambda value: 0 <= value <= 64, "0 to 64; 0: one less than there are processors"),
+    "load_timeout_s": (lambda value: 0 < value <= 86400, "seconds, more than 0 and at most a day"),
+    "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
+    "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
+    "eviction": (lambda value: value in ("distance", "lru"), "distance or lru"),
 }
-_NOT_SETTINGS: Final = ("SHMMAP_TEST_",)
+"""Which values a setting may have, and the hint for who gives another."""
+_NOT_SETTINGS: Final = "SHMMAP_TEST_"
 FILE_NAMES: Final = {"budget_bytes": "budget", "cache_bytes": "cache_size"}
 """What files, variables and options call a setting, where that is not the attribute's name."""
 
@@ -166,18 +172,9 @@ def _convert(name: str, value: Any, origin: str) -> Any:
         raise ConfigError(
             f"{origin}: {name} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
         ) from None
-    allowed: dict[str, Callable[[Any], bool]] = {
-        "session_quota": lambda v: 0 < v <= 1 or 1 << 20 <= v <= LARGEST_BYTES,
-        "workers": lambda v: 0 <= v <= 64,
-        "load_timeout_s": lambda v: 0 < v <= 86400,
-        "budget_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
-        "cache_bytes": lambda v: 0 <= v <= LARGEST_BYTES,
-        "eviction": lambda v: v in ("distance", "lru"),
-    }
-    if name in allowed and not allowed[name](value):
-        raise ConfigError(
-            f"{origin}: {name} cannot be {value!r}", key=name, origin=origin, hint=_RANGES.get(name, "")
-        )
+    is_possible, hint = _RANGES.get(name, (lambda _value: True, ""))
+    if not is_possible(value):
+        raise ConfigError(f"{origin}: {name} cannot be {value!r}", key=name, origin=origin, hint=hint)
     return value
 
 
@@ -213,13 +210,6 @@ def load_config(
     return DaemonConfig(**{name: setting.value for name, setting in found.items()})
 
 
-class Setting(NamedTuple):
-    """A setting's value and where it comes from: ``FILE:LINE``, a variable, the flags, the default."""
-
-    value: Any
-    origin: str
-
-
 def trace_settings(
     flags: Mapping[str, Any], *, file: str = "", environ: Mapping[str, str] = os.environ
 ) -> dict[str, Setting]:
@@ -246,11 +236,11 @@ def trace_settings(
     endpoint = settings["endpoint"]
     if endpoint.value and settings["instance"].origin == "default":
         # clients that know the socket alone look for the segments of the instance it is named after
-        settings["instance"] = Setting(instance_of(endpoint.value), endpoint.origin)
+        settings["instance"] = Setting(_instance_of(endpoint.value), endpoint.origin)
     return settings
 
 
-def instance_of(endpoint: str) -> str:
+def _instance_of(endpoint: str) -> str:
     """Return the instance that a socket's name stands for; the default one where it cannot be a name."""
     try:
         return check_instance(os.path.basename(endpoint_path(endpoint)).removesuffix(".sock"))

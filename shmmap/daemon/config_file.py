@@ -17,14 +17,14 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["SYSTEM_CONFIG_FILE", "Assignment", "installed_config_file", "read_settings_file"]
+__all__ = ["SYSTEM_CONFIG_FILE", "Setting", "installed_config_file", "read_settings_file"]
 
 SYSTEM_CONFIG_FILE: Final = "/etc/shmmap/shmmap.toml"
 _KEY: Final = re.compile(r"""\s*(?:"([^"]+)"|'([^']+)'|([A-Za-z0-9_-]+))\s*[.=]|\s*\[+\s*([A-Za-z0-9_-]+)""")
 
 
-class Assignment(NamedTuple):
-    """A value and where it is set, ``FILE:LINE``."""
+class Setting(NamedTuple):
+    """A setting's value and where it comes from: ``FILE:LINE``, a variable, the flags, the default."""
 
     value: Any
     origin: str
@@ -37,7 +37,7 @@ def installed_config_file(environ: Mapping[str, str] = os.environ) -> str:
     return next((place for place in places if os.path.exists(place)), "")
 
 
-def read_settings_file(path: str) -> dict[str, Assignment]:
+def read_settings_file(path: str) -> dict[str, Setting]:
     """Read the settings of a file.
 
     Raises
@@ -56,7 +56,7 @@ def read_settings_file(path: str) -> dict[str, Assignment]:
         raise ConfigError(f"{path}: {error}", origin=path) from error
     lines = _lines(text)
     return {
-        name: Assignment(value, f"{path}:{lines[name]}" if name in lines else path)
+        name: Setting(value, f"{path}:{lines[name]}" if name in lines else path)
         for name, value in settings.items()
     }
 

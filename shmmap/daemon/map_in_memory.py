@@ -18,12 +18,10 @@ from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.budget import choose_budget
 from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.loading.adoption import Adoption
-from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import ConfigError
@@ -58,10 +56,10 @@ class MapInMemory:
         gid: int,
     ) -> None:
         self.directory = directory
-        self.epoch = secrets.randbits(63) | 1
+        epoch = secrets.randbits(63) | 1
         self.identity = DaemonIdentity(
             pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),
-            epoch=self.epoch, instance=config.instance, endpoint=socket_path, map_path=config.map_path,
+            epoch=epoch, instance=config.instance, endpoint=socket_path, map_path=config.map_path,
             map_version=catalogue.map_version, shm_dir=directory.path, id_prefix=catalogue.id_prefix,
             library_version=__version__, started_unix_ns=time.time_ns(), frame_id=catalogue.frame_id,
         )  # fmt: skip
@@ -85,34 +83,26 @@ class MapInMemory:
         ledger = Ledger(budget)
         ledger.overhead_bytes = self.statistics.size_bytes
         self.statistics.reserve = ledger.add_overhead
-        self.event_log = EventLog(self.epoch)
+        self.event_log = EventLog(epoch)
         self.sessions = Sessions()
         reclaimer = Reclaimer(ledger, directory, self.sessions, POLICIES[config.eviction], pins)
-        self.rows = CellRows(self.statistics, catalogue.id_prefix, segment_prefix(config.instance))
         self.cache = CellCache(
-            catalogue, ledger, reclaimer, directory, self.statistics,
-            instance=config.instance, epoch=self.epoch, mode=mode, gid=gid, rows=self.rows,
-            event_log=self.event_log,
+            catalogue, reclaimer, self.statistics, self.event_log,
+            instance=config.instance, mode=mode, gid=gid,
         )  # fmt: skip
         self.watched = WatchedDescriptors()
         pool = WorkerPool(
             config.loaders(), directory.path, config.load_timeout_s, self.watched,
             cache_dir=config.cache_dir, cache_bytes=config.cache_bytes,
         )  # fmt: skip
-        loads = Loads(ledger)
         self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(
-            self.cache, loads, self.map_switch, pool, self.statistics, clock=time.monotonic
-        )
-        adoption = Adoption(directory, config.instance, self.cache, loads, mode=mode, gid=gid)
-        adoption.take_over(time.monotonic())
+        self.scheduler = Scheduler(self.cache, self.map_switch, pool, clock=time.monotonic)
+        Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
         self.cache.tell_all()
-        for fd, hear in (
-            (pins.fd, self.scheduler.hear_of_closes),
-            (self.cache.names.fd, self.cache.hear_of_names),
-        ):
-            if fd >= 0:
-                self.watched.watch(fd, lambda hear=hear: hear(time.monotonic()))  # type: ignore[misc]
+        if pins.fd >= 0:
+            self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(time.monotonic()))
+        if self.cache.names.fd >= 0:
+            self.watched.watch(self.cache.names.fd, lambda: self.cache.hear_of_names(time.monotonic()))
 
     def close(self, *, keep: bool) -> None:
         """End the loaders, and take every name away or leave those of the segments to the next life."""

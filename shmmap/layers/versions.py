@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Final, Protocol
 
 import numpy as np
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 from xxhash import xxh3_64_intdigest
 
 from shmmap.geometry import Area, Box
-from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 
 __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
@@ -36,6 +36,12 @@ class Cells(Protocol):
         """Cells whose box touches ``area``, ascending."""
 
 
+@lru_cache(maxsize=4096)
+def _halo_m(layer: str) -> float:
+    """How far beyond a cell a layer looks, metres."""
+    return layer_spec(layer).halo_m
+
+
 class LayerVersions:
     """Answers for the layers of one daemon's map.
 
@@ -47,17 +53,7 @@ class LayerVersions:
 
     def __init__(self, catalogue: Callable[[], Cells]) -> None:
         self._catalogue = catalogue
-        self._halos: dict[str, float] = {LAYER: 0.0}
         self._versions: dict[tuple[int, str], int] = {}
-
-    def halo_m(self, layer: str) -> float:
-        """How far beyond a cell a layer looks, metres."""
-        halo = self._halos.get(layer)
-        if halo is None:
-            if len(self._halos) > 4096:
-                self._halos = {LAYER: 0.0}
-            halo = self._halos[layer] = layer_spec(layer).halo_m
-        return halo
 
     def version(self, index: int, layer: str) -> int:
         """Current version of one layer of a cell.
@@ -65,7 +61,7 @@ class LayerVersions:
         It is the cell's own (`shmmap.origin.stamp.cell_version`) unless the layer has a halo: then
         the XXH3-64 of it and of the neighbours' versions in id order, as u64.
         """
-        if not self.halo_m(layer):
+        if not _halo_m(layer):
             return self._catalogue().version(index)
         version = self._versions.get((index, layer))
         if version is None:
@@ -79,7 +75,7 @@ class LayerVersions:
 
     def neighbours(self, index: int, layer: str) -> list[int]:
         """Catalogue indices of the cells that a layer of this one looks into, ascending."""
-        halo = self.halo_m(layer)
+        halo = _halo_m(layer)
         if not halo:
             return []
         min_x, min_y, max_x, max_y = self._catalogue().box(index)

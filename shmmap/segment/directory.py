@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+from collections.abc import Iterator
 
 from shmmap.errors import ConfigError
 from shmmap.failpoints import step
@@ -99,6 +100,15 @@ class ShmDirectory:
         # a pipe of that name would keep the opener waiting
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         return os.open(name.lstrip("/"), flags, dir_fd=self._fd)
+
+    @contextlib.contextmanager
+    def opened(self, name: str) -> Iterator[int]:
+        """`open` a segment for a moment."""
+        fd = self.open(name)
+        try:
+            yield fd
+        finally:
+            os.close(fd)
 
     def rename(self, old: str, new: str) -> bool:
         """Rename a segment; False if it is gone."""

@@ -75,7 +75,7 @@ def main() -> None:
             life = InnerDaemon(
                 str(made.root), budget_bytes=4 << 30, cache_dir=scratch, shm_dir=first.shm_dir, name="next"
             )
-            adoption = Adoption(life.directory, "inner", life.cache, life.loads, mode=0o400, gid=-1)
+            adoption = Adoption(life.cache, life.loads)
             spent = milliseconds(lambda: adoption.take_over(life.now_s()))
             assert life.ledger.resident_count == options.segments
             life.leave()

@@ -21,8 +21,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from shmmap.daemon.cache.eviction_policy import POLICIES
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Outcome, Reclaimer
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Failure, Key, Load, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.segment.directory import ShmDirectory
@@ -66,7 +67,7 @@ class Wanted:
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 class Machine(RuleBasedStateMachine):
-    """One life of ledger and loads; as the reclaimer's observer it hears what leaves and what is freed."""
+    """One life of ledger and loads; it hears of the reclaimer what leaves and what is freed."""
 
     @initialize(policy=st.sampled_from(sorted(POLICIES)))
     def begin(self, policy: str) -> None:
@@ -78,10 +79,13 @@ class Machine(RuleBasedStateMachine):
         self.ledger.overhead_bytes = OVERHEAD_PAGES * PAGE
         self.sessions = Sessions()
         self.clients = [self.sessions.open(connections.of(), f"client {n}", 0.0) for n in range(2)]
-        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, POLICIES[policy])
+        self.reclaimer = Reclaimer(
+            self.ledger, self.directory, self.sessions, POLICIES[policy], PinWatch(self.directory)
+        )
         self.names_retired: list[str] = []
         self.names_freed: list[str] = []
-        self.reclaimer.observer = self
+        self.reclaimer.on_retired = lambda resident, _why: self.names_retired.append(resident.name)
+        self.reclaimer.on_gone = self.names_freed.append
         self.now_s = 100.0
         self.versions = dict.fromkeys(KEYS, 1)
         self.segments: dict[str, Segment] = {}
@@ -101,16 +105,6 @@ class Machine(RuleBasedStateMachine):
         found = [s for s in self.of_state("resident") if s.key == key]
         assert len(found) <= 1
         return found[0] if found else None
-
-    def retired(self, resident: Resident, why: str) -> None:
-        del why
-        self.names_retired.append(resident.name)
-
-    def freed(self, resident: Resident) -> None:
-        self.names_freed.append(resident.name)
-
-    def renamed(self, name: str) -> None:
-        raise AssertionError(f"nobody has taken {name}")
 
     def follow(self) -> None:
         """Take over what the reclaimer said it retired and freed; nothing mapped may be among the freed."""
@@ -244,7 +238,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule()
     def memory_came_back(self) -> None:
-        self.queue.clear_failures(frozenset({"over_budget"}))
+        self.queue.forget_refusals()
         self.failures = {key: code for key, code in self.failures.items() if code != "over_budget"}
 
     @rule(key=st.sampled_from(KEYS), more=st.booleans())
@@ -361,9 +355,9 @@ class Machine(RuleBasedStateMachine):
             if shortage <= 0:
                 assert pages <= room
                 return
-            outcome = self.reclaimer.free(shortage, self.now_s)
+            on_its_way = self.reclaimer.free(shortage, self.now_s)
             self.follow()
-            if outcome is Outcome.IMPOSSIBLE:
+            if not on_its_way:
                 assert pages > room
                 return
             self.now_s = max(self.now_s + 1e-6, min(self.reclaimer.wake_s, self.reclaimer.next_sweep_s()))

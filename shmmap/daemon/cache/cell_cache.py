@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
+from shmmap.daemon.cache.cell_rows import CellRows
 from shmmap.daemon.cache.holders import Holders
-from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
 from shmmap.daemon.cache.survey import Survey
 from shmmap.daemon.cache.warm_index import WarmIndex
 from shmmap.daemon.events.cell_events import CellEvents
-from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.records import Key, Resident
 from shmmap.failpoints import step
 from shmmap.geometry import ZRange
@@ -28,25 +28,14 @@ from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
-from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["CellCache", "Rows"]
+__all__ = ["CellCache"]
 
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
-
-
-class Rows(Protocol):
-    """Where segments are shown; see `shmmap.daemon.telemetry.cell_rows`."""
-
-    def show(self, resident: Resident, state: str) -> None:
-        """Show a segment as it is now."""
-
-    def hide(self, name: str) -> None:
-        """There is no segment of this name any more."""
 
 
 class CellCache:
@@ -54,19 +43,17 @@ class CellCache:
 
     Parameters
     ----------
-    instance, epoch
-        Part of every segment's name; part of its publish block.
+    instance
+        Part of every segment's name.
     mode, gid
         Access of published segments; ``gid`` -1 leaves the group alone.
-    rows
-        Shows segments to operators.
     event_log
         Told what happens to cells.
 
     Attributes
     ----------
-    events
-        Tells what happens to cells.
+    events, rows
+        Tells what happens to cells; shows segments to operators.
     used : set
         Segments handed out since the statistics last showed them.
     holders, survey
@@ -82,41 +69,39 @@ class CellCache:
     def __init__(
         self,
         catalogue: Catalogue,
-        ledger: Ledger,
         reclaimer: Reclaimer,
-        directory: ShmDirectory,
         statistics: StatisticsWriter,
+        event_log: EventLog,
         *,
         instance: str,
-        epoch: int,
         mode: int,
         gid: int,
-        rows: Rows,
-        event_log: EventLog,
     ) -> None:
         self.catalogue = catalogue
-        self.ledger = ledger
         self.reclaimer = reclaimer
+        self.ledger = reclaimer.ledger
+        self.directory = reclaimer.directory
         self.layers = LayerVersions(lambda: self.catalogue)
         self.holders = Holders(reclaimer)
-        self.survey = Survey(ledger, self.holders, in_service=self.is_in_service)
-        self.warm = WarmIndex(lambda: len(self.catalogue))
+        self.survey = Survey(self.ledger, self.holders, in_service=self.is_in_service)
+        self.warm = WarmIndex()
         self.id_prefix = catalogue.id_prefix
         self.segment_prefix = segment_prefix(instance)
         self.heights: dict[int, tuple[float, float]] = {}
-        self.names = SegmentNameWatch(directory.path, self.segment_prefix)
-        self.events = CellEvents(event_log, ledger.memory, statistics, self.wire_id)
+        self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
+        self.events = CellEvents(event_log, statistics, self.wire_id, PressureEvents(event_log, self._memory))
+        self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
         self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
-        self._rows = rows
-        self._directory = directory
-        self._statistics = statistics
-        self._instance = instance
-        self._epoch = epoch
-        self._access = (mode, gid)
+        self.statistics = statistics
+        self.instance = instance
+        self.epoch = event_log.epoch
+        self.mode = mode
+        self.gid = gid
         self._indices: dict[str, int] = {}
         self._untold: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
-        reclaimer.observer = self
+        reclaimer.on_retired = self._on_retired
+        reclaimer.on_gone = lambda name: self.tell(self.rows.hide, name)
 
     # --- names --------------------------------------------------------------------------------
 
@@ -186,12 +171,11 @@ class CellCache:
         OSError
             It cannot be published, for lack of memory, say.
         """
-        mode, gid = self._access
-        resident.name = new_segment_name(self._instance)
+        resident.name = new_segment_name(self.instance)
         resident.version = self.layers.version(index, resident.key.layer)
-        block = PublishBlock(self._epoch, resident.version)
-        resident.nbytes = self._directory.publish(
-            fd, resident.name, block=block, header_bytes=header_bytes, mode=mode, gid=gid
+        block = PublishBlock(self.epoch, resident.version)
+        resident.nbytes = self.directory.publish(
+            fd, resident.name, block=block, header_bytes=header_bytes, mode=self.mode, gid=self.gid
         )
         old = self.ledger.enter(resident)
         if old is not None:
@@ -204,7 +188,7 @@ class CellCache:
         """Take a segment of an earlier life; it is handed out once a loader has checked it."""
         self.ledger.enter(resident)
         self.enter(resident, index)
-        self._statistics.add("adopted")
+        self.statistics.add("adopted")
 
     def accept(self, resident: Resident) -> bool:
         """Hand out an adopted segment from now on; False if it has left service meanwhile."""
@@ -219,7 +203,7 @@ class CellCache:
     def reject(self, resident: Resident, why: str, now_s: float) -> None:
         """Take an adopted segment that is not what it should be out of service, if it still is in it."""
         if self.ledger.resident_named(resident.name) is resident:
-            self._statistics.add("adoptions_failed")
+            self.statistics.add("adoptions_failed")
             log.warning("segment of an earlier daemon not used", segment=resident.name, reason=why)
             self.reclaimer.retire(resident, now_s, "damaged")
 
@@ -235,10 +219,10 @@ class CellCache:
             self.warm.encode(resident, self.wire_id(resident.key.cell_id), segment)
             current = resident.version == self.layers.version(index, resident.key.layer)
             if current:
-                self.warm.enter(resident, index)
+                self.warm.enter(resident, index, len(self.catalogue))
                 self.heights[index] = (resident.z_min, resident.z_max)
             self._indices[self.wire_id(resident.key.cell_id)] = index
-        self.tell(self._rows.show, resident, "resident" if current else "stale")
+        self.tell(self.rows.show, resident, "resident" if current else "stale")
 
     def forget_indices(self) -> None:
         """Catalogue indices mean other cells from now on; what is resident is entered anew."""
@@ -263,6 +247,11 @@ class CellCache:
             how, what = self._untold.popleft()
             how(*what)
 
+    def _memory(self) -> tuple[int, int, int, int]:
+        """Budget, used, pinned and retired bytes."""
+        ledger, pinned = self.ledger, self.statistics.values["bytes_pinned"]
+        return ledger.budget_bytes, ledger.used_bytes, pinned, ledger.retired_bytes
+
     # --- leaving --------------------------------------------------------------------------------
 
     def chill(self, index: int) -> None:
@@ -276,32 +265,20 @@ class CellCache:
             for cell in (index, *self.layers.neighbours(index, layer)):
                 self.warm.leave(cell, layer)
 
-    def evict(self, resident: Resident, now_s: float, why: str = "request") -> bool:
-        """Retire on request; True if nobody has it mapped."""
-        return self.reclaimer.retire(resident, now_s, why)
-
-    def retired(self, resident: Resident, why: str) -> None:
+    def _on_retired(self, resident: Resident, why: str) -> None:
         """Nobody finds it any more; its bytes still show."""
         self.tell(self.events.retired, resident, why)
         self.used.discard(resident)
         index = self.index_of(resident.key.cell_id)
         if index is not None and self.warm.get(index, resident.key.layer) is resident:
             self.warm.leave(index, resident.key.layer)
-        self.tell(self._rows.show, resident, "zombie")
-
-    def freed(self, resident: Resident) -> None:
-        """Its bytes show no more."""
-        self.tell(self._rows.hide, resident.name)
-
-    def renamed(self, name: str) -> None:
-        """It shows under another name from now on."""
-        self.tell(self._rows.hide, name)
+        self.tell(self.rows.show, resident, "zombie")
 
     def hear_of_names(self, now_s: float) -> None:
         """Names vanished from the directory: what somebody else removed is handed out no more."""
         names = self.names.gone()
         residents = self.ledger.residents() if names is None else map(self.ledger.resident_named, names)
-        for resident in [r for r in residents if r is not None and not self._directory.exists(r.name)]:
+        for resident in [r for r in residents if r is not None and not self.directory.exists(r.name)]:
             cell = resident.key.cell_id
             log.warning("segment removed by somebody else", segment=resident.name, cell=cell)
             self.reclaimer.retire(resident, now_s, "damaged")
@@ -310,5 +287,5 @@ class CellCache:
         """Take every segment's name away, or leave the names to the next life."""
         if not keep:
             self.reclaimer.remove_all()
-        self.reclaimer.close()
+        self.reclaimer.pins.close()
         self.names.close()

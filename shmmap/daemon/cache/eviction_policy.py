@@ -6,8 +6,8 @@ A policy only orders candidates; pins, waiting requests and the budget are not i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,16 +15,10 @@ from shmmap.daemon.records import Resident
 
 __all__ = ["POLICIES", "EvictionPolicy", "by_distance", "by_last_use"]
 
-Pose = tuple[float, float]
-
-
-class EvictionPolicy(Protocol):
-    """Orders segments, the one to retire first in front.
-
-    ``poses`` are where the clients are (or will be), metres, map frame.
-    """
-
-    def __call__(self, candidates: Sequence[Resident], poses: Sequence[Pose]) -> list[Resident]: ...
+Pose: TypeAlias = tuple[float, float]
+EvictionPolicy: TypeAlias = Callable[[Sequence[Resident], Sequence[Pose]], list[Resident]]
+"""Orders segments, the one to retire first in front; given where the clients are (or will be), metres, map
+frame."""
 
 
 def by_last_use(candidates: Sequence[Resident], poses: Sequence[Pose]) -> list[Resident]:

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -17,25 +20,27 @@ __all__ = ["UNKNOWN_SLOT", "Holders"]
 
 HOLDERS_S: Final = 0.03
 """Time of the processor that finding out who holds what may take for one reply."""
+MOST_SEGMENTS: Final = 512
+"""Segments looked at for one reply."""
 UNKNOWN_SLOT: Final = 0
 """Stands for whoever uses a segment without being a session."""
 
 
+@dataclass(eq=False, slots=True)
 class Holders:
     """Asks the kernel who has segments locked, and the sessions who that is."""
 
-    def __init__(self, reclaimer: Reclaimer) -> None:
-        self._reclaimer = reclaimer
+    reclaimer: Reclaimer
 
     @property
     def by_slot(self) -> bool:
         """Whether the kernel tells which sessions use a segment."""
-        return self._reclaimer.pins.source is not PinSource.SESSIONS
+        return self.reclaimer.pins.source is not PinSource.SESSIONS
 
     def slots_of(self, resident: Resident) -> list[int] | None:
         """Slots that have a segment locked; None if its name is gone."""
         try:
-            with self._reclaimer.pins.opened(self._reclaimer.name_on_disk(resident)) as fd:
+            with self.reclaimer.pins.opened(self.reclaimer.name_on_disk(resident)) as fd:
                 return holders(fd)
         except OSError:
             return None
@@ -46,29 +51,29 @@ class Holders:
         Unknown is whose lock no session of ours has (a client of an earlier life that we have not heard
         of), and a pin without any lock.  Our own loaders look at segments, too, and do not count.
         """
-        known = [slot for slot in slots if self._reclaimer.sessions.by_slot(slot) is not None]
+        known = [slot for slot in slots if self.reclaimer.sessions.by_slot(slot) is not None]
         ours = slots.count(LOADER_SLOT)
-        if len(slots) > len(known) + ours or (not known and not ours and self._reclaimer.is_pinned(resident)):
+        if len(slots) > len(known) + ours or (not known and not ours and self.reclaimer.is_pinned(resident)):
             known.append(UNKNOWN_SLOT)
         return known
 
-    def of(self, residents: Iterable[Resident], *, limit: int = 512) -> tuple[Holder, ...]:
+    def of(self, residents: Iterable[Resident]) -> tuple[Holder, ...]:
         """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock.
 
         A bounded look: at so many segments, and for so long.
         """
         end_s = time.thread_time() + HOLDERS_S
-        bytes_of: dict[int, int] = {}
-        cells_of: dict[int, int] = {}
-        for count, resident in enumerate(residents):
-            if count >= limit or time.thread_time() > end_s:
+        bytes_of: Counter[int] = Counter()
+        cells_of: Counter[int] = Counter()
+        for resident in islice(residents, MOST_SEGMENTS):
+            if time.thread_time() > end_s:
                 break
             for slot in self.users_among(resident, self.slots_of(resident) or ()):
-                bytes_of[slot] = bytes_of.get(slot, 0) + resident.nbytes
-                cells_of[slot] = cells_of.get(slot, 0) + 1
+                bytes_of[slot] += resident.nbytes
+                cells_of[slot] += 1
         found = []
-        for slot, nbytes in sorted(bytes_of.items(), key=lambda item: -item[1]):
-            session = self._reclaimer.sessions.by_slot(slot)
+        for slot, nbytes in bytes_of.most_common():
+            session = self.reclaimer.sessions.by_slot(slot)
             if session is None:
                 found.append(Holder(0, 0, -1, "unknown", nbytes, cells_of[slot]))
             else:

@@ -72,10 +72,6 @@ class Ledger:
         self.overhead_bytes += nbytes if fits else 0
         return fits
 
-    def memory(self) -> tuple[int, int, int]:
-        """Budget, used and retired bytes."""
-        return self.budget_bytes, self.used_bytes, self.retired_bytes
-
     @property
     def resident_count(self) -> int:
         """How many segments can be handed out."""

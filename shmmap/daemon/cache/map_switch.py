@@ -91,17 +91,18 @@ class MapSwitch:
             if retired.resident.key.cell_id in moved:
                 cache.reclaimer.never_revive(retired.resident.key)
         for resident in list(cache.ledger.residents()):
-            index = cache.index_of(resident.key.cell_id)
-            if index is None or resident.key.cell_id in gone or resident.key.cell_id in moved:
-                cache.evict(resident, now_s, "map")
-                if resident.key.cell_id not in gone:
+            cell_id = resident.key.cell_id
+            index = cache.index_of(cell_id)
+            if index is None or cell_id in gone or cell_id in moved:
+                cache.reclaimer.retire(resident, now_s, "map")
+                if cell_id not in gone:
                     cache.reclaimer.never_revive(resident.key)  # its header has the old box
                 continue
             cache.warm.leave(index, resident.key.layer)
             if resident.checked or cache.is_current(resident):
                 cache.enter(resident, index)
             else:
-                cache.evict(resident, now_s, "map")
+                cache.reclaimer.retire(resident, now_s, "map")
         return change
 
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:

@@ -10,9 +10,10 @@ or when a client's session ends; on a timer only as a precaution.
 from __future__ import annotations
 
 import contextlib
-import enum
-from collections.abc import Iterable
-from typing import Final, Protocol
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.daemon.cache.eviction_policy import EvictionPolicy
 from shmmap.daemon.cache.ledger import Ledger
@@ -24,7 +25,7 @@ from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, retired_name
 
-__all__ = ["Observer", "Outcome", "Reclaimer"]
+__all__ = ["Reclaimer"]
 
 TICK_S: Final = 0.002
 """A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
@@ -43,26 +44,7 @@ PIN_MEMO_S: Final = 0.2
 """How long a segment found pinned is not considered again for eviction."""
 
 
-class Outcome(enum.Enum):
-    """What an attempt to make room came to."""
-
-    PENDING = "room is on its way: try again later"
-    IMPOSSIBLE = "everything else is in use"
-
-
-class Observer(Protocol):
-    """Who is told what becomes of segments."""
-
-    def retired(self, resident: Resident, why: str) -> None:
-        """It left service: for ``room``, ``request``, ``map``, ``superseded`` or ``damaged``."""
-
-    def freed(self, resident: Resident) -> None:
-        """Its memory went back."""
-
-    def renamed(self, name: str) -> None:
-        """A segment does not have this name any more; it has another."""
-
-
+@dataclass(eq=False, slots=True)
 class Reclaimer:
     """Carries out what the ledger and the eviction policy decide about memory.
 
@@ -73,32 +55,28 @@ class Reclaimer:
 
     Attributes
     ----------
-    observer
-        Told what becomes of segments.
+    on_retired
+        Called with a segment that left service, and why: for ``room``, ``request``, ``map``, ``superseded``
+        or ``damaged``.
+    on_gone
+        Called with a name under which there is no segment any more: it was freed, or has another.
     evicted_count
         Segments retired to make room.
     wake_s
         When `free` is worth calling again although nothing changed (hand-out grace ends).
     """
 
-    def __init__(
-        self,
-        ledger: Ledger,
-        directory: ShmDirectory,
-        sessions: Sessions,
-        policy: EvictionPolicy,
-        pins: PinWatch | None = None,
-    ) -> None:
-        self.pins = pins or PinWatch(directory)
-        self.ledger = ledger
-        self._directory = directory
-        self.sessions = sessions
-        self._policy = policy
-        self._pinned_until_s: dict[str, float] = {}
-        self._by_key: dict[Key, Retired] = {}
-        self.observer: Observer
-        self.evicted_count = 0
-        self.wake_s = float("inf")
+    ledger: Ledger
+    directory: ShmDirectory
+    sessions: Sessions
+    policy: EvictionPolicy
+    pins: PinWatch
+    on_retired: Callable[[Resident, str], None] = field(init=False)
+    on_gone: Callable[[str], None] = field(init=False)
+    evicted_count: int = 0
+    wake_s: float = math.inf
+    _pinned_until_s: dict[str, float] = field(default_factory=dict)
+    _by_key: dict[Key, Retired] = field(default_factory=dict)
 
     # --- retiring -----------------------------------------------------------------------------
 
@@ -128,19 +106,19 @@ class Reclaimer:
         Where everybody may make files somebody may have taken that name: then it is a name nobody knows.
         """
         try:
-            return self._directory.rename(resident.name, retired_name(resident.name))
+            return self.directory.rename(resident.name, retired_name(resident.name))
         except OSError as error:
             old, new = resident.name, another_name(resident.name)
             log.warning("segment not renamed", old=old, new=retired_name(old), error=error.strerror)
-            found = self._directory.rename(old, retired_name(new))
+            found = self.directory.rename(old, retired_name(new))
             self.ledger.rename(resident, new)
-            self.observer.renamed(old)
+            self.on_gone(old)
             return found
 
     def _watch(self, resident: Resident, now_s: float, why: str, *, found: bool) -> bool:
         """Have an eye on a segment out of service; True if nobody has it mapped."""
         retired = self.ledger.retired[resident.name]
-        self.observer.retired(resident, why)
+        self.on_retired(resident, why)
         if not found:
             self._forget(retired)
             return True
@@ -163,7 +141,7 @@ class Reclaimer:
             return None
         name = retired.resident.name
         try:
-            found = self._directory.rename(retired_name(name), name)
+            found = self.directory.rename(retired_name(name), name)
         except OSError as error:  # somebody else has taken its name: the cell is loaded anew
             log.warning("segment not renamed", old=retired_name(name), new=name, error=error.strerror)
             self.never_revive(key)
@@ -191,7 +169,7 @@ class Reclaimer:
             session = self.sessions.by_slot(slot)
             if session is not None:
                 session.drop_segment(resident)
-        self.observer.freed(resident)
+        self.on_gone(resident.name)
         return self.ledger.freed(resident.name)
 
     # --- freeing ------------------------------------------------------------------------------
@@ -201,15 +179,13 @@ class Reclaimer:
         due = [one for one in self.ledger.retired.values() if one.probe_after_s <= now_s]
         return sum(self._probe(one, now_s) for one in due[:PROBES_AT_ONCE])
 
-    def let_go(self, residents: Iterable[Resident], now_s: float) -> int:
-        """Somebody dropped these: free what nobody else has; returns the bytes freed."""
-        freed = 0
+    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
+        """Somebody dropped these: free what nobody else has."""
         for resident in residents:
             self._pinned_until_s.pop(resident.name, None)
             retired = self.ledger.retired.get(resident.name)
             if retired is not None:
-                freed += self._probe(retired, now_s)
-        return freed
+                self._probe(retired, now_s)
 
     def _probe(self, retired: Retired, now_s: float) -> int:
         used = self.is_pinned(retired.resident)
@@ -220,7 +196,7 @@ class Reclaimer:
         if used is False and now_s < retired.probe_after_s:
             retired.condemned = True  # its tick is not over yet
             return 0
-        self._directory.unlink(retired_name(retired.resident.name))
+        self.directory.unlink(retired_name(retired.resident.name))
         return self._forget(retired)
 
     def _interval_s(self, retired: Retired) -> float:
@@ -248,21 +224,21 @@ class Reclaimer:
 
     def next_sweep_s(self) -> float:
         """When the next look at a retired segment is due; infinity when there is none."""
-        return min((one.probe_after_s for one in self.ledger.retired.values()), default=float("inf"))
+        return min((one.probe_after_s for one in self.ledger.retired.values()), default=math.inf)
 
-    def free(self, shortage: int, now_s: float) -> Outcome:
-        """Retire segments until ``shortage`` bytes are about to be freed.
+    def free(self, shortage: int, now_s: float) -> bool:
+        """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
 
-        Looks at a bounded number per call; `Outcome.PENDING` means that calling again later helps.
+        Looks at a bounded number per call; True also means that calling again later helps.
         """
-        self.wake_s = float("inf")
+        self.wake_s = math.inf
         missing = shortage - self.ledger.condemned_bytes()
         if missing <= 0:
-            return Outcome.PENDING
+            return True
         candidates, graced = self.ledger.candidates(now_s, HAND_OUT_GRACE_S)
         self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
         unknown = [r for r in candidates if r.name not in self._pinned_until_s]
-        ordered = self._policy(unknown, self.sessions.poses())
+        ordered = self.policy(unknown, self.sessions.poses())
         # what a session says it holds is most likely pinned: look at the others first
         ordered.sort(key=lambda resident: bool(resident.sessions))
         for resident in ordered[:PROBES_AT_ONCE]:
@@ -274,21 +250,21 @@ class Reclaimer:
             self.retire(resident, now_s, "room")
             self.evicted_count += 1
             if missing <= 0:
-                return Outcome.PENDING
+                return True
         if len(ordered) > PROBES_AT_ONCE:
             self.wake_s = now_s
-            return Outcome.PENDING
+            return True
         # their readers may be just opening these; those that have done so are no reason to wait
         unknown = [r for r in graced if r.name not in self._pinned_until_s]
         for resident in unknown[:PROBES_AT_ONCE]:
             if not self.is_pinned(resident):
                 self.wake_s = resident.last_use_s + HAND_OUT_GRACE_S
-                return Outcome.PENDING
+                return True
             self._pinned_until_s[resident.name] = now_s + PIN_MEMO_S
         if len(unknown) > PROBES_AT_ONCE:
             self.wake_s = now_s
-            return Outcome.PENDING
-        return Outcome.PENDING if self.ledger.condemned_bytes() >= shortage else Outcome.IMPOSSIBLE
+            return True
+        return self.ledger.condemned_bytes() >= shortage
 
     # --- the end --------------------------------------------------------------------------------
 
@@ -296,8 +272,4 @@ class Reclaimer:
         """Take every name away; memory goes back as soon as its last reader ends."""
         for resident in self.ledger.everything():
             with contextlib.suppress(OSError):
-                self._directory.unlink(self.name_on_disk(resident))
-
-    def close(self) -> None:
-        """Hear of nothing any more."""
-        self.pins.close()
+                self.directory.unlink(self.name_on_disk(resident))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -16,13 +16,9 @@ from shmmap.protocol.messages import Handle
 __all__ = ["WarmIndex"]
 
 
+@dataclass(eq=False, slots=True)
 class WarmIndex:
     """The same twice: to be looked up one by one, and a whole area at once.
-
-    Parameters
-    ----------
-    count_cells
-        Returns how many cells the map has.
 
     Attributes
     ----------
@@ -32,10 +28,8 @@ class WarmIndex:
         Per layer, (cells,) uint64: the version, 0 where the cell is not in memory.
     """
 
-    def __init__(self, count_cells: Callable[[], int]) -> None:
-        self._count_cells = count_cells
-        self.layers: dict[str, dict[int, Resident]] = {}
-        self.versions: dict[str, NDArray[np.uint64]] = {}
+    layers: dict[str, dict[int, Resident]] = field(default_factory=dict)
+    versions: dict[str, NDArray[np.uint64]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return sum(map(len, self.layers.values()))
@@ -60,13 +54,13 @@ class WarmIndex:
         resident.handle = encode_handle(handle)
         resident.stale_handle = encode_handle(msgspec.structs.replace(handle, stale=True))
 
-    def enter(self, resident: Resident, index: int) -> None:
-        """A segment has the current version of its cell."""
+    def enter(self, resident: Resident, index: int, cells: int) -> None:
+        """A segment has the current version of its cell, one of so many ``cells`` of the map."""
         layer = resident.key.layer
         self.layers.setdefault(layer, {})[index] = resident
         versions = self.versions.get(layer)
         if versions is None:
-            versions = self.versions[layer] = np.zeros(self._count_cells(), np.uint64)
+            versions = self.versions[layer] = np.zeros(cells, np.uint64)
         versions[index] = resident.version
 
     def leave(self, index: int, layer: str) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from shmmap.daemon.events.eviction_history import EvictionHistory
 from shmmap.daemon.events.log import EventLog, PressureEvents
@@ -15,63 +16,48 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["CellEvents"]
 
 
+@dataclass(eq=False, slots=True)
 class CellEvents:
     """Hears of cells and tells of them.
 
     Parameters
     ----------
-    memory
-        Gives budget, used and retired bytes.
     wire_id
         Makes of a cell id what replies and events carry.
-
-    Attributes
-    ----------
     pressure
         Tells of cells that were refused for lack of memory.
     """
 
-    def __init__(
-        self,
-        log: EventLog,
-        memory: Callable[[], tuple[int, int, int]],
-        statistics: StatisticsWriter,
-        wire_id: Callable[[str], str],
-    ) -> None:
-        self._log = log
-        self._memory = memory
-        self._statistics = statistics
-        self._wire_id = wire_id
-        self._history = EvictionHistory()
-        self.pressure = PressureEvents(log, self._memory_in_use)
-
-    def _memory_in_use(self) -> tuple[int, int, int, int]:
-        budget, used, retired = self._memory()
-        return budget, used, self._statistics.values["bytes_pinned"], retired
+    event_log: EventLog
+    statistics: StatisticsWriter
+    wire_id: Callable[[str], str]
+    pressure: PressureEvents
+    _history: EvictionHistory = field(default_factory=EvictionHistory)
 
     def loaded(self, resident: Resident, took_ns: int, replaces: int) -> None:
         """A segment was loaded and published; ``took_ns`` from handing the load to a worker."""
-        again = self._history.loaded(resident.key, resident.version)
-        self._statistics.add("loads_finished")
-        self._statistics.add("bytes_loaded", resident.nbytes)
-        self._statistics.add("loads_after_eviction", again)
-        self._statistics.add_duration("load", took_ns)
-        self._tell_loaded(resident, resident.load_ns, again, replaces)
+        again = self._tell_loaded(resident, resident.load_ns, replaces)
+        self.statistics.add("loads_finished")
+        self.statistics.add("bytes_loaded", resident.nbytes)
+        self.statistics.add("loads_after_eviction", again)
+        self.statistics.add_duration("load", took_ns)
 
     def revived(self, resident: Resident) -> None:
         """A retired segment is in service again, without a load."""
-        again = self._history.loaded(resident.key, resident.version)
-        self._tell_loaded(resident, 0, again, 0)
+        self._tell_loaded(resident, 0, 0)
 
-    def _tell_loaded(self, resident: Resident, load_ns: int, again: bool, replaces: int) -> None:
-        self._log.publish(
-            events.Loaded, self._wire_id(resident.key.cell_id), resident.key.layer, resident.version,
+    def _tell_loaded(self, resident: Resident, load_ns: int, replaces: int) -> bool:
+        """Tell of a segment in service; returns whether it had been evicted to make room."""
+        again = self._history.loaded(resident.key, resident.version)
+        self.event_log.publish(
+            events.Loaded, self.wire_id(resident.key.cell_id), resident.key.layer, resident.version,
             resident.nbytes, resident.points, load_ns, again, replaces,
         )  # fmt: skip
+        return again
 
     def changed(self, cell_id: str, version: int) -> None:
         """A load found that a cell's file is not the one the catalogue knows."""
-        self._log.publish(events.Changed, self._wire_id(cell_id), version, "changed")
+        self.event_log.publish(events.Changed, self.wire_id(cell_id), version, "changed")
 
     def retired(self, resident: Resident, why: str) -> None:
         """A segment left service; of superseded ones their successor's event tells."""
@@ -81,22 +67,21 @@ class CellEvents:
             cell, layer = resident.key
             reason = "budget" if why == "room" else why
             log.info("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason=reason)
-            self._log.publish(
-                events.Evicted, self._wire_id(resident.key.cell_id), resident.key.layer,
-                resident.version, resident.nbytes, why,
-            )  # fmt: skip
+            self.event_log.publish(
+                events.Evicted, self.wire_id(cell), layer, resident.version, resident.nbytes, why
+            )
 
     def failed(self, key: Key, failure: Failure, now_s: float) -> None:
         """A load ended without a segment."""
-        wire_id = self._wire_id(key.cell_id)
+        wire_id = self.wire_id(key.cell_id)
         if failure.code in SPACE_CODES:
             self.pressure.refused(wire_id, key.layer, failure.code, now_s)
         else:
-            self._log.publish(
+            self.event_log.publish(
                 events.Failed, wire_id, key.layer, failure.code, failure.message, failure.delay_s
             )
 
     def retried(self, key: Key, failure: Failure) -> None:
         """A cell that failed is about to be loaded again."""
         if failure.code not in SPACE_CODES:
-            self._log.publish(events.Retried, self._wire_id(key.cell_id), key.layer, failure.code)
+            self.event_log.publish(events.Retried, self.wire_id(key.cell_id), key.layer, failure.code)

@@ -18,8 +18,7 @@ LIMIT: Final = 1 << 14
 class EvictionHistory:
     """The last keys that were evicted to make room, at most 16384 of them."""
 
-    def __init__(self, limit: int = LIMIT) -> None:
-        self._limit = limit
+    def __init__(self) -> None:
         self._versions: dict[Key, int] = {}
 
     def __len__(self) -> int:
@@ -29,7 +28,7 @@ class EvictionHistory:
         """Note that this version made room for others."""
         self._versions.pop(key, None)
         self._versions[key] = version
-        if len(self._versions) > self._limit:
+        if len(self._versions) > LIMIT:
             del self._versions[next(iter(self._versions))]
 
     def loaded(self, key: Key, version: int) -> bool:

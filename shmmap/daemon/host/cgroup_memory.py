@@ -28,7 +28,7 @@ def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
     proc
         Directory with ``cgroup`` and ``mountinfo`` of the process.
     """
-    groups = _groups(f"{proc}/cgroup")
+    groups = _groups(Path(proc, "cgroup"))
     limits: list[int] = []
     for kind, root, mount, options in mounts(f"{proc}/mountinfo"):
         group = groups.get(kind)
@@ -37,14 +37,14 @@ def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
         inside = os.path.relpath(group, root) if _is_below(group, root) else "."
         place = Path(mount, inside)
         while True:
-            limits += _read(place / _FILES[kind])
+            limits += [int(line) for line in _lines(place / _FILES[kind]) if line.isdecimal()]
             if place == Path(mount):
                 break
             place = place.parent
-    return min(limits, default=None)
+    return min((limit for limit in limits if limit < _NO_LIMIT), default=None)
 
 
-def _groups(path: str) -> dict[str, str]:
+def _groups(path: Path) -> dict[str, str]:
     """Per kind of hierarchy, the group of the process."""
     found: dict[str, str] = {}
     for line in _lines(path):
@@ -60,16 +60,9 @@ def _is_below(group: str, root: str) -> bool:
     return group == root or group.startswith(root.rstrip("/") + "/")
 
 
-def _lines(path: str) -> list[str]:
+def _lines(path: Path) -> list[str]:
+    """Lines of a file; none where it cannot be read."""
     try:
-        return Path(path).read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+        return path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:
         return []
-
-
-def _read(path: Path) -> list[int]:
-    try:
-        text = path.read_text(encoding="ascii").strip()
-    except OSError:
-        return []
-    return [int(text)] if text.isdigit() and int(text) < _NO_LIMIT else []

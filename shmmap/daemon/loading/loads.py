@@ -235,9 +235,9 @@ class Loads:
             self._queue.discard(load)
             del self.by_key[key]
 
-    def clear_failures(self, codes: frozenset[str]) -> None:
-        """Forget standing failures of these kinds: what caused them may have passed."""
-        for code in codes:
+    def forget_refusals(self) -> None:
+        """Forget standing failures for lack of memory: there may be room now."""
+        for code in SPACE_CODES:
             for key in self._keys_failed.pop(code, ()):
                 self._forget_failure(key, code)
 

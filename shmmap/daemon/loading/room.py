@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.reclaimer import Outcome
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.loading.worker_messages import Grant, Need, Refuse
+from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load
 from shmmap.quantities import format_bytes
@@ -38,7 +37,7 @@ class Room:
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
-        if self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back():
+        if self.cache.reclaimer.free(shortage, now_s) or self._may_be_given_back():
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
@@ -51,20 +50,14 @@ class Room:
         ledger = self.cache.ledger
         for number, (worker, nbytes) in list(self.hungry.items()):
             load = jobs.get(number)
-            answer: Grant | Refuse | None = None
-            if load is not None and self.loads.grow(load, nbytes):
-                answer = Grant(number)
-            elif load is not None:
-                hopeless = nbytes + ledger.overhead_bytes > ledger.budget_bytes
-                shortage = ledger.shortage(nbytes - load.reserved)
-                if not hopeless and (
-                    self.cache.reclaimer.free(shortage, now_s) is Outcome.PENDING or self._may_be_given_back()
-                ):
-                    continue
-                answer = Refuse(number)
+            if load is not None:
+                granted = self.loads.grow(load, nbytes)
+                if not granted and nbytes + ledger.overhead_bytes <= ledger.budget_bytes:
+                    shortage = ledger.shortage(nbytes - load.reserved)
+                    if self.cache.reclaimer.free(shortage, now_s) or self._may_be_given_back():
+                        continue
+                self.pool.answer(worker, Decision(granted))
             del self.hungry[number]
-            if answer is not None:
-                self.pool.answer(worker, answer)
 
     def _may_be_given_back(self) -> bool:
         """Whether a load runs that will end by itself: it may need less than is reserved for it.

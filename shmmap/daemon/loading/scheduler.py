@@ -20,16 +20,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_messages import (
-    Check,
-    Checked,
-    Done,
-    Failed,
-    Job,
-    Need,
-    Ready,
-    Segment,
-)  # fmt: skip
+from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Failed, Job, Need, Ready, Segment
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
@@ -38,7 +29,6 @@ from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.logfmt import log
 from shmmap.segment.directory import is_full
 from shmmap.segment.layout import SourceStamp
-from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Scheduler"]
 
@@ -64,26 +54,19 @@ class Scheduler:
     """
 
     def __init__(
-        self,
-        cache: CellCache,
-        loads: Loads,
-        map_switch: MapSwitch,
-        pool: WorkerPool,
-        statistics: StatisticsWriter,
-        *,
-        clock: Callable[[], float],
+        self, cache: CellCache, map_switch: MapSwitch, pool: WorkerPool, *, clock: Callable[[], float]
     ) -> None:
         self._cache = cache
         self._map_switch = map_switch
-        self._statistics = statistics
-        self.loads = loads
+        self._statistics = cache.statistics
+        self.loads = Loads(cache.ledger)
         self.pool = pool
         pool.on_message = lambda worker: self.on_worker(worker, clock())
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
-        self.room = Room(cache, loads, pool)
-        self.lost = LostWorkers(pool, self._jobs, loads, self.room, statistics, self._fail)
+        self.room = Room(cache, self.loads, pool)
+        self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
     # --- being asked ----------------------------------------------------------------------------
 
@@ -121,7 +104,7 @@ class Scheduler:
     def pump(self, now_s: float) -> None:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
-            self.loads.clear_failures(SPACE_CODES)
+            self.loads.forget_refusals()
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
         while self.pool.has_room:
@@ -174,12 +157,12 @@ class Scheduler:
     def hear_of_closes(self, now_s: float) -> None:
         """The kernel reports that segments were closed."""
         if self._cache.reclaimer.hear(now_s):
-            self.loads.clear_failures(SPACE_CODES)
+            self.loads.forget_refusals()
 
     def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
         """Somebody dropped these: what was refused for lack of memory may fit now."""
         self._cache.reclaimer.let_go(residents, now_s)
-        self.loads.clear_failures(SPACE_CODES)
+        self.loads.forget_refusals()
 
     def next_event_s(self) -> float:
         """When `pump` has something to do although nothing arrives; infinity for never."""

@@ -14,6 +14,7 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -47,14 +48,12 @@ class _Refused(Exception):
     """The daemon has no room for the segment."""
 
 
+@dataclass(eq=False, slots=True)
 class _Worker:
-    def __init__(
-        self, channel: socket.socket, directory: ShmDirectory, cache: LayerCache | None = None
-    ) -> None:
-        self._channel = channel
-        self._directory = directory
-        self._cache = cache
-        self._waiting: list[worker_messages.Job | worker_messages.Check] = []
+    channel: socket.socket
+    directory: ShmDirectory
+    cache: LayerCache | None
+    _waiting: list[worker_messages.Job | worker_messages.Check] = field(default_factory=list)
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
@@ -69,15 +68,15 @@ class _Worker:
                 self._check(job)
 
     def _receive(self) -> worker_messages.ToWorker | None:
-        data = self._channel.recv(MAX_PACKET_BYTES)
+        data = self.channel.recv(MAX_PACKET_BYTES)
         return worker_messages.decode_to_worker(data) if data else None
 
     def _send(self, message: worker_messages.FromWorker, fd: int | None = None) -> None:
         packet = worker_messages.encode(message)
         if fd is None:
-            self._channel.send(packet)
+            self.channel.send(packet)
         else:
-            socket.send_fds(self._channel, [packet], [fd])
+            socket.send_fds(self.channel, [packet], [fd])
 
     def _reserve(self, job: worker_messages.Job, nbytes: int) -> None:
         """Ask for more room where the segment needs more than was reserved for it."""
@@ -90,17 +89,17 @@ class _Worker:
                     sys.exit(0)
                 if isinstance(answer, worker_messages.Job | worker_messages.Check):
                     self._waiting.append(answer)
-                elif isinstance(answer, worker_messages.Grant):
-                    job.granted = nbytes
-                    break
-                else:
+                elif not answer.granted:
                     raise _Refused
+                else:
+                    job.granted = nbytes
+                    return
 
     def _load(self, job: worker_messages.Job) -> None:
         started_ns = time.monotonic_ns()
         _test_hook(job.path)
         try:
-            fd = self._directory.create()
+            fd = self.directory.create()
             try:
                 step("worker.alloc")
                 made = self._make(job, fd)
@@ -141,7 +140,7 @@ class _Worker:
             spec,
             CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
             fd,
-            cache=self._cache,
+            cache=self.cache,
             keep=job.layer != LAYER,  # the source itself is as quick to read, and on this disk already
             source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
@@ -152,17 +151,12 @@ class _Worker:
         if not job.points:
             return None
         try:
-            fd = self._directory.open(job.points)
-        except OSError:
-            return None
-        try:
-            lock_slot(fd, LOADER_SLOT)
-            source = read_segment(fd, job.box, spec.source_columns)
-            return source if source.stamp == SourceStamp.of(os.stat(job.path)) else None
+            with self.directory.opened(job.points) as fd:
+                lock_slot(fd, LOADER_SLOT)
+                source = read_segment(fd, job.box, spec.source_columns)
+                return source if source.stamp == SourceStamp.of(os.stat(job.path)) else None
         except (OSError, SegmentCorrupt):
             return None
-        finally:
-            os.close(fd)
 
     def _check(self, job: worker_messages.Check) -> None:
         wrong, stamp = "", None
@@ -171,13 +165,10 @@ class _Worker:
             if stamp != job.stamp:
                 wrong = "its source has changed"
             elif job.segment:
-                fd = self._directory.open(job.segment)
-                try:
+                with self.directory.opened(job.segment) as fd:
                     step("worker.check")
                     lock_slot(fd, LOADER_SLOT)
                     verify_file(fd)
-                finally:
-                    os.close(fd)
         except (OSError, SegmentCorrupt) as error:
             wrong = str(error)
         self._send(worker_messages.Checked(job.number, wrong[:500], stamp))

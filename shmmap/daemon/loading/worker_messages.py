@@ -17,14 +17,13 @@ from shmmap.segment.layout import SourceStamp
 __all__ = [
     "Check",
     "Checked",
+    "Decision",
     "Done",
     "Failed",
     "FromWorker",
-    "Grant",
     "Job",
     "Need",
     "Ready",
-    "Refuse",
     "Segment",
     "ToWorker",
     "decode_from_worker",
@@ -60,16 +59,10 @@ class Check(msgspec.Struct, array_like=True, tag="check"):
     stamp: SourceStamp
 
 
-class Grant(msgspec.Struct, array_like=True, tag="grant"):
-    """The bytes asked for are reserved."""
+class Decision(msgspec.Struct, array_like=True, tag="decision"):
+    """Whether the bytes asked for are reserved, or do not fit."""
 
-    number: int
-
-
-class Refuse(msgspec.Struct, array_like=True, tag="refuse"):
-    """The bytes asked for do not fit."""
-
-    number: int
+    granted: bool
 
 
 class Ready(msgspec.Struct, array_like=True, tag="ready"):
@@ -82,7 +75,7 @@ class Ready(msgspec.Struct, array_like=True, tag="ready"):
 
 
 class Need(msgspec.Struct, array_like=True, tag="need"):
-    """The segment needs more than was granted; the worker waits for `Grant` or `Refuse`."""
+    """The segment needs more than was granted; the worker waits for a `Decision`."""
 
     number: int
     bytes: int
@@ -133,7 +126,7 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
     stamp: SourceStamp | None = None
 
 
-ToWorker: TypeAlias = Job | Check | Grant | Refuse
+ToWorker: TypeAlias = Job | Check | Decision
 FromWorker: TypeAlias = Ready | Need | Segment | Done | Checked | Failed
 
 encode: Final = msgspec.msgpack.Encoder().encode

@@ -67,6 +67,7 @@ class Worker:
         return self.channel.fileno()
 
 
+@dataclass(eq=False, slots=True)
 class WorkerPool:
     """Up to ``limit`` worker processes.
 
@@ -91,26 +92,17 @@ class WorkerPool:
         Workers in a row that ended before they were ready: not their job's fault.
     """
 
-    def __init__(
-        self,
-        limit: int,
-        shm_dir: str,
-        deadline_s: float,
-        watched: WatchedDescriptors,
-        *,
-        cache_dir: str = "",
-        cache_bytes: int = 0,
-    ) -> None:
-        self._limit = limit
-        self._shm_dir = shm_dir
-        self._deadline_s = deadline_s
-        self._watched = watched
-        self.on_message: Callable[[Worker], None] = lambda _worker: None
-        self._cache = (cache_dir, str(cache_bytes)) if cache_dir and cache_bytes else ()
-        self._workers: dict[int, Worker] = {}
-        self._ending: list[subprocess.Popen[bytes]] = []
-        self._installed = _installed()
-        self.failed_starts = 0
+    limit: int
+    shm_dir: str
+    deadline_s: float
+    watched: WatchedDescriptors
+    cache_dir: str = ""
+    cache_bytes: int = 0
+    on_message: Callable[[Worker], None] = field(init=False)
+    failed_starts: int = 0
+    _workers: dict[int, Worker] = field(default_factory=dict)
+    _ending: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    _program: tuple[int, int] | None = field(default_factory=_installed)
 
     def __len__(self) -> int:
         return len(self._workers)
@@ -129,17 +121,18 @@ class WorkerPool:
 
     @property
     def _may_start(self) -> bool:
-        return len(self._workers) + len(self._ending) < self._limit
+        return len(self._workers) + len(self._ending) < self.limit
 
     def start_one(self) -> Worker:
         """Start a worker process."""
+        cache = (self.cache_dir, str(self.cache_bytes)) if self.cache_dir and self.cache_bytes else ()
         process, ours = start_child(
-            "shmmap.daemon.loading.worker_main", self._shm_dir, *self._cache, new_session=True
+            "shmmap.daemon.loading.worker_main", self.shm_dir, *cache, new_session=True
         )
         ours.setblocking(False)
         worker = Worker(process, ours)
         self._workers[worker.fd] = worker
-        self._watched.watch(worker.fd, lambda: self.on_message(worker))
+        self.watched.watch(worker.fd, lambda: self.on_message(worker))
         return worker
 
     def submit(self, job: worker_messages.Job | worker_messages.Check, now_s: float) -> bool:
@@ -161,7 +154,7 @@ class WorkerPool:
         worker.queue[job.number] = job
         return True
 
-    def answer(self, worker: Worker, message: worker_messages.Grant | worker_messages.Refuse) -> None:
+    def answer(self, worker: Worker, message: worker_messages.Decision) -> None:
         """Answer a worker's `worker_messages.Need`."""
         with contextlib.suppress(OSError):
             worker.channel.send(worker_messages.encode(message))
@@ -210,7 +203,7 @@ class WorkerPool:
 
     def remove(self, worker: Worker) -> tuple[list[worker_messages.Job | worker_messages.Check], str]:
         """Forget a dead worker; returns its unfinished jobs, and how it ended, for people."""
-        self._watched.unwatch(worker.fd)
+        self.watched.unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
         if worker.segment_fd >= 0:
@@ -221,7 +214,7 @@ class WorkerPool:
         except subprocess.TimeoutExpired:
             self._ending.append(worker.process)
             how = "killed, and has not ended yet"
-        if not worker.ready and (worker.foreign or _installed() != self._installed):
+        if not worker.ready and (worker.foreign or _installed() != self._program):
             how = RESTART
         return list(worker.queue.values()), how
 
@@ -230,7 +223,7 @@ class WorkerPool:
         return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
 
     def _due_s(self, worker: Worker) -> float:
-        return worker.head_since_s + (self._deadline_s if worker.ready else START_DEADLINE_S)
+        return worker.head_since_s + (self.deadline_s if worker.ready else START_DEADLINE_S)
 
     def next_deadline_s(self) -> float:
         """When the next load becomes overdue; infinity when nothing loads."""

@@ -72,13 +72,10 @@ class PinWatch:
         if kept is not None:
             yield kept[0]
             return
-        fd = self._directory.open(name)
-        try:
+        with self._directory.opened(name) as fd:
             yield fd
-        finally:
-            os.close(fd)
 
-    def told(self, fd: int) -> bool:
+    def is_used_elsewhere(self, fd: int) -> bool:
         """Whether anybody else uses an open segment, according to the kernel; False where it gives none."""
         if self.source is PinSource.LEASES:
             return in_use(fd)
@@ -88,7 +85,7 @@ class PinWatch:
         """Whether anybody uses a segment; None if its name is gone."""
         try:
             with self.opened(name) as fd:
-                return self.told(fd)
+                return self.is_used_elsewhere(fd)
         except FileNotFoundError:
             return None
         except OSError:

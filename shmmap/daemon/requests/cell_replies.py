@@ -13,7 +13,6 @@ from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.codec import encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
-from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Answer", "CellReplies"]
 
@@ -38,8 +37,6 @@ class CellReplies:
 
     cache: CellCache
     scheduler: Scheduler
-    statistics: StatisticsWriter
-    epoch: int
 
     def answer(self, wanted: PendingRequest, now_s: float) -> None:
         """Send what there is by now of everything that is wanted."""
@@ -62,14 +59,15 @@ class CellReplies:
         self.reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
         self.hand_out(wanted.session, answer, now_s)
         if wanted.deadline_s:
-            self.statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
+            self.cache.statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
 
     def reply(
         self, session: Session, request: int, answer: Answer, removed: tuple[str, ...], removed_packed: bytes
     ) -> None:
         """Send a reply; the bookkeeping follows in `hand_out`, when it is on its way."""
+        cache = self.cache
         reply = encode_cells(
-            request, self.epoch, self.cache.catalogue.map_version, answer.handles, removed, removed_packed,
+            request, cache.epoch, cache.catalogue.map_version, answer.handles, removed, removed_packed,
             answer.pending, answer.failed,
         )  # fmt: skip
         session.connection.reply(reply)
@@ -81,7 +79,7 @@ class CellReplies:
             resident.hits += 1
         session.hold(answer.residents)
         self.cache.used.update(answer.residents)
-        self.statistics.add("handles_sent", len(answer.handles))
+        self.cache.statistics.add("handles_sent", len(answer.handles))
 
     def _answer_cold(
         self, wanted: PendingRequest, index: int, layer: str, answer: Answer, now_s: float

@@ -17,21 +17,14 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.cell_replies import Answer, CellReplies
 from shmmap.daemon.requests.differential import difference, warm_difference
-from shmmap.daemon.requests.limits import (
-    SessionQuota,
-    admitted_layers,
-    check_count,
-    check_held,
-    check_queue,
-)  # fmt: skip
 from shmmap.daemon.requests.pending_request import PendingRequest, WaitingList
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area
 from shmmap.protocol import messages
-from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellRequests", "note_area"]
 
@@ -53,19 +46,17 @@ class CellRequests:
         self,
         cache: CellCache,
         scheduler: Scheduler,
-        statistics: StatisticsWriter,
         *,
-        epoch: int,
         quota_bytes: int,
         clock: Callable[[], float],
     ) -> None:
         self._cache = cache
         self._scheduler = scheduler
         scheduler.on_settled = self.settled
-        self._statistics = statistics
+        self._statistics = cache.statistics
         self._now_s = clock
-        self._quota = SessionQuota(quota_bytes, cache, statistics, clock)
-        self._answers = CellReplies(cache, scheduler, statistics, epoch=epoch)
+        self._quota = limits.SessionQuota(quota_bytes, cache, clock)
+        self._answers = CellReplies(cache, scheduler)
         self._waiting: dict[Key, list[PendingRequest]] = {}
         self._patient = WaitingList()
 
@@ -79,7 +70,7 @@ class CellRequests:
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         note_area(session, area)
-        layers = admitted_layers(self._cache, message.layers)
+        layers = limits.admitted_layers(self._cache, message.layers)
         indices = self._cache.at_height(self._cache.catalogue.query(area).tolist(), area.z)
         cells = [(index, layer) for index in indices for layer in layers]
         self._begin(PendingRequest(session, message.request, cells, area=area), message.wait, now_s)
@@ -87,8 +78,8 @@ class CellRequests:
     def selected(self, session: Session, message: messages.Selected, now_s: float) -> None:
         """Cells by id, in the order asked for."""
         _check_wait(message.wait)
-        layers = admitted_layers(self._cache, message.layers)
-        check_count(len(message.ids) * len(layers))
+        layers = limits.admitted_layers(self._cache, message.layers)
+        limits.check_count(len(message.ids) * len(layers))
         cells: list[tuple[int, str]] = []
         unknown: list[tuple[str, str]] = []
         for cell_id in message.ids:
@@ -102,11 +93,11 @@ class CellRequests:
 
     def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
         """Cells that touch an area, minus those the client holds."""
-        check_held(message)
+        limits.check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         note_area(session, area)
-        layers = admitted_layers(self._cache, message.layers)
+        layers = limits.admitted_layers(self._cache, message.layers)
         found = self._cache.catalogue.query(area)
         if len(layers) == 1 and area.z is None and self._quota.is_out_of_reach(session):
             warm = warm_difference(self._cache, message, found, layers[0])
@@ -139,7 +130,7 @@ class CellRequests:
     # --- loading and waiting --------------------------------------------------------------------
 
     def _begin(self, wanted: PendingRequest, wait_s: float | None, now_s: float) -> None:
-        check_count(len(wanted.cells))
+        limits.check_count(len(wanted.cells))
         warm = self._cache.warm.layers
         find = self._cache.find_warm
         cold = [
@@ -150,7 +141,7 @@ class CellRequests:
         self._statistics.add("hits", len(wanted.cells) - len(cold))
         self._quota.check(wanted, cold)
         if cold:
-            check_queue(self._cache.catalogue, self._scheduler.loads, wanted.session, cold)
+            limits.check_queue(self._cache.catalogue, self._scheduler.loads, wanted.session, cold)
             self._statistics.add("misses", len(cold))
             self._load(wanted, cold, now_s)
             if wait_s and wanted.outstanding and self._patient.has_room(wanted.session):

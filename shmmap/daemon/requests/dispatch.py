@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.cache.survey import Survey, Usage
+from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import bounded_intent
@@ -19,7 +20,6 @@ from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import Heard
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
-from shmmap.logfmt import log
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 
@@ -40,6 +40,7 @@ class Dispatch:
     authorization: Authorization
     survey: Survey
     sampler: Sampler
+    defects: Defects
 
     def handle(self, heard: Heard) -> None:
         """Answer one request, or say why not."""

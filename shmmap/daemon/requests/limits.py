@@ -23,7 +23,6 @@ from shmmap.layers.spec import canonical_layers
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol import messages
 from shmmap.quantities import format_bytes
-from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = [
     "MOST_CELLS",
@@ -151,7 +150,6 @@ class SessionQuota:
 
     nbytes: int
     cache: CellCache
-    statistics: StatisticsWriter
     clock: Callable[[], float]
 
     def is_out_of_reach(self, session: Session) -> bool:
@@ -190,5 +188,5 @@ class SessionQuota:
                 quota = format_bytes(self.nbytes)
                 message = f"this client would keep more than its quota of {quota} for itself alone"
                 wanted.refused[key] = ("over_budget", message)
-                self.statistics.add("refused_quota")
+                cache.statistics.add("refused_quota")
                 cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self.clock())

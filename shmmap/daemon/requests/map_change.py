@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new state of the map takes over: waiting requests, memory and loads follow it."""
+"""A new state of the map takes over: waiting requests, memory and loads follow it, and it is told."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.events.map_events import tell_reload, tell_reload_failed
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue
-from shmmap.statistics.writer import StatisticsWriter
+from shmmap.origin.catalogue import Catalogue, CatalogueChange
+from shmmap.protocol import events
 
 __all__ = ["MapChange"]
+
+CELLS_TOLD: Final = 256
+"""Changed cells named one by one: a map written anew has a million; `metadata` names them all."""
 
 
 @dataclass(eq=False, slots=True)
@@ -31,25 +34,45 @@ class MapChange:
     scheduler: Scheduler
     map_switch: MapSwitch
     event_log: EventLog
-    statistics: StatisticsWriter
 
     def collect(self) -> None:
         """A reload is over: serve what it found, and tell those who asked for it."""
-        self.reloader.collect(self.apply, self._keep)
+        self.reloader.collect(self._apply, self._keep)
 
-    def apply(self, catalogue: Catalogue) -> None:
+    def _apply(self, catalogue: Catalogue) -> None:
         """Serve another state of the map from now on."""
-        cache, old, now_s = self.cache, self.cache.catalogue, time.monotonic()
+        cache, old, statistics = self.cache, self.cache.catalogue, self.cache.statistics
         self.cells.renumber(lambda index: catalogue.find(old.id(index)), old.id)
-        change = self.map_switch.switch(catalogue, now_s)
+        change = self.map_switch.switch(catalogue, time.monotonic())
         self.scheduler.drop(change.removed)
         cache.tell_all()
-        tell_reload(self.event_log, self.statistics, catalogue, change, cache.wire_id)
-        counts = {name: len(getattr(change, name)) for name in ("changed", "moved", "added", "removed")}
-        log.info("reload done", cells=len(catalogue), **counts)
-        self.statistics.set("map_problems", len(catalogue.problems))
+        statistics.add("reloads")
+        statistics.set("last_reload_unix_ns", time.time_ns())
+        statistics.set("last_reload_failed", 0)
+        statistics.set("map_problems", len(catalogue.problems))
+        self._tell(change)
         for problem in catalogue.problems:
             log.warning("problem in the map", what=problem)
 
+    def _tell(self, change: CatalogueChange) -> None:
+        """Say what is new in the map."""
+        cache, catalogue = self.cache, self.cache.catalogue
+        kinds = {how: getattr(change, how) for how in ("changed", "moved", "added", "removed")}
+        counts = {how: len(cells) for how, cells in kinds.items()}
+        named = [(how, cell) for how, cells in kinds.items() for cell in cells[:CELLS_TOLD]][:CELLS_TOLD]
+        log.info("reload done", cells=len(catalogue), **counts)
+        self.event_log.publish(
+            events.Reloaded, catalogue.map_version, counts["changed"] + counts["moved"], counts["added"],
+            counts["removed"], len(named),
+        )  # fmt: skip
+        for how, cell in named:
+            index = catalogue.find(cell) if how != "removed" else None
+            version = catalogue.version(index) if index is not None else 0
+            self.event_log.publish(events.Changed, cache.wire_id(cell), version, how)
+
     def _keep(self, error: ShmmapError) -> None:
-        tell_reload_failed(self.event_log, self.statistics, self.cache.catalogue.map_version, error)
+        """The map could not be read again: the old state of it stays."""
+        cache = self.cache
+        cache.statistics.add("reloads_failed")
+        cache.statistics.set("last_reload_failed", 1)
+        self.event_log.publish(events.Reloaded, cache.catalogue.map_version, 0, 0, 0, 0, error.message)

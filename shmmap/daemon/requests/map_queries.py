@@ -23,7 +23,6 @@ from shmmap.errors import BadRequest, UnknownCell
 from shmmap.layers.registry import kinds
 from shmmap.protocol import messages
 from shmmap.protocol.events import Recent
-from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["MapQueries"]
 
@@ -46,11 +45,9 @@ class MapQueries:
     config: DaemonConfig
     cache: CellCache
     sessions: Sessions
-    statistics: StatisticsWriter
     pins: OperatorPins
     map_switch: MapSwitch
     loads: Loads
-    epoch: int
     event_log: EventLog
     events_path: str = ""
     _kinds: tuple[str, ...] = field(init=False, default_factory=lambda: tuple(k.describe() for k in kinds()))
@@ -64,7 +61,7 @@ class MapQueries:
         cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
         return messages.Welcome(
             message.request, major, minor, daemon=__version__, instance=self.config.instance,
-            epoch=self.epoch, session=session.slot, map_version=catalogue.map_version,
+            epoch=self.cache.epoch, session=session.slot, map_version=catalogue.map_version,
             map_path=self.config.map_path, frame_id=catalogue.frame_id, shm_dir=self.config.shm_dir,
             id_prefix=cache.id_prefix, segment_prefix=cache.segment_prefix, cells=len(catalogue),
             bounds=catalogue.bounds, layers=self._kinds,
@@ -100,7 +97,7 @@ class MapQueries:
         rows = tuple(map(self._row, indices[start:end]))
         following = end if end < len(indices) else None
         return messages.MetadataPage(
-            message.request, self.epoch, catalogue.map_version, rows, following, known, removed
+            message.request, self.cache.epoch, catalogue.map_version, rows, following, known, removed
         )
 
     def _row(self, index: int) -> messages.MetadataRow:
@@ -114,8 +111,8 @@ class MapQueries:
         nothing = Share()
         rows = tuple(_session_row(one, usage.shares.get(one.slot, nothing), now_s) for one in self.sessions)
         return messages.StatsReply(
-            message.request, self.epoch, self._catalogue.map_version, dict(self.statistics.values), rows,
-            usage.unknown, usage.unknown_bytes,
+            message.request, self.cache.epoch, self._catalogue.map_version,
+            dict(self.cache.statistics.values), rows, usage.unknown, usage.unknown_bytes,
         )  # fmt: skip
 
     def _show(self, message: messages.Show) -> messages.ShownCell:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 __all__ = ["RecentCounts"]
@@ -24,10 +24,10 @@ class RecentCounts:
         Over which spans their growth is told, longest last.
     """
 
-    def __init__(self, names: Sequence[str], spans_s: Sequence[float]) -> None:
+    def __init__(self, names: Iterable[str], spans_s: Iterable[float]) -> None:
         self._names = tuple(names)
         self._spans_s = tuple(spans_s)
-        length = int(max(spans_s) / SAMPLE_S) + 2
+        length = int(max(self._spans_s) / SAMPLE_S) + 2
         self._samples: deque[tuple[float, tuple[int, ...]]] = deque(maxlen=length)
 
     def look(self, values: Mapping[str, int], now_s: float) -> None:

@@ -14,13 +14,11 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import client_row
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.statistics.client_rows import MAX_CLIENTS
 from shmmap.statistics.counters import SPANS, WINDOWED
-from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["BEAT_S", "Sampler"]
 
@@ -48,23 +46,19 @@ class Sampler:
 
     cache: CellCache
     scheduler: Scheduler
-    statistics: StatisticsWriter
-    rows: CellRows
     event_log: EventLog
     sessions: Sessions
     waiting: Sized
     on_beat: Callable[[], None]
     next_s: float = 0.0
-    _recent: RecentCounts = field(
-        init=False, default_factory=lambda: RecentCounts(tuple(WINDOWED), tuple(SPANS.values()))
-    )
+    _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _looked_s: float = float("-inf")
     _told_s: float = float("-inf")
     _last_s: float = 0.0
 
     def turn(self, now_s: float) -> None:
         """Beat if it is time to, soon after cells came, went or changed."""
-        if self.statistics.outdated:
+        if self.cache.statistics.outdated:
             # whoever asks right after a change sees it, yet a stream of changes costs little
             self.next_s = min(self.next_s, self._last_s + CHANGE_BEAT_S)
         if now_s >= self.next_s:
@@ -73,38 +67,38 @@ class Sampler:
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
-        ledger, set_value = self.cache.ledger, self.statistics.set
+        cache, ledger, set_value = self.cache, self.cache.ledger, self.cache.statistics.set
         set_value("sessions", len(self.sessions))
         set_value("waiting_requests", len(self.waiting))
         set_value("workers", len(self.scheduler.pool))
         set_value("load_queue", len(self.scheduler.loads))
         set_value("cells_resident", ledger.resident_count)
-        set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(self.cache.warm))
+        set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(cache.warm))
         set_value("bytes_resident", ledger.resident_bytes)
         set_value("zombies", len(ledger.retired))
         set_value("bytes_zombie", ledger.retired_bytes)
-        set_value("bytes_pinned", self.cache.survey.usage.nbytes)
-        set_value("segments_pinned", self.cache.survey.usage.count)
+        set_value("bytes_pinned", cache.survey.usage.nbytes)
+        set_value("segments_pinned", cache.survey.usage.count)
         set_value("bytes_reserved", ledger.reserved_bytes)
-        set_value("bytes_statistics", self.statistics.size_bytes)
+        set_value("bytes_statistics", cache.statistics.size_bytes)
         set_value("budget_bytes", ledger.budget_bytes)
-        set_value("evictions", self.cache.reclaimer.evicted_count)
-        set_value("map_cells", len(self.cache.catalogue))
+        set_value("evictions", cache.reclaimer.evicted_count)
+        set_value("map_cells", len(cache.catalogue))
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
         """What takes longer, and need not be done at each of many beats while cells load."""
         self._looked_s = now_s
-        if self.cache.survey.idle:  # else the serving loop is at it
-            self.cache.survey.step()
-        values = self.statistics.values
+        cache, values = self.cache, self.cache.statistics.values
+        if cache.survey.idle:  # else the serving loop is at it
+            cache.survey.step()
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
         clients = islice(self.sessions, MAX_CLIENTS)
-        self.statistics.show_clients([client_row(session) for session in clients])
-        self.cache.events.pressure.turn(now_s)
+        cache.statistics.show_clients([client_row(session) for session in clients])
+        cache.events.pressure.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
             self.event_log.beat()
@@ -115,13 +109,13 @@ class Sampler:
         for _ in range(min(USED_ROWS_A_BEAT, len(cache.used))):
             resident = cache.used.pop()
             if cache.ledger.resident_named(resident.name) is resident:
-                self.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
+                cache.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
 
     def _beat(self, now_s: float) -> None:
         self.measure()
         if now_s - self._looked_s >= BEAT_S:
             self._look_around(now_s)
-        self.cache.ledger.overhead_bytes = self.statistics.size_bytes
+        self.cache.ledger.overhead_bytes = self.cache.statistics.size_bytes
         self._show_used()
-        self.statistics.beat()
+        self.cache.statistics.beat()
         self.on_beat()

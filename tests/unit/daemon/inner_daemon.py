@@ -23,14 +23,13 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
+from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.telemetry.cell_rows import CellRows
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
@@ -38,7 +37,6 @@ from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
 from shmmap.protocol.messages import Area, BoxMessage, Cells
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.names import segment_prefix
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.writer import StatisticsWriter
@@ -83,7 +81,9 @@ class InnerDaemon:
         self.sessions = Sessions()
         self.ledger = Ledger(budget_bytes)
         self.ledger.overhead_bytes = self.statistics.size_bytes
-        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, POLICIES["distance"])
+        self.reclaimer = Reclaimer(
+            self.ledger, self.directory, self.sessions, POLICIES["distance"], PinWatch(self.directory)
+        )
         self.watched = WatchedDescriptors()
         self.pool = WorkerPool(
             workers,
@@ -94,31 +94,26 @@ class InnerDaemon:
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
-            catalogue, self.ledger, self.reclaimer, self.directory, self.statistics,
-            instance="inner", epoch=EPOCH, mode=0o400, gid=-1, event_log=self.event_log,
-            rows=CellRows(self.statistics, catalogue.id_prefix, segment_prefix("inner")),
+            catalogue, self.reclaimer, self.statistics, self.event_log,
+            instance="inner", mode=0o400, gid=-1,
         )  # fmt: skip
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
-        self.loads = Loads(self.ledger)
         self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(
-            self.cache, self.loads, self.map_switch, self.pool, self.statistics, clock=self.now_s
-        )
+        self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
+        self.loads = self.scheduler.loads
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.cache,
             self.scheduler,
-            self.statistics,
-            epoch=EPOCH,
             quota_bytes=quota_bytes,
             clock=self.now_s,
         )
         self.scheduler.on_settled = self._on_settled
         self.queries = MapQueries(
             DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir), self.cache,
-            self.sessions, self.statistics, OperatorPins(self.cache, self.scheduler), self.map_switch,
-            self.loads, epoch=EPOCH, event_log=self.event_log,
+            self.sessions, OperatorPins(self.cache, self.scheduler), self.map_switch, self.loads,
+            self.event_log,
         )  # fmt: skip
 
     def _on_settled(self, key: Key) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -106,11 +107,11 @@ BAD: list[tuple[str, Any]] = [
     ("budget_bytes", -1), ("budget_bytes", "lots"), ("budget_bytes", 1.5), ("budget_bytes", 1 << 70),
     ("budget_bytes", True), ("eviction", "fifo"), ("eviction", 3), ("strict", "maybe"), ("strict", 1),
     ("instance", "a/b"), ("instance", ""), ("instance", "x" * 65), ("instance", "a.b"), ("instance", 5),
-    ("map_path", 5), ("group", ["x"]), ("shm_dir", None),
+    ("map_path", 5), ("group", ["x"]),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "value"), [(n, v) for n, v in BAD if v is not None])
+@pytest.mark.parametrize(("name", "value"), BAD)
 def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None:
     with pytest.raises(ConfigError) as failure:
         load({name: value})
@@ -175,6 +176,13 @@ def test_quotas_are_parts_or_bytes() -> None:
     assert load({"session_quota": "1"}).session_quota == 1.0
     assert load({"session_quota": "64M"}).session_quota == float(64 << 20)
     assert load({"session_quota": 1}).session_quota == 1.0
+
+
+def test_a_processor_is_left_for_who_is_being_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    for processors, loaders in ((1, 1), (2, 1), (4, 3), (64, 4)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, count=processors: set(range(count)))
+        assert DaemonConfig().loaders() == loaders
+    assert DaemonConfig(workers=9).loaders() == 9
 
 
 def test_the_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

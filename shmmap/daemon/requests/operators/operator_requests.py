@@ -19,15 +19,7 @@ from shmmap.protocol.codec import encode
 
 __all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
 
-OPERATOR_REQUESTS: Final = (
-    messages.Reload,
-    messages.Evict,
-    messages.Pin,
-    messages.Unpin,
-    messages.Shutdown,
-)
-
-
+OPERATOR_REQUESTS: Final = (messages.Reload, messages.Evict, messages.Pin, messages.Unpin, messages.Shutdown)
 FAREWELL_S: Final = 1.0
 """How long a stop waits for the one who asked for it: its libzmq drops a reply that was not read when the
 connection ends (ZMQ_IMMEDIATE)."""
@@ -88,6 +80,6 @@ class OperatorRequests:
         residents = self.cache.ledger.residents()
         chosen = [r for r in residents if message.ids is None or r.key.cell_id in cells]
         loose = [resident for resident in chosen if resident.key not in self.pins]
-        freed = sum(self.cache.evict(resident, now_s) for resident in loose)
+        freed = sum(self.cache.reclaimer.retire(resident, now_s) for resident in loose)
         kept = len(chosen) - len(loose)
         return messages.Evicted(message.request, freed, len(loose) - freed, unknown, kept)

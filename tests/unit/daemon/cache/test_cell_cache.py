@@ -90,7 +90,7 @@ def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch)
     broken = [fail(number, "load_failed") for number in (0, 1, 2, 0, 3, 4)]
     full = [fail(number, "no_space") for number in (5, 6)]
     assert set(loads.failures) == {broken[0], broken[4], broken[5], *full}
-    loads.clear_failures(frozenset({"no_space"}))
+    loads.forget_refusals()
     assert set(loads.failures) == {broken[0], broken[4], broken[5]}
     assert not loads.by_key
 
@@ -105,7 +105,7 @@ class Puppet:
         process = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
         self.worker = Worker(process, ours, ready=True)
         one.pool._workers[self.worker.fd] = self.worker
-        one.pool._watched.watch(self.worker.fd, lambda: one.pool.on_message(self.worker))
+        one.pool.watched.watch(self.worker.fd, lambda: one.pool.on_message(self.worker))
 
     def queue(self, count: int) -> list[worker_messages.Job]:
         """Run the daemon until it has handed out this many jobs."""
@@ -274,10 +274,11 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
         puppet.say(puppet.done(job))
         os.close(fd)
     assert len(one.cells_of(1).cells) == 4
-    granted = worker_messages.decode_to_worker(
-        next(d for d in iter(lambda: puppet.channel.recv(65536), b"") if b"grant" in d)
-    )
-    assert granted == worker_messages.Grant(queue[0].number)
+    packets = [puppet.channel.recv(65536) for _ in range(5)]
+    *jobs, decision = map(worker_messages.decode_to_worker, packets)
+    assert jobs == queue
+    assert decision == worker_messages.Decision(True), "and none of a job that nobody has"
+    assert not wait_readable([puppet.channel.fileno()], 0.0)
     assert (one.ledger.reserved_bytes, one.scheduler.room.hungry) == (0, {})
     puppet.channel.close()
 
@@ -289,7 +290,7 @@ def test_more_needed_than_there_will_ever_be(puppet: Puppet) -> None:
     assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == job
     puppet.say(worker_messages.Need(job.number, one.ledger.budget_bytes))
     one.run_until(lambda: wait_readable([puppet.channel.fileno()], 0.0))
-    assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == worker_messages.Refuse(job.number)
+    assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == worker_messages.Decision(False)
     puppet.say(worker_messages.Failed(job.number, "over_budget", "it does not fit"))
     assert [failure.code for failure in one.cells_of(1).failed] == ["over_budget"]
     puppet.channel.close()
@@ -301,7 +302,7 @@ def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     one.cells.area(one.session(), Area(1, EVERYWHERE, wait=30.0), one.now_s())
     assert len(one.cells_of(1).cells) == 16
     for resident in list(one.ledger.residents()):
-        one.cache.evict(resident, one.now_s())
+        one.reclaimer.retire(resident, one.now_s())
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     lowest = os.dup(0)
     os.close(lowest)

@@ -39,7 +39,7 @@ def test_forgotten_layers_leave_no_tables(tmp_path: Path, inner: Inner) -> None:
         ask(one, session, number, f"voxel(leaf={number}.0)")
     assert len(one.cache.warm.layers) == len(one.cache.warm.versions) == 3
     for resident in list(one.ledger.residents()):
-        one.cache.evict(resident, one.now_s())
+        one.reclaimer.retire(resident, one.now_s())
     assert one.cache.warm.layers == {}
     assert one.cache.warm.versions == {}
     assert len(ask(one, session, 9, "voxel(leaf=1.0)").cells) == 2

@@ -47,14 +47,14 @@ def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> N
     first = load(one, 1)
     old = first.name
     with taken(one, retired_name(old)), open(f"{one.shm_dir}{old}", "rb"):
-        one.cache.evict(first, one.now_s())
+        one.reclaimer.retire(first, one.now_s())
         assert first.name != old
         assert Path(f"{one.shm_dir}{retired_name(first.name)}").exists()
         assert shown(one) == {first.name.rpartition(".")[2]: "zombie"}
         assert load(one, 2) is first
         assert shown(one) == {first.name.rpartition(".")[2]: "resident"}
         assert Path(f"{one.shm_dir}{first.name}").exists()
-    one.cache.evict(first, one.now_s())
+    one.reclaimer.retire(first, one.now_s())
     one.run_until(lambda: not one.ledger.retired)
     assert (one.ledger.retired_bytes, one.ledger.resident_bytes, shown(one)) == (0, 0, {})
     assert [name for name in os.listdir(one.shm_dir) if not name.endswith("statistics")] == []
@@ -65,7 +65,7 @@ def test_the_name_it_had_before(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     first = load(one, 1)
     with open(f"{one.shm_dir}{first.name}", "rb"):
-        one.cache.evict(first, one.now_s())
+        one.reclaimer.retire(first, one.now_s())
         with taken(one, first.name):
             assert load(one, 2) is not first
         assert one.ledger.retired

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from shmmap.daemon.events.eviction_history import EvictionHistory
 from shmmap.daemon.records import Key
 
 
-def test_what_was_evicted_is_known_once() -> None:
-    history = EvictionHistory(limit=3)
+def test_what_was_evicted_is_known_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmmap.daemon.events.eviction_history.LIMIT", 3)
+    history = EvictionHistory()
     for number in range(5):
         history.evicted(Key(f"{number}", "points"), number)
     assert len(history) == 3

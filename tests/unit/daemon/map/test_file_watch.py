@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.host import inotify
-from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch
+from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch, directories_of
 from shmmap.errors import ConfigError
 
 
@@ -20,6 +20,17 @@ def watch(tmp_path: Path) -> Iterator[FileWatch]:
     one = FileWatch([str(tmp_path)])
     yield one
     one.close()
+
+
+def test_the_directories_of_a_map(tmp_path: Path) -> None:
+    """Of its cells, wherever those are, and of its metadata."""
+    town, elsewhere = tmp_path / "town", tmp_path / "elsewhere"
+    (town / "cells").mkdir(parents=True)
+    assert directories_of(str(town), "", f"{town}/cells/") == {str(town), f"{town}/cells"}
+    assert directories_of(str(town), "", f"{elsewhere}/") == {str(town)}, "it is not there"
+    assert directories_of(str(town), f"{elsewhere}/map.yaml", f"{town}/") == {str(town), str(elsewhere)}
+    assert directories_of(f"{town}/all.pcd", "", f"{town}/all.pcd") == {str(town)}
+    assert directories_of("all.pcd", "", "") == {"."}
 
 
 def test_it_is_due_once_the_files_were_left_alone(watch: FileWatch, tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ def test_use(directory: ShmDirectory, source: PinSource, lock: int | None, used:
 def test_a_kept_segment_tells_when_it_is_let_go(directory: ShmDirectory) -> None:
     pins = PinWatch(directory, events=True)
     zombie = NAME + ".zombie"
+    descriptors = len(os.listdir("/proc/self/fd"))
     mapping = map_segment(directory.path + NAME, 5)
     directory.rename(NAME, zombie)
     assert pins.keep(zombie)
@@ -85,6 +86,8 @@ def test_a_kept_segment_tells_when_it_is_let_go(directory: ShmDirectory) -> None
     assert pins.is_used(zombie) is False
     directory.unlink(zombie)  # its memory goes when it is released
     pins.release(zombie)
+    assert not pins.keeps(zombie)
+    assert len(os.listdir("/proc/self/fd")) == descriptors
     assert pins.closed() == set()
     pins.close()
 

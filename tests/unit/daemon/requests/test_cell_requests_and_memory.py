@@ -27,8 +27,8 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
     wanted = ("0_0.pcd", "20_20.pcd", "20_0.pcd")
     with one.loaders_standing_still(), open(one.path_of(second.name.rsplit(".", 1)[1]), "rb"):
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
-        one.cache.evict(first, one.now_s() - 1.0)
-        one.cache.evict(second, one.now_s() - 1.0)
+        one.reclaimer.retire(first, one.now_s() - 1.0)
+        one.reclaimer.retire(second, one.now_s() - 1.0)
         one.run_until(lambda: first.name not in one.ledger.retired)
         assert second.name in one.ledger.retired, "somebody has it open"
         os.kill(next(iter(one.pool)).process.pid, signal.SIGCONT)
@@ -171,7 +171,7 @@ def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
     wanted = ("0_0.pcd", "0_0.pcd", "20_0.pcd")
     with one.loaders_standing_still():
         one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
-        one.cache.evict(first, one.now_s() - 1.0)
+        one.reclaimer.retire(first, one.now_s() - 1.0)
         one.run_until(lambda: first.name not in one.ledger.retired)
     assert names(one.cells_of(2)) == list(wanted)
     assert sum(reply.request == 2 for _, reply in one.replies) == 1

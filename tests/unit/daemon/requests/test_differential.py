@@ -63,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     inner.reload()
     after = ask(inner, 2, EVERYWHERE)
     names = sorted(made.corners)
-    inner.cache.evict(inner.cache.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
+    inner.reclaimer.retire(inner.cache.warm.layers["points"][names.index(COLD)], inner.now_s() - 1.0)
     inner.run_until(lambda: not inner.ledger.retired)
     assert set(before) == set(names)
     assert set(after) == set(names) - {BROKEN}
@@ -184,12 +184,16 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
     """A cell held in another layer only is still new in this one."""
     name = "-20_-20.pcd"
     index = served.names.index(name)
-    for layers, lacks in (((), [(index, "points")]), (("points",), []), (("points", "points"), [])):
+    for layers, lacks in (
+        (("voxel(leaf=1.0)",), [(index, "points")]),
+        (("points",), []),
+        (("points", "points"), []),
+        (("voxel(leaf=1.0)", "points"), []),
+    ):
         message = Differential(1, EVERYWHERE, ("points",), (HeldCell(name, served.current[name], layers),))
-        if layers:
-            found = difference(served.inner.cache, message, [index], ("points",))
-            assert found.cells == lacks
-            assert found.removed == ()
+        found = difference(served.inner.cache, message, [index], ("points",))
+        assert found.cells == lacks
+        assert found.removed == ()
 
 
 @pytest.mark.parametrize("packed", [b"1234567", b"123456789"])
