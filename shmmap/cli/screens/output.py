@@ -33,6 +33,7 @@ __all__ = [
     "wants_style",
 ]
 
+_EDGES: Final = 2  # blanks left and right of a table
 _NARROWEST: Final = 20  # columns that text needs to be worth breaking
 
 
@@ -123,7 +124,7 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     from rich.text import Text
 
     console = Console(highlight=False)
-    shown = columns_that_fit(columns, rows, console.width)
+    shown = columns_that_fit(columns, rows, console.width - _EDGES)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
     for index in shown:
         # only the first column, a name, may be folded: numbers in pieces tell nothing
