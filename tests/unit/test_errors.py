@@ -81,7 +81,7 @@ def test_a_package_that_is_missing_is_one_line(module: str, package: str) -> Non
     with pytest.raises(PackageMissing) as missing, needed_packages("shmmap-ndt"):
         __import__(module)
     assert missing.value.message == f"shmmap-ndt needs the package {package}, which is not installed"
-    assert f"pip install {package}; a client-only install has only" in missing.value.hint
+    assert f"pip install {package}; after a client-only install, `pip install .`" in missing.value.hint
     assert missing.value.__cause__ is None
     assert missing.value.__suppress_context__
 

@@ -150,7 +150,7 @@ def print_summary(summary: DriveSummary) -> None:
         why = (f"{s.trust.describe(name)} ({count})" for name, count in s.failed_limits.items())
         print(f"  not trusted   {', '.join(why)}")
     if s.lost or s.relocalized:
-        print(f"  lost          {s.lost} scans; relocalized {s.relocalized} times")
+        print(f"  lost          scans: {s.lost}, times relocalized: {s.relocalized}")
     print(
         f"map             updates: {s.map_updates}, cells added: {s.cells_added}, cells removed:"
         f" {s.cells_removed}, scans that waited for it: {s.waited}"
