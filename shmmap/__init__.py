@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from shmmap.layers.covariance import voxel_covariances
     from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
-    from shmmap.needed_packages import needed_packages
+    from shmmap.optional_packages import needed_packages
     from shmmap.protocol.messages import HeldCell, Holder, Intent
 
 __version__ = "0.2.0"
@@ -188,12 +188,12 @@ def __getattr__(name: str) -> Any:
     elif name == "write_pcd":
         module = "shmmap.formats.pcd.writer"
     elif name == "needed_packages":
-        module = "shmmap.needed_packages"
+        module = "shmmap.optional_packages"
     elif name in __all__:
         module = "shmmap.errors"
     else:
         raise AttributeError(f"module 'shmmap' has no attribute {name!r}")
-    from shmmap.needed_packages import needed_packages
+    from shmmap.optional_packages import needed_packages
 
     with needed_packages(f"shmmap.{name}"):
         value = getattr(importlib.import_module(module), name)

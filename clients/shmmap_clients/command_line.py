@@ -44,9 +44,11 @@ __all__ = [
     "add_daemon_options",
     "add_json_option",
     "add_verb",
+    "announce_scans",
     "at_least",
     "complain",
     "connect",
+    "finite",
     "not_negative",
     "nothing_found",
     "output_file",
@@ -147,8 +149,24 @@ def not_negative(text: str) -> float:
     return value
 
 
+def finite(text: str) -> float:
+    """Read a finite number."""
+    value = _number(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a number, not {text!r}")
+    return value
+
+
 def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def announce_scans(args: argparse.Namespace) -> None:
+    """Say that ``--scans`` is waited for where it is the address of a publisher, unless ``--quiet``."""
+    from shmmap_clients.streams import is_endpoint
+
+    if is_endpoint(args.scans) and not args.quiet:
+        print_line(f"waiting for scans from {args.scans}", file=sys.stderr)

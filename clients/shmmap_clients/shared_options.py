@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from shmmap_clients.command_line import not_negative, positive
+from shmmap_clients.command_line import finite, not_negative, positive
 
 __all__ = [
     "add_backend_option",
@@ -125,7 +125,7 @@ def add_height_option(parser: Parser, *, default: float | None, shown: str) -> N
     """Add ``--height``."""
     parser.add_argument(
         "--height",
-        type=float,
+        type=finite,
         default=default,
         metavar="M",
         help=f"height of the frame that the points are in above the map's ground (default: {shown})",

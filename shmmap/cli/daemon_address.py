@@ -70,11 +70,30 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
     name, directory = instance(args), shm_dir(args)
     found = read_statistics(name, directory)
     if found.identity is None:
+        others = ", ".join(_instances(directory))
         raise NoSocket(
             f"no daemon runs as instance {name!r} with segments in {directory}",
-            hint="start one with `shmmap serve MAP`, or say which: --endpoint, or --instance with --shm-dir",
+            hint=f"other instances are there: {others}; name one with --instance or SHMMAP_INSTANCE"
+            if others
+            else "start one with `shmmap serve MAP`, or say which: --endpoint, or --instance with --shm-dir",
         )
     return found, found.identity
+
+
+def _instances(directory: str) -> list[str]:
+    """Return the instances with statistics in ``directory``."""
+    from shmmap.segment.names import statistics_name
+
+    begin, end = statistics_name("*").removeprefix("/").split("*")
+    try:
+        names = sorted(os.listdir(directory))
+    except OSError:
+        return []
+    return [
+        name.removeprefix(begin).removesuffix(end)
+        for name in names
+        if name.startswith(begin) and name.endswith(end)
+    ]
 
 
 def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:

@@ -21,10 +21,14 @@ def output_file(text: str) -> Path:
         There is no such directory, or it or the file may not be written to.
     """
     path = Path(text)
-    with writing_errors(text):
+    with writing_errors(str(path)):
         if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), text)
-        os.stat(os.path.join(path.parent, "."))  # a directory, and there
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        try:
+            os.stat(os.path.join(path.parent, "."))  # a directory, and there
+        except OSError as error:
+            error.filename = text  # the name that the caller knows
+            raise
         if not os.access(path if path.exists() else path.parent, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), text)
     return path

@@ -80,7 +80,7 @@ class _Prose(str):
 
 
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Fills prose and texts of one line, and leaves others of several lines as they are written."""
+    """Fills prose and texts of one line, and folds the long lines of others."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = argparse.HelpFormatter._fill_text
@@ -88,7 +88,37 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
             first, *others = text.splitlines()
             hanging = [fill(self, line, width - 2, indent).replace("\n", "\n  ") for line in others]
             return "\n".join([fill(self, first, width, indent), *hanging])
-        return super()._fill_text(text, width, indent) if "\n" in text else fill(self, text, width, indent)
+        return _folded(text, width + 1) if "\n" in text else fill(self, text, width, indent)
+
+
+def _folded(text: str, width: int) -> str:
+    """Fold lines that are too long; those with an indent (JSON, commands) hang, others are sentences.
+
+    A sentence that continues in the next line is filled with it.
+    """
+    import textwrap
+
+    lines: list[str] = []
+    for line in text.splitlines():
+        continues = lines and lines[-1][-1:] not in ("", ".", ":") and not lines[-1].startswith(" ")
+        if continues and line and not line.startswith(" "):
+            lines[-1] += " " + line
+        else:
+            lines.append(line)
+    folded: list[str] = []
+    for line in lines:
+        words = line.lstrip()
+        indent = " " * (len(line) - len(words))
+        hanging = indent + "  " if indent else ""
+        folded += textwrap.wrap(
+            words,
+            width,
+            initial_indent=indent,
+            subsequent_indent=hanging,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ) or [""]
+    return "\n".join(folded)
 
 
 def add_verb(
@@ -103,7 +133,8 @@ def add_verb(
 ) -> argparse.ArgumentParser:
     """Add a verb that ``run`` carries out.
 
-    The lines of ``description`` are paragraphs; ``json`` and ``epilog`` stand below the options as written.
+    The lines of ``description`` are paragraphs; ``json`` and ``epilog`` stand below the options as written,
+    with long lines folded.
     """
     if json:
         epilog = f"JSON (fields may be added, none is removed):\n{json}"

@@ -4,18 +4,20 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import re
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any, Final, NoReturn
 
-from shmmap.errors import InternalError, ShmmapError
+from shmmap.errors import CannotWrite, InternalError, ShmmapError
 
 __all__ = ["Parser", "add_allow_empty", "complain", "exit_code_of", "join_negative_values", "nothing_found"]
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
+_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 
@@ -58,7 +60,10 @@ class Parser(argparse.ArgumentParser):
         words, self._words = self._words, []
         options = (word for word in words if word.startswith("--") and len(word) > len("--"))
         unknown = [word for word in options if word.split("=")[0] not in self._option_string_actions]
-        if unknown and message.endswith("required"):  # a misspelt option is why another one is missing
+        missing = message.endswith("required") or message.startswith(
+            "the following arguments are required: -"
+        )
+        if unknown and missing:  # a misspelt option is why another one is missing
             self._refuse_unknown(unknown)
         complain(self.prog, message, f"{self.prog} --help")
         sys.exit(2)
@@ -83,6 +88,7 @@ def join_negative_values(words: Sequence[str], options: Container[str] | None = 
 
 def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program to its end and return its exit code; its errors are told on stderr."""
+    _open_what_is_closed()
     try:
         code = run()
         sys.stdout.flush()
@@ -90,12 +96,17 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         complain(name, error.message, error.hint)
         return error.exit_code
     except BrokenPipeError:
-        # the interpreter flushes stdout once more at exit: let that go nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return _EXIT_BROKEN_PIPE
     except KeyboardInterrupt:
         return _EXIT_INTERRUPTED
     except Exception as error:  # noqa: BLE001
+        if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
+            _drop_output()
+            complain(
+                name, f"cannot write the output: {error.strerror}", "free some space, or choose another disk"
+            )
+            return CannotWrite.exit_code
         import traceback
 
         traceback.print_exc()
@@ -106,6 +117,18 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         )
         return InternalError.exit_code
     return code
+
+
+def _open_what_is_closed() -> None:
+    """Let what is printed go nowhere if stdout or stderr was closed when this process was started."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+
+
+def _drop_output() -> None:
+    """Let what stdout still holds go nowhere: the interpreter flushes it once more at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def complain(name: str, message: str, hint: str = "") -> None:

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from shmmap.needed_packages import needed_packages
+from shmmap.optional_packages import needed_packages
 
 if TYPE_CHECKING:
     import open3d

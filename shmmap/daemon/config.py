@@ -149,6 +149,7 @@ def parse_bytes(text: str) -> int:
 def _convert(name: str, value: Any, origin: str) -> Any:
     """Check one setting's type and range."""
     kind = type(getattr(DaemonConfig(), name))
+    called = FILE_NAMES.get(name, name)
     try:
         if name in ("budget_bytes", "cache_bytes"):
             value = parse_bytes(value) if isinstance(value, str) else value
@@ -166,15 +167,15 @@ def _convert(name: str, value: Any, origin: str) -> Any:
             raise ValueError
     except ConfigError as error:
         raise ConfigError(
-            f"{origin}: {name}: {error.message}", key=name, origin=origin, hint=error.hint
+            f"{origin}: {called}: {error.message}", key=name, origin=origin, hint=error.hint
         ) from None
     except (KeyError, ValueError, OverflowError):
         raise ConfigError(
-            f"{origin}: {name} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
+            f"{origin}: {called} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
         ) from None
     is_possible, hint = _RANGES.get(name, (lambda _value: True, ""))
     if not is_possible(value):
-        raise ConfigError(f"{origin}: {name} cannot be {value!r}", key=name, origin=origin, hint=hint)
+        raise ConfigError(f"{origin}: {called} cannot be {value!r}", key=name, origin=origin, hint=hint)
     return value
 
 

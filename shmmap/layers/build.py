@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest, InternalError
 from shmmap.layers.contract import BUILT_ANYWHERE, Box, Columns, LayerTable, PointTable
 from shmmap.layers.spec import LayerSpec, parse_layer
-from shmmap.needed_packages import needed_packages
+from shmmap.optional_packages import needed_packages
 
 __all__ = ["build_layer", "build_spec"]
 

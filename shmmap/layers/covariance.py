@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
-from shmmap.needed_packages import needed_packages
+from shmmap.optional_packages import needed_packages
 
 __all__ = ["CONVENTIONS", "Convention", "voxel_covariances"]
 

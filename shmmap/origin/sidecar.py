@@ -101,7 +101,10 @@ def load_sidecar(path: str, key: str) -> Catalogue | None:
         return _catalogue(header, rest)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, MapDataError, msgspec.MsgspecError) as error:
+    except OSError as error:
+        log.warning("catalogue cache cannot be read", path=path, error=error.strerror)
+        return None
+    except (ValueError, MapDataError, msgspec.MsgspecError) as error:
         log.warning("damaged catalogue cache ignored", path=path, error=error)
         return None
 

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from typing import Final
 
 __all__ = ["MAX_PACKET_BYTES", "channel", "how_ended", "start_child"]
@@ -26,7 +28,10 @@ def channel() -> tuple[socket.socket, socket.socket]:
 def start_child(
     module: str, *arguments: str, new_session: bool
 ) -> tuple[subprocess.Popen[bytes], socket.socket]:
-    """Start ``python -m MODULE CHANNEL_FD PARENT_PID ARGUMENT...``.
+    """Start ``python -m MODULE CHANNEL_FD PARENT_PID ARGUMENT...``; Ctrl-C is the parent's to handle.
+
+    The child has SIGINT blocked from its first instruction on: else it could end in the middle of its
+    imports, with a traceback at the user's terminal.
 
     Parameters
     ----------
@@ -43,7 +48,7 @@ def start_child(
     """
     ours, theirs = channel()
     try:
-        with theirs:
+        with theirs, _interrupts_blocked():
             # one worker, one core: Open3D would start a thread for each
             environment = {
                 "OMP_NUM_THREADS": "1",
@@ -60,6 +65,16 @@ def start_child(
         ours.close()
         raise
     return process, ours
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT in this thread and in what it starts; one that came meanwhile is delivered afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def how_ended(code: int) -> str:

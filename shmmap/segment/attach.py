@@ -22,7 +22,7 @@ import posix_ipc
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
-from shmmap.needed_packages import needed_packages
+from shmmap.optional_packages import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import read_columns, unpack_header
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader

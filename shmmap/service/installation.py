@@ -154,6 +154,8 @@ def write(planned: Sequence[PlannedFile]) -> None:
             interim.chmod(0o644)
             interim.replace(one.path)
         except OSError as error:
+            denied = isinstance(error, PermissionError)
             raise CannotWrite(
-                f"cannot write {one.path}: {error.strerror}", hint="run it with sudo, or with --user"
+                f"cannot write {one.path}: {error.strerror}",
+                hint="run it with sudo, or with --user" if denied else "",
             ) from error

@@ -38,7 +38,7 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
     (tmp_path / "old.svg").write_text("old")
     assert output_file(str(tmp_path / "old.svg")) == tmp_path / "old.svg"
     for name in ("nowhere/new.svg", "old.svg/new.svg", "."):
-        with pytest.raises(CannotWrite, match=str(tmp_path)):
+        with pytest.raises(CannotWrite, match=f"cannot write {tmp_path / name}: "):
             output_file(str(tmp_path / name))
         with pytest.raises(CannotWrite):
             write_text(tmp_path / name, "text")
@@ -65,6 +65,7 @@ def test_programs_tell_it_without_a_traceback(tmp_path: Path, capsys: pytest.Cap
         (elevation, ["build", "--wait", "-1"]),
         (elevation, ["build", "--epsg", "-3"]),
         (pose_init, ["--scan", "s.pcd", "--pose", "0,0,0,0,0,0", "--seed", "-1"]),
+        (pose_init, ["--scan", "s.pcd", "--pose", "0,0,0,0,0,0", "--height", "nan"]),
     ],
 )
 def test_impossible_numbers_exit_2(
@@ -75,6 +76,17 @@ def test_impossible_numbers_exit_2(
         program(words)
     assert ended.value.code == 2
     assert f"argument {words[-2]}: expected " in capsys.readouterr().err
+
+
+def test_a_scan_without_points_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan, cloud = tmp_path / "none.bin", tmp_path / "map.bin"
+    scan.touch()
+    np.zeros((1, 4), np.float32).tofile(cloud)
+    for program, verb in ((ndt, "align"), (compare, "apply")):
+        words = [verb, "--map", str(cloud), "--scan", str(scan), "--backend", "numpy"]
+        assert program(words) == 1
+        assert "none.bin has no" in capsys.readouterr().err.replace("has none", "has no points")
+        assert program([*words, "--allow-empty"]) == 0
 
 
 PROGRAMS = {

@@ -232,12 +232,23 @@ def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", code=1)
     shmmap("export", "--circle", "9000,0,5", "-o", "other.pcd", "--allow-empty")
     shmmap("export", "--id", "0_0.pcd", "-o", "other.xyz", code=2)
+    shmmap("export", "--id", "0_0.pcd", "-o", "", "--format", "pcd", code=2)
     shmmap("export", "--id", "0_0.pcd", "-o", "out.pcd/beneath.pcd", code=73)
     (divided_map.pcd_dir / "20_0.pcd").write_bytes(b"broken")
     shmmap("export", "--id", "0_0.pcd", "20_0.pcd", "--output-dir", ".", code=1)
     assert sorted(path.name for path in shmmap.cwd.iterdir()) == ["map", "out.pcd"]
     shmmap("export", "--id", "0_0.pcd", "-o", "out.pcd", "--force")
     assert len(read_pcd(target)["x"]) == 500
+
+
+@pytest.mark.parametrize("words", [["show"], ["query", "--id"], ["pin"], ["unpin"], ["evict"]])
+def test_who_misspells_a_cell_is_told_which_there_are(shmmap: Shmmap, words: list[str]) -> None:
+    done = shmmap.run(*words, "/elsewhere/20_0.pdc")
+    assert done.returncode == 1
+    assert re.search(r"hint: did you mean -?20_0\.pcd\?\n$", done.stderr), done.stderr
+    done = shmmap.run(*words, "nothing like it")
+    assert done.returncode == 1
+    assert "hint: `shmmap query --circle X,Y,R` prints the ids" in done.stderr
 
 
 def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -21,7 +22,7 @@ from shmmap.errors import (
     ShmmapError,
     error_from_wire,
 )
-from shmmap.needed_packages import needed_packages
+from shmmap.optional_packages import needed_packages
 
 
 def kinds(root: type[ShmmapError] = ShmmapError) -> Iterator[type[ShmmapError]]:
@@ -80,7 +81,7 @@ def test_a_package_that_is_missing_is_one_line(module: str, package: str) -> Non
     with pytest.raises(PackageMissing) as missing, needed_packages("shmmap-ndt"):
         __import__(module)
     assert missing.value.message == f"shmmap-ndt needs the package {package}, which is not installed"
-    assert f"pip install {package}; a client-only install has only" in missing.value.hint
+    assert f"pip install {package}; after a client-only install, `pip install .`" in missing.value.hint
     assert missing.value.__cause__ is None
     assert missing.value.__suppress_context__
 
@@ -154,3 +155,10 @@ def test_all_public_errors_are_of_the_tree() -> None:
         value = getattr(shmmap, name)
         if isinstance(value, type) and issubclass(value, BaseException):
             assert value in set(kinds())
+
+
+def test_no_public_name_is_that_of_a_module() -> None:
+    """To import the module would put it in the name's place."""
+    here = Path(shmmap.__file__).parent
+    modules = {path.stem for path in here.iterdir() if path.is_dir() or path.suffix == ".py"}
+    assert not modules & set(shmmap.__all__)

@@ -21,7 +21,16 @@ PACKAGE = Path(shmmap.__file__).parent
 CLIENTS = Path(shmmap_clients.__file__).parent
 TESTS = Path(__file__).parents[1]
 
-BASE = {"errors", "columns", "failpoints", "logfmt", "processes", "geometry", "quantities", "needed_packages"}
+BASE = {
+    "errors",
+    "columns",
+    "failpoints",
+    "logfmt",
+    "processes",
+    "geometry",
+    "quantities",
+    "optional_packages",
+}
 PARTS = {
     # part: what it may import besides itself
     "errors": set[str](),
@@ -31,16 +40,16 @@ PARTS = {
     "quantities": set[str](),
     "processes": set[str](),
     "geometry": {"errors"},
-    "needed_packages": {"errors"},
+    "optional_packages": {"errors"},
     "formats": {"errors", "columns", "geometry", "logfmt"},
-    "segment": {"errors", "columns", "geometry", "failpoints", "needed_packages"},
+    "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
     "protocol": {"errors", "columns", "geometry"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},
     "client": {
-        "errors", "columns", "failpoints", "geometry", "needed_packages", "segment", "protocol",
+        "errors", "columns", "failpoints", "geometry", "optional_packages", "segment", "protocol",
         "statistics.layout",
     },
     "daemon": BASE | {"formats", "segment", "protocol", "statistics", "layers", "origin", "dividing"},

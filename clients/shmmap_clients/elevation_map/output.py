@@ -41,7 +41,7 @@ def check_output(path: Path, epsg: int | None = None) -> None:
     """
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
-        raise BadRequest(f"{path.name}: elevation is written as {', '.join(_SUFFIXES)}")
+        raise BadRequest(f"{path}: elevation is written as {', '.join(_SUFFIXES)}")
     if suffix in _GEOTIFF:
         if importlib.util.find_spec("tifffile") is None:
             raise BadRequest("GeoTIFF needs the package tifffile", hint="pip install tifffile, or write .npz")

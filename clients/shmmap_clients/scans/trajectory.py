@@ -48,7 +48,7 @@ def matrix_of(translation: Iterable[float], quaternion: Iterable[float]) -> NDAr
     x, y, z, w = quaternion
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not (math.isfinite(norm) and norm > 0):
-        raise BadRequest(f"{(x, y, z, w)} is no rotation")
+        raise BadRequest(f"the quaternion {x:g},{y:g},{z:g},{w:g} is no rotation")
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
     T = np.eye(4)
     T[:3, :3] = [
@@ -117,7 +117,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     MapMissing
         There is no such file.
     MapDataError
-        A line is not eight numbers, or its rotation is none; the message names the line.
+        A line is not eight numbers, or its rotation is none (the message names the line), or there is none.
     """
     name = os.fspath(path)
     stamps: list[float] = []
@@ -145,4 +145,6 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise MapDataError(f"{name}: cannot be read: {error.strerror}", cause="trajectory") from error
     except UnicodeDecodeError:
         raise MapDataError(f"{name}: not a text file", cause="trajectory") from None
+    if not stamps:
+        raise MapDataError(f"{name}: no poses", cause="trajectory")
     return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4))

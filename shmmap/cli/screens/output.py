@@ -33,13 +33,14 @@ __all__ = [
     "wants_style",
 ]
 
+_EDGES: Final = 2  # blanks left and right of a table
 _NARROWEST: Final = 20  # columns that text needs to be worth breaking
 
 
 class Column(NamedTuple):
     """One column of a table; numbers are aligned right.
 
-    A terminal too narrow for the table goes without the columns that are ``spare``, highest first.
+    A terminal too narrow for the table shows of the ``spare`` columns those that fit, lowest first.
     """
 
     name: str
@@ -123,7 +124,7 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     from rich.text import Text
 
     console = Console(highlight=False)
-    shown = columns_that_fit(columns, rows, console.width)
+    shown = columns_that_fit(columns, rows, console.width - _EDGES)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
     for index in shown:
         # only the first column, a name, may be folded: numbers in pieces tell nothing
@@ -140,14 +141,14 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
 def columns_that_fit(
     columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int, *, gap: int = 3
 ) -> list[int]:
-    """Return the indices of all columns, without the most spare ones as far as ``width`` demands it."""
+    """Return the indices of the columns that are not spare, and of the others that fit, least spare first."""
     widths = [max(map(len, texts)) for texts in zip([column.name for column in columns], *rows, strict=True)]
-    shown = list(range(len(columns)))
-    for level in sorted({column.spare for column in columns} - {0}, reverse=True):
-        if sum(widths[index] + gap for index in shown) - gap <= width:
-            break
-        shown = [index for index in shown if columns[index].spare != level]
-    return shown
+    shown: list[int] = []
+    for level in sorted({0, *(column.spare for column in columns)}):
+        more = [index for index, column in enumerate(columns) if column.spare == level]
+        if not level or sum(widths[index] + gap for index in shown + more) - gap <= width:
+            shown += more
+    return sorted(shown)
 
 
 def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:

@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
+from shmmap.errors import UnknownCell
 from shmmap.quantities import counted, format_bytes
 
 if TYPE_CHECKING:
     from shmmap.errors import CellError
     from shmmap.protocol.messages import Holder
 
-__all__ = ["failure_lines", "holder_row", "holder_rows"]
+__all__ = ["failure_lines", "holder_row", "holder_rows", "unknown_ids"]
 
 _NAMED_CELLS: Final = 3
 
@@ -54,6 +55,11 @@ def failure_lines(failed: Iterable[CellError]) -> list[str]:
             lines.append(f"failed: {len(errors):,} cells ({layer}): {reason} [{code}]: {shown}")
         lines += _holder_lines(errors)
     return lines
+
+
+def unknown_ids(failed: Iterable[CellError]) -> list[str]:
+    """Return the ids that the map does not have, each once."""
+    return list(dict.fromkeys(error.cell_id for error in failed if error.code == UnknownCell.code))
 
 
 def _named(error: CellError) -> str:

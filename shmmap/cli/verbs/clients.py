@@ -13,6 +13,7 @@ from shmmap.cli.screens.output import (
     Column,
     format_bytes,
     format_duration,
+    print_hanging,
     print_json,
     print_line,
     print_table,
@@ -50,8 +51,8 @@ _COLUMNS = (
 _LEGEND = """\
 CELLS, GIVEN: cells it was given and has not returned, and their memory
 MAPPED: mapped now, according to the kernel
-OUTDATED: the part of MAPPED that is stale (a newer version exists) or retired (out of service), see
-  STATE in `shmmap ls`; retired memory is freed when the last client lets go"""
+OUTDATED: the part of MAPPED that is stale (a newer version exists) or retired (out of service; freed when \
+the last client lets go)"""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -89,7 +90,8 @@ def run(args: argparse.Namespace) -> int:
         print_line(f"{unknown}: mapped by unidentified processes (not through the client library)")
     if sys.stdout.isatty():
         for line in _LEGEND.splitlines():
-            print_line(line)
+            names, meaning = line.split(": ", 1)
+            print_hanging(f"{names}: ", meaning)
     return 0
 
 

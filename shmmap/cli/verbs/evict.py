@@ -7,6 +7,7 @@ import argparse
 from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
+from shmmap.cli.near_cells import near_cells_hint, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import counted, print_json, print_line
@@ -57,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
                 print_json(_as_json(Evicted(0, 0, 0)))
             return no_cell_there(args, client, area)
         answer = client.evict(cells)
+        hint = near_cells_hint(client, answer.unknown)
         kept = _kept(client, cells) if answer.kept and not args.json else []
     if args.json:
         print_json(_as_json(answer))
@@ -72,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
             print_line(f"  and {len(kept) - _NAMED:,} more, see `shmmap pin`")
         for name in answer.unknown:
             print_line(f"unknown cell: {name}")
+    print_near_cells(hint)
     return 1 if answer.unknown else 0
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from shmmap.cli.areas import add_area_or_ids, area_from, area_text, no_cell_there
+from shmmap.cli.near_cells import near_cells_hint, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
-from shmmap.cli.screens.refusals import failure_lines
+from shmmap.cli.screens.refusals import failure_lines, unknown_ids
 from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
         found = client.area(area, wait=args.wait) if area else client.selected(args.id, wait=args.wait)
         if not found.complete:
             _complain_of(found, args.wait)
+            print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
         written: list[dict[str, Any]] = []
         if found.cells:
@@ -118,7 +120,7 @@ def _complain_of(found: CellSet, wait_s: float) -> None:
 
 
 def _format(args: argparse.Namespace) -> str:
-    suffix = Path(args.output).suffix.lower().removeprefix(".") if args.output else "pcd"
+    suffix = "pcd" if args.output is None else Path(args.output).suffix.lower().removeprefix(".")
     kind: str = args.format or suffix
     if kind not in _FORMATS:
         raise BadRequest(
@@ -130,7 +132,7 @@ def _format(args: argparse.Namespace) -> str:
 def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tuple[Path, list[Cell]]]:
     """Which file takes which cells."""
     unique = list({cell.id: cell for cell in cells}.values())
-    if args.output:
+    if args.output is not None:
         return [(Path(args.output), unique)]
     names = [Path(cell.id).with_suffix(f".{kind}").name for cell in unique]
     if len(set(names)) != len(names):

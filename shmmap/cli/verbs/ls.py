@@ -40,11 +40,11 @@ _COLUMNS = (
     Column("Y", "right", spare=2),
     Column("SIZE", "right", spare=6),
     Column("STATE", spare=4),
-    Column("LAYER", spare=3),
+    Column("LAYER", spare=1),
     Column("ROWS", "right"),
     Column("MEMORY", "right"),
     Column("HITS", "right", spare=5),
-    Column("LAST USED", "right", spare=1),
+    Column("LAST USED", "right", spare=3),
     Column("LOAD", "right", spare=7),
 )
 

@@ -7,6 +7,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
+from shmmap.cli.near_cells import near_cells_hint, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_layer_option, add_verb, layers_from
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import Column, format_bytes, print_json, print_line, print_table
@@ -54,11 +55,12 @@ def run(args: argparse.Namespace) -> int:
                 print_json({"cells": [], "unknown": []})
             return no_cell_there(args, client, area)
         answer = client.pin(cells, layers_from(args))
-    return print_pins(answer, as_json=args.json)
+        hint = near_cells_hint(client, answer.unknown)
+    return print_pins(answer, hint, as_json=args.json)
 
 
-def print_pins(answer: Pinned, *, as_json: bool) -> int:
-    """Print what is pinned; returns the exit code."""
+def print_pins(answer: Pinned, hint: str, *, as_json: bool) -> int:
+    """Print what is pinned, and a hint about unknown ids; returns the exit code."""
     if as_json:
         rows = [
             {"id": cell.id, "layer": cell.layer, "state": cell.state, "bytes": cell.bytes}
@@ -73,4 +75,5 @@ def print_pins(answer: Pinned, *, as_json: bool) -> int:
             print_line("nothing is pinned")
         for name in answer.unknown:
             print_line(f"unknown cell: {name}")
+    print_near_cells(hint)
     return 1 if answer.unknown else 0

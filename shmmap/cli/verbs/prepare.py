@@ -79,6 +79,8 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.layer:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
+    if not args.cache_size:
+        raise BadRequest("--cache-size 0 keeps no layer", hint="name a size such as 512M or 2G")
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
     origin = find_origin(args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir)

@@ -8,6 +8,7 @@ import re
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there
+from shmmap.cli.near_cells import near_cells_hint, print_near_cells
 from shmmap.cli.options import (
     Subparsers,
     add_daemon_options,
@@ -28,7 +29,7 @@ from shmmap.cli.screens.output import (
     print_table,
     rows_text,
 )
-from shmmap.cli.screens.refusals import failure_lines, holder_rows
+from shmmap.cli.screens.refusals import failure_lines, holder_rows, unknown_ids
 from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ _COLUMNS = (
     Column("CELL"),
     Column("X", "right", spare=2),
     Column("Y", "right", spare=2),
-    Column("LAYER", spare=3),
+    Column("LAYER", spare=1),
     Column("ROWS", "right"),
     Column("MEMORY", "right"),
     Column("VERSION", spare=4),
@@ -121,6 +122,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             _print_text(found, welcome.id_prefix, summed=bool(found.cells) or held_given)
         if not found.complete:
+            print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
         return _judge_empty(args, client, area, found)
 

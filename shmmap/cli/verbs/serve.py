@@ -12,10 +12,10 @@ __all__ = ["add_parser", "run"]
 _EPILOG = """\
 Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.
 MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
-or inside the folder of the files), or one cloud of any format that is read: a PCD file of up to 256 MiB
-is one cell as it is; any other is first divided into the cache directory, just as `shmmap divide` does it:
-a LAS or float64 cloud far from the origin is shifted close to it, and the log and `shmmap status` say by
-how much.  To keep its frame: `shmmap divide --translate none`, and serve that map.
+or inside the folder of the files), or one cloud of any format that is read.  A PCD file of up to 256 MiB
+is one cell as it is.  Any other cloud is first divided into the cache directory, as `shmmap divide` does
+it.  A LAS or float64 cloud far from the origin is shifted close to it, and the log and `shmmap status` say
+by how much.  To keep its frame: `shmmap divide --translate none`, and serve that map.
 `shmmapd` is `shmmap serve`: the same options.
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for

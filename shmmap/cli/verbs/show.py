@@ -7,10 +7,12 @@ import argparse
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import extent_text
+from shmmap.cli.near_cells import near_cells_hint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.accounts import user_name
 from shmmap.cli.screens.output import format_bytes, print_json, print_pairs, rows_text
 from shmmap.cli.screens.refusals import holder_row
+from shmmap.errors import UnknownCell
 
 if TYPE_CHECKING:
     from shmmap.protocol.messages import Holder, ShownCell, ShownSegment
@@ -49,7 +51,11 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:
-        cell = client.show(args.cell)
+        try:
+            cell = client.show(args.cell)
+        except UnknownCell as error:
+            error.hint = near_cells_hint(client, [args.cell])
+            raise
     if args.json:
         print_json(_as_json(cell))
     else:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
+from shmmap.cli.near_cells import near_cells_hint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import print_json
@@ -43,4 +44,5 @@ def run(args: argparse.Namespace) -> int:
                 print_json({"cells": [], "unknown": []})
             return no_cell_there(args, client, area)
         answer = client.unpin(cells)
-    return print_pins(answer, as_json=args.json)
+        hint = near_cells_hint(client, answer.unknown)
+    return print_pins(answer, hint, as_json=args.json)

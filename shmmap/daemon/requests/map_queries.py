@@ -125,7 +125,7 @@ class MapQueries:
         if index is None:
             if not found or not message.id:
                 raise UnknownCell(
-                    f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is resident"
+                    f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is in memory"
                 )
             return messages.ShownCell(message.request, found[0].key.cell_id, 0, *found[0].box, 0, shown)
         (cell_id,) = ids

@@ -55,6 +55,9 @@ def test_a_wrong_line_is_named(tmp_path: Path, line: str) -> None:
 
 
 def test_trajectory_refusals(tmp_path: Path) -> None:
+    (tmp_path / "empty").write_text("# nothing but this\n")
+    with pytest.raises(MapDataError, match="no poses"):
+        read_trajectory(tmp_path / "empty")
     with pytest.raises(MapDataError, match="cannot be read"):
         read_trajectory(tmp_path)
     with pytest.raises(MapMissing):

@@ -98,6 +98,30 @@ def test_a_reader_that_went_away_is_no_error() -> None:
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+def test_a_full_disk_is_no_defect() -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "shmmap.cli", "version"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == errors.CannotWrite.exit_code
+    assert done.stderr.startswith("shmmap: cannot write the output: No space left on device\nhint: ")
+
+
+def test_closed_streams_are_no_defect() -> None:
+    command = f"{sys.executable} -m shmmap.cli"
+    done = subprocess.run(
+        ["sh", "-c", f"{command} version >&-; echo $?; {command} nonsense 2>&-; echo $?"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ("0\n2\n", "")
+
+
 def test_version_and_its_json(capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
@@ -123,3 +147,10 @@ def test_no_daemon_is_69_and_says_where_it_looked(
     assert said.out == ""
     assert "'town'" in said.err
     assert str(tmp_path) in said.err
+
+
+def test_other_instances_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("shmmap.town.statistics", "shmmap.city.statistics", "shmmap.town.0123456789abcdef"):
+        (tmp_path / name).touch()
+    assert main(["status", "--shm-dir", str(tmp_path), "--instance", "twon"]) == 69
+    assert "hint: other instances are there: city, town; name one with --instance" in capsys.readouterr().err

@@ -119,6 +119,11 @@ def test_wrong_usage_exits_2_and_hints_at_help(words: list[str], capsys: pytest.
             "shmmap query: unknown option --circel; did you mean --circle?",
             "shmmap query --help",
         ),
+        (
+            ["export", "--circle", "1,2,3", "--outptu", "x.pcd"],
+            "shmmap export: unknown option --outptu; did you mean --output?",
+            "shmmap export --help",
+        ),
     ],
 )
 def test_what_is_misspelt_is_refused_by_its_verb_with_a_suggestion(
@@ -138,16 +143,16 @@ def test_without_a_verb_all_are_listed(capsys: pytest.CaptureFixture[str]) -> No
     assert "Exit codes" in said.err
 
 
-def test_descriptions_are_filled_and_tables_in_them_are_not(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("verb", CONTRACT)
+def test_help_fits_the_terminal(
+    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "60")
-    for verb in ("top", "clients"):
-        with pytest.raises(SystemExit):
-            main([verb, "--help"])
-        text = capsys.readouterr().out
-        assert max(map(len, text.split("JSON (fields")[0].splitlines())) < 60
-        assert "\n  {" in text, "its JSON stands as it was written"
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([verb, "--help"])
+    text = capsys.readouterr().out
+    assert [line for line in text.splitlines() if len(line) >= 80] == []
+    assert ("\n  {" in text) == ("JSON (fields" in text), "its JSON keeps its shape"
 
 
 def test_area_from_options() -> None:
@@ -180,3 +185,23 @@ def test_common_options_may_stand_before_the_verb() -> None:
     assert verb_first(["--timeout=3", "query", "--id", "a"]) == ["query", "--timeout=3", "--id", "a"]
     for words in (["status", "--json"], ["--help"], ["--version"], ["--json"], ["--endpoint"], []):
         assert verb_first(words) == words
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["evict"], "evict: give cells, or an area, or --all"),
+        (["unpin", "--all", "0_0.pcd"], "unpin: give cells, or an area, or --all, only one of them"),
+        (["pin", "--circle", "1,2,3", "0_0.pcd"], "pin: give cells, or an area, only one of them"),
+    ],
+)
+def test_which_cells_are_meant_has_to_be_clear(
+    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    assert capsys.readouterr().err == f"shmmap: {says}\nhint: shmmap {words[0]} --help\n"
+
+
+def test_a_cache_that_keeps_nothing_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["prepare", ".", "--layer", "points", "--cache-size", "0"]) == 2
+    assert "--cache-size 0 keeps no layer" in capsys.readouterr().err

@@ -161,6 +161,11 @@ def test_every_kind_of_damage_is_noticed(origin: MapDirectory, caplog: pytest.Lo
         assert_equal(truth, origin.load())
         assert any("damaged catalogue cache ignored" in message for message in caplog.messages)
         assert file.read_bytes() == sound  # written anew
+    file.unlink()
+    file.mkdir()
+    caplog.clear()
+    assert_equal(truth, origin.load())
+    assert any("catalogue cache cannot be read" in message for message in caplog.messages)
 
 
 def test_unwritable_cache_directory_costs_only_a_warning(

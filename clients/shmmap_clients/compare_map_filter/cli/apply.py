@@ -104,5 +104,6 @@ def run(args: argparse.Namespace) -> int:
         where = f"{extent_text(compare.bounds)}, the pose is at ({x:.3f}, {y:.3f})"
         return nothing_found(args, f"no map around the scan: {where}", name="shmmap-compare")
     if not kept:
-        return nothing_found(args, "no point is kept: the map explains all of them", name="shmmap-compare")
+        why = "the map explains all of them" if len(scan.xyz) else f"{args.scan} has none"
+        return nothing_found(args, f"no point is kept: {why}", name="shmmap-compare")
     return 0

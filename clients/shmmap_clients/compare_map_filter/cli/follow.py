@@ -13,6 +13,7 @@ from shmmap_clients.command_line import (
     add_daemon_options,
     add_json_option,
     add_verb,
+    announce_scans,
     connect,
     not_negative,
     nothing_found,
@@ -139,6 +140,7 @@ def run(args: argparse.Namespace) -> int:
             stack.enter_context(writing_errors(args.out))
             output = open_output(args.out, mask=args.mask, wait_s=30.0)
             stack.callback(output.close)
+        announce_scans(args)
         for compared in compare_drive(scans, window, compare, first_wait_s=30.0, wait_s=wait_s):
             statistics.add(compared)
             if output is not None:

@@ -114,7 +114,7 @@ def add_parser(subparsers: Any) -> None:
         type=not_negative,
         default=1.0,
         metavar="M",
-        help="give a height to columns without one that are this near to others with one (default: 1)",
+        help="fill in the height of columns without one, at most this far from columns with one (default: 1)",
     )
     parser.add_argument(
         "--epsg", type=at_least(1), metavar="CODE", help="coordinate system to name in a GeoTIFF"

@@ -114,6 +114,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{'pose':24}{pose_text(result.T_map_base, args.pose_format)}")
         _print(document, [trust.describe(name) for name in result.failed_limits], bound.describe())
+    if not len(scan):
+        return nothing_found(args, f"{args.scan} has no points", name="shmmap-ndt")
     if result.no_map:
         x, y, z = result.T_map_base[:3, 3]
         bounds = [*cloud[:, :2].min(axis=0), *cloud[:, :2].max(axis=0)] if len(cloud) else None

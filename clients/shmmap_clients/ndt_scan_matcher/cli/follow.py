@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import add_verb, connect, print_json, write_text
+from shmmap_clients.command_line import add_verb, announce_scans, connect, print_json, write_text
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, trust_from
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
@@ -64,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         if publisher is not None and args.listener_wait > 0:
             publisher.wait_for_listener(args.listener_wait)
         report = stack.enter_context(FollowReport(args))
+        announce_scans(args)
         first = next(scans, None)
         if first is None:
             return report.no_scans()

@@ -48,14 +48,19 @@ class FollowReport:
     def __enter__(self) -> FollowReport:
         args = self._args
         if args.tum:
-            self._stack.enter_context(writing_errors(str(args.tum)))
-            self._tum = self._stack.enter_context(open(args.tum, "w", encoding="utf-8"))
+            self._tum = self._opened(str(args.tum))
         if args.json_lines == "-":
             self._lines = sys.stdout
         elif args.json_lines:
-            self._stack.enter_context(writing_errors(args.json_lines))
-            self._lines = self._stack.enter_context(open(args.json_lines, "w", encoding="utf-8"))
+            self._lines = self._opened(args.json_lines)
         return self
+
+    def _opened(self, path: str) -> TextIO:
+        """Open a file to write; until this report is closed, what cannot be written is `CannotWrite`."""
+        with writing_errors(path):
+            file = open(path, "w", encoding="utf-8")  # noqa: SIM115
+        self._stack.enter_context(writing_errors(path))
+        return self._stack.enter_context(file)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -145,7 +150,7 @@ def print_summary(summary: DriveSummary) -> None:
         why = (f"{s.trust.describe(name)} ({count})" for name, count in s.failed_limits.items())
         print(f"  not trusted   {', '.join(why)}")
     if s.lost or s.relocalized:
-        print(f"  lost          {s.lost} scans; relocalized {s.relocalized} times")
+        print(f"  lost          scans: {s.lost}, times relocalized: {s.relocalized}")
     print(
         f"map             updates: {s.map_updates}, cells added: {s.cells_added}, cells removed:"
         f" {s.cells_removed}, scans that waited for it: {s.waited}"

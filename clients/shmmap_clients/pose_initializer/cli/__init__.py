@@ -77,7 +77,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--candidates", type=at_least(1), default=200, metavar="N", help="poses to score (default: 200)"
     )
     parser.add_argument(
-        "--seed", type=at_least(0), default=0, metavar="N", help="of the random search (default: 0)"
+        "--seed", type=at_least(0), default=0, metavar="N", help="seed of the random search (default: 0)"
     )
     add_thin_option(parser, default=1.0)
     add_leaf_option(parser)

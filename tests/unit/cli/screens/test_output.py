@@ -64,6 +64,24 @@ def test_a_narrow_terminal_goes_without_spare_columns(columns: int, names: list[
     assert [WIDE[index].name for index in columns_that_fit(WIDE, WIDE_ROWS, columns)] == names
 
 
+def test_a_wide_column_takes_no_other_with_it() -> None:
+    columns = (Column("CELL"), Column("LAYER", spare=1), Column("X", "right", spare=2))
+    rows = [["town_0_0.pcd", "voxel(leaf=0.5,of=crop(z_max=12.0))", "100"]]
+    assert columns_that_fit(columns, rows, 30) == [0, 2]
+    assert columns_that_fit(columns, rows, 52) == [0, 1]
+
+
+def test_a_table_is_never_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name is folded only where no column is left to leave out."""
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for width in range(24, 60):
+        monkeypatch.setenv("COLUMNS", str(width))
+        monkeypatch.setattr("sys.stdout", terminal := Terminal())
+        print_table(WIDE, WIDE_ROWS)
+        assert "town_0_0.pcd" in terminal.getvalue(), f"folded at {width} columns"
+
+
 def test_a_narrow_terminal_is_told_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.delenv("NO_COLOR", raising=False)

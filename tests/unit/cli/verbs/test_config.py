@@ -35,6 +35,8 @@ def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     [
         ("bugdet = 3\nmap_path = '/'", 78, "did you mean 'budget"),
         ("map_path = '/'\nworkers = 'many'", 78, ":2: workers must be"),
+        ("map_path = '/'\nbudget = -5", 78, ":2: budget cannot be -5"),
+        ("map_path = '/'\ncache_size = 'much'", 78, ":2: cache_size: 'much' is no size"),
         ("map_path = '/no/map'", 66, "there is no map at /no/map"),
         ("workers = 1", 78, "no map is named"),
         ("map_path = '/'\ngroup = 'no such group'", 78, "there is no group"),

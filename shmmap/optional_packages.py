@@ -45,5 +45,6 @@ def needed_packages(what: str) -> Iterator[None]:
         package = _PACKAGES.get(module, module)
         raise PackageMissing(
             f"{what} needs the package {package}, which is not installed",
-            hint=f"pip install {package}; a client-only install has only numpy, pyzmq, posix_ipc and msgspec",
+            hint=f"pip install {package}; after a client-only install, `pip install .` in the checkout brings"
+            " all packages",
         ) from None
