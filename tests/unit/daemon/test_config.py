@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.config import DaemonConfig, load_config, parse_bytes
+from shmmap.daemon.config import FILE_NAMES, DaemonConfig, load_config, parse_bytes
 from shmmap.errors import ConfigError
 
 
@@ -118,7 +118,7 @@ def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None
     assert failure.value.origin == "command line"
     assert failure.value.key == name
     assert failure.value.message.startswith("command line: ")
-    assert name in failure.value.message
+    assert FILE_NAMES.get(name, name) in failure.value.message
     assert failure.value.exit_code == 78
 
 
