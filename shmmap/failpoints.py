@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places where a test can kill a process, to see what that leaves: ``SHMMAP_TEST_CRASH=STEP[:N[:FILE]]``.
+"""Places where a test can break a process, to see what that leaves: ``SHMMAP_TEST_CRASH=STEP[:N[:FILE]]``.
 
 The process sends itself SIGKILL when it comes to STEP for the Nth time (the first, if N is not
 given).  With FILE only the process that makes this file dies: those that take its place live on,
-and the test sees that the step was reached.  Without the variable a step is an empty function.
+and the test sees that the step was reached.
+
+``SHMMAP_TEST_DEFECT=STEP:N:FILE`` has the step raise an exception N times instead, as soon as there is this
+file.  Without these variables a step is an empty function.
 """
 
 from __future__ import annotations
@@ -44,18 +47,31 @@ DAEMON_STEPS: Final = (
 CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.map")
 
 
-def _without_crash(label: str) -> None:
-    """Do nothing: this process is not to die."""
+def _untouched(label: str) -> None:
+    """Do nothing: no test wants anything of this process."""
+
+
+def _parsed(wanted: str) -> tuple[str, int, str]:
+    label, _, rest = wanted.partition(":")
+    number, _, file = rest.partition(":")
+    if label not in {*WORKER_STEPS, *DAEMON_STEPS, *CLIENT_STEPS}:
+        raise ValueError(f"SHMMAP_TEST_CRASH, SHMMAP_TEST_DEFECT: there is no step {label!r}")
+    return label, int(number or 1), file
+
+
+class _Defect:
+    def __init__(self, wanted: str) -> None:
+        self._label, self._left, self._file = _parsed(wanted)
+
+    def __call__(self, label: str) -> None:
+        if label == self._label and self._left and os.path.exists(self._file):
+            self._left -= 1
+            raise RuntimeError(f"a defect at {label}, as a test wants it")
 
 
 class _Crash:
     def __init__(self, wanted: str) -> None:
-        label, _, rest = wanted.partition(":")
-        number, _, self._file = rest.partition(":")
-        if label not in {*WORKER_STEPS, *DAEMON_STEPS, *CLIENT_STEPS}:
-            raise ValueError(f"SHMMAP_TEST_CRASH: there is no step {label!r}")
-        self._label = label
-        self._left = int(number or 1)
+        self._label, self._left, self._file = _parsed(wanted)
 
     def __call__(self, label: str) -> None:
         if label != self._label:
@@ -76,6 +92,7 @@ class _Crash:
         return True
 
 
-_wanted: Final = os.environ.get("SHMMAP_TEST_CRASH", "")
-step: Final = _Crash(_wanted) if _wanted else _without_crash
+_crash: Final = os.environ.get("SHMMAP_TEST_CRASH", "")
+_defect: Final = os.environ.get("SHMMAP_TEST_DEFECT", "")
+step: Final = _Crash(_crash) if _crash else _Defect(_defect) if _defect else _untouched
 """Called with the name of the step the process has come to."""

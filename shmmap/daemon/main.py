@@ -5,13 +5,14 @@ The order matters.  The lock comes first, because binding would steal a live soc
 taken over before anything is published; READY is said when requests are answered.  On the way out
 every name is taken away before the lock is.
 
-**Stopping empties, restarting keeps warm.**  SIGTERM and SIGINT stop the daemon and free all
-memory.  SIGUSR1 stops it and leaves the segments to its next life, which adopts them
-(`shmmap.daemon.loading.adoption`), as it does after a crash; whoever waits for an answer gets it from the
-next life, too.  A SIGTERM that follows a SIGUSR1 changes nothing about that, so a service manager
-that sends SIGTERM anyway can announce a restart beforehand.  systemd ends a unit in the same way
-for ``restart`` and ``stop``, but while it does so its job list says which it is; ``+`` gives the
-line the right to ask and to send, in a unit for one user ``systemctl --user`` has it anyway::
+**Stopping empties, restarting keeps warm.** SIGTERM and SIGINT stop the daemon and free all memory.
+SIGUSR1 stops it and leaves the segments to its next life, which adopts them
+(`shmmap.daemon.loading.adoption`), as it does after a crash, or when a defect ends the daemon; whoever
+waits for an answer gets it from the next life, too. A SIGTERM that follows a SIGUSR1 changes nothing
+about that, so a service manager that sends SIGTERM anyway can announce a restart beforehand. systemd
+ends a unit in the same way for ``restart`` and ``stop``, but while it does so its job list says which it
+is; ``+`` gives the line the right to ask and to send, in a unit for one user ``systemctl --user`` has it
+anyway::
 
     ExecStop=-+/bin/sh -c 'systemctl list-jobs --plain --no-legend | \
         grep -Eq "^ *[0-9]+ +%n +restart " && kill -USR1 $MAINPID'
@@ -46,7 +47,7 @@ from shmmap.daemon.prerequisites import (
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
-from shmmap.errors import ConfigError
+from shmmap.errors import ConfigError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.origin.map_layout import absolute_path
@@ -108,11 +109,16 @@ def run(config: DaemonConfig) -> int:
             log.warning("problem in the map", what=problem)
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
-            stack.callback(lambda: memory.close(keep=signals.keep))
+            stack.push(partial(_close, memory, signals))
         service = Service(config, memory, Reloader(origin), ServiceManager(), path, gid, signals, activated)
         service.run(started_s)
     log.info("stopped", instance=config.instance)
     return 0
+
+
+def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:
+    """Leave the segments to the next life, too, if a defect ended this one: it is like a crash."""
+    memory.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
 
 
 def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:

@@ -53,6 +53,12 @@ def check_daemon(patient: Patient) -> Finding:
             "if its log says that it cannot write its statistics, lift that limit; else the watchdog ends it"
             f" under systemd, elsewhere kill -ABRT {identity.pid}",
         )
+    if defects := patient.seen.counters.get("defects", 0):
+        return warn(
+            name,
+            f"{fact}; it survived {counted(defects, 'exception')}",
+            "please report the tracebacks in its log: journalctl -u shmmapd -g defect",
+        )
     if identity.library_version != shmmap.__version__:
         return warn(
             name,

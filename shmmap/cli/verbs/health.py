@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import format_duration, print_json, print_line
+from shmmap.cli.screens.output import counted, format_duration, print_json, print_line
 from shmmap.errors import DaemonUnreachable
+
+if TYPE_CHECKING:
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped": paused | "hung" | "dead", "beat_age_s", "pid", "instance"}
+  {"state": "healthy" | "stopped": paused | "hung" | "dead", "beat_age_s", "pid", "instance",
+   "defects": exceptions that the daemon survived, whose tracebacks its log has}
 Exit code: 0 healthy, 1 paused or hung, 69 dead or never started."""
 
 
@@ -42,10 +47,17 @@ def run(args: argparse.Namespace) -> int:
                 "beat_age_s": round(found.beat_age_s, 6),
                 "pid": identity.pid,
                 "instance": identity.instance,
+                "defects": found.counters.get("defects", 0),
             }
         )
     else:
         age = format_duration(found.beat_age_s)
         state = "paused" if found.state == "stopped" else found.state
-        print_line(f"{state}: pid {identity.pid}, last heartbeat {age} ago")
+        print_line(f"{state}: pid {identity.pid}, last heartbeat {age} ago{_defects(found)}")
     return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(found.state, 1)
+
+
+def _defects(found: Snapshot) -> str:
+    """What the daemon survived, if anything: somebody should report it."""
+    count = found.counters.get("defects", 0)
+    return f"; it survived {counted(count, 'exception')}, see its log" if count else ""
