@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 from shmmap.client.session import Session
 from shmmap.protocol import messages
 
 __all__ = ["OperatorRequests", "several"]
+
+RELOAD_S: Final = 60.0
+"""How long reading a map's catalogue may take, beside what any request may."""
 
 
 class OperatorRequests:
@@ -32,14 +36,14 @@ class OperatorRequests:
         return self._session.ask(lambda n: messages.Show(n, cell), messages.ShownCell)
 
     def reload(self) -> messages.Reloaded:
-        """Have the daemon read the map's directory again.
+        """Have the daemon read the map's directory again, which may take a minute more than other requests.
 
         Raises
         ------
         NotPermitted
             The daemon lets only administrators do this.
         """
-        return self._session.ask(messages.Reload, messages.Reloaded)
+        return self._session.ask(messages.Reload, messages.Reloaded, quiet_s=RELOAD_S)
 
     def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
         """Have the daemon drop cells, all by default; those in use are freed when they are let go.

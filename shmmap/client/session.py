@@ -136,10 +136,15 @@ class Session:
         finally:
             self._lock.release()
 
-    def ask(self, make: Callable[[int], messages.Request], kind: type[R]) -> R:
-        """Send the request that ``make`` builds for a request id; returns its reply."""
-        with self._turn(self.timeout_s) as connection:
-            reply = connection.ask(make(connection.new_request()), kind, timeout_s=self.timeout_s)
+    def ask(self, make: Callable[[int], messages.Request], kind: type[R], *, quiet_s: float = 0.0) -> R:
+        """Send the request that ``make`` builds for a request id; returns its reply.
+
+        ``quiet_s`` is how long the daemon may be busy with it, during which silence means nothing.
+        """
+        timeout_s = self.timeout_s + quiet_s
+        with self._turn(timeout_s) as connection:
+            message = make(connection.new_request())
+            reply = connection.ask(message, kind, timeout_s=timeout_s, quiet_s=quiet_s)
             self.welcome = connection.welcome
             return reply
 

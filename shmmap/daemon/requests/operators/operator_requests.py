@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -40,6 +40,7 @@ class OperatorRequests:
     reloader: Reloader
     stop_by_s: float = math.inf
     _asked_to_stop: Session | None = None
+    _reloading: set[tuple[int, int]] = field(default_factory=set)
 
     def handle(self, session: Session, message: messages.Request, now_s: float) -> None:
         """Carry out one request and answer it, a reload when it is over."""
@@ -62,9 +63,13 @@ class OperatorRequests:
             self.stop_by_s = -math.inf
 
     def _reload(self, session: Session, message: messages.Reload) -> None:
-        before = self.cache.catalogue
+        before, asked = self.cache.catalogue, (session.slot, message.request)
+        if asked in self._reloading:
+            return  # the client repeats what it has no answer to yet
+        self._reloading.add(asked)
 
         def answer(result: Catalogue | ShmmapError) -> None:
+            self._reloading.discard(asked)
             if isinstance(result, ShmmapError):
                 session.connection.refuse(message.request, result)
                 return
