@@ -87,9 +87,10 @@ class Service:
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
         quota, budget = config.session_quota, cache.ledger.budget_bytes
+        self._inbox = Inbox(statistics)
         cells = CellRequests(
             cache, scheduler, quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
-            clock=time.monotonic,
+            due=self._inbox.due, clock=time.monotonic,
         )  # fmt: skip
         sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
@@ -106,7 +107,6 @@ class Service:
             handshake, cells, queries, operators, authorization, cache.survey, sampler, defects
         )
         self._handshake = handshake
-        self._inbox = Inbox(statistics, dispatch.refuse_unread)
         self._loop = ServingLoop(
             watched, self._inbox, dispatch, operators, cells, cache, scheduler, sampler, statistics, defects
         )

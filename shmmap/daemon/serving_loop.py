@@ -80,8 +80,8 @@ class ServingLoop:
             callback = self.watched.callbacks.get(fd)
             if callback is not None:  # another one's may have ended it
                 self._guarded(callback)
-        self._guarded(self.cache.tell_all)
         self._guarded(self._serve)
+        self._guarded(self.cache.tell_all)
         self._look_after_the_rest(time.monotonic())
         self._guarded(self.scheduler.pump, time.monotonic())
         self._guarded(self.cache.tell_all)
@@ -98,12 +98,16 @@ class ServingLoop:
         """Serve those whose turn it is, for a bounded time."""
         start_s = time.monotonic()
         end_s = start_s + SERVE_S
-        while start_s < end_s and (heard := self.inbox.take()) is not None:
-            self.dispatch.handle(heard)
+        while start_s < end_s and (turn := self.inbox.take()) is not None:
+            if turn.answer is not None:
+                self._guarded(turn.answer)
+            else:
+                self.dispatch.handle(turn)
             self.cache.tell_all()
             now_s = time.monotonic()
-            self.inbox.served(heard, now_s - start_s)
-            self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
+            self.inbox.served(turn, now_s - start_s)
+            if turn.answer is None:
+                self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s = now_s
 
     def _look_after_the_rest(self, now_s: float) -> None:

@@ -10,6 +10,7 @@ first.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.cell_replies import Answer, CellReplies
 from shmmap.daemon.requests.differential import difference, warm_difference
 from shmmap.daemon.requests.pending_request import PendingRequest, WaitingList
+from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area
@@ -38,6 +40,8 @@ class CellRequests:
     ----------
     quota_bytes
         Most bytes one session may keep that no other session also holds.
+    due
+        Given a connection and what answers it: called in its process's turn.
     clock
         The serving loop's clock, seconds.
     """
@@ -48,12 +52,14 @@ class CellRequests:
         scheduler: Scheduler,
         *,
         quota_bytes: int,
+        due: Callable[[Connection, Callable[[], None]], None],
         clock: Callable[[], float],
     ) -> None:
         self._cache = cache
         self._scheduler = scheduler
         scheduler.on_settled = self.settled
         self._statistics = cache.statistics
+        self._due = due
         self._now_s = clock
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
         self._answers = CellReplies(cache, scheduler)
@@ -185,8 +191,18 @@ class CellRequests:
         for wanted in self._waiting.pop(key, ()):
             wanted.outstanding.discard(key)
             if not wanted.outstanding and not self._goes_on_waiting(wanted):
-                self._stop_waiting(wanted)
-                self._answers.answer(wanted, self._now_s())
+                self._answer_in_turn(wanted)
+
+    def _answer_in_turn(self, wanted: PendingRequest) -> None:
+        """Answer a request that waits; what it asks for stays needed until then."""
+        if not wanted.due:
+            wanted.due = True
+            self._due(wanted.session.connection, partial(self._answer_now, wanted))
+
+    def _answer_now(self, wanted: PendingRequest) -> None:
+        if wanted in self._patient:  # its session may have ended
+            self._stop_waiting(wanted)
+            self._answers.answer(wanted, self._now_s())
 
     def _goes_on_waiting(self, wanted: PendingRequest) -> bool:
         """Whether a cell that had settled is cold again, or may fit now, and there is time to load it."""
@@ -213,8 +229,7 @@ class CellRequests:
     def answer_overdue(self, now_s: float) -> None:
         """Answer those who waited long enough, with what there is."""
         for wanted in self._patient.overdue(now_s):
-            self._stop_waiting(wanted)
-            self._answers.answer(wanted, now_s)
+            self._answer_in_turn(wanted)
 
     def forget(self, session: Session) -> None:
         """The session ended: nobody waits for its requests any more."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Final
 
 from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.host.defects import Defects
@@ -17,16 +16,13 @@ from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
-from shmmap.daemon.transport.inbox import Heard
+from shmmap.daemon.transport.inbox import Turn
 from shmmap.daemon.transport.sessions import Session
-from shmmap.errors import BadRequest, Busy, InternalError, NoSession, ShmmapError
+from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 
 __all__ = ["Dispatch"]
-
-WORTH_AN_ANSWER_BYTES: Final = 1 << 16
-"""A longer request that is refused unread is dropped: finding its number takes too long."""
 
 
 @dataclass(eq=False, slots=True)
@@ -42,28 +38,21 @@ class Dispatch:
     sampler: Sampler
     defects: Defects
 
-    def handle(self, heard: Heard) -> None:
+    def handle(self, turn: Turn) -> None:
         """Answer one request, or say why not."""
-        data = heard.body
+        data = turn.body
         request = 0
         try:
-            if heard.several_frames:
+            if turn.several_frames:
                 raise BadRequest("a request is one frame")
             message = decode_request(data)
             request = message.request
-            self._route(heard.connection, message)
+            self._route(turn.connection, message)
         except ShmmapError as error:
-            heard.connection.refuse(request or request_number(data), error)
+            turn.connection.refuse(request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
             self.defects.met()
-            heard.connection.refuse(request, InternalError("the daemon failed on this request"))
-
-    def refuse_unread(self, heard: Heard) -> None:
-        """A process has too many requests waiting to have this one served, ever."""
-        data = heard.body
-        if len(data) <= WORTH_AN_ANSWER_BYTES:
-            error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
-            heard.connection.refuse(request_number(data), error)
+            turn.connection.refuse(request, InternalError("the daemon failed on this request"))
 
     def _route(self, connection: Connection, message: messages.Request) -> None:
         now_s = time.monotonic()

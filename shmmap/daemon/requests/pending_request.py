@@ -21,6 +21,8 @@ __all__ = ["MOST_OF_A_SESSION", "PendingRequest", "WaitingList"]
 MOST_OF_A_SESSION: Final = 64
 """Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
 
+OVERDUE_AT_ONCE: Final = 256
+
 
 @dataclass(eq=False, slots=True)
 class PendingRequest:
@@ -44,6 +46,8 @@ class PendingRequest:
         What it waits for in all, and the loads of it that have not ended.
     began_s, deadline_s
         When it began to wait and until when; 0 for a request that does not wait.
+    due
+        Whether it will be answered in its process's next turn.
     """
 
     session: Session
@@ -59,6 +63,7 @@ class PendingRequest:
     outstanding: set[Key] = field(default_factory=set)
     began_s: float = 0.0
     deadline_s: float = 0.0
+    due: bool = False
 
     def distances_m(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far boxes, (N, 4), are from the client, as far as it said where it is.
@@ -102,6 +107,9 @@ class WaitingList:
         self._counts[request.session] += 1
         heapq.heappush(self._heap, (request.deadline_s, self._number, request))
 
+    def __contains__(self, request: PendingRequest) -> bool:
+        return request in self._requests
+
     def remove(self, request: PendingRequest) -> None:
         """A request waits no longer."""
         del self._requests[request]
@@ -114,15 +122,19 @@ class WaitingList:
 
     def next_deadline_s(self) -> float:
         """When the next one's patience ends; infinity when none waits."""
-        while self._heap and self._heap[0][2] not in self._requests:
+        while self._heap and not self._waits(self._heap[0][2]):
             heapq.heappop(self._heap)
         return self._heap[0][0] if self._heap else float("inf")
 
     def overdue(self, now_s: float) -> list[PendingRequest]:
-        """Those whose patience has ended."""
-        if self.next_deadline_s() > now_s:
-            return []
-        return [request for request in self._requests if request.deadline_s <= now_s]
+        """Those whose patience has ended, a bounded number at a time."""
+        found: list[PendingRequest] = []
+        while self.next_deadline_s() <= now_s and len(found) < OVERDUE_AT_ONCE:
+            found.append(heapq.heappop(self._heap)[2])
+        return found
+
+    def _waits(self, request: PendingRequest) -> bool:
+        return request in self._requests and not request.due
 
     def of(self, session: Session) -> list[PendingRequest]:
         """Those of one session."""

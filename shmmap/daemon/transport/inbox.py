@@ -16,9 +16,11 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from shmmap.daemon.transport.connection import Connection
+from shmmap.errors import Busy
+from shmmap.protocol.codec import request_number
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MOST_BYTES", "MOST_OF_A_CONNECTION", "MOST_OF_A_PROCESS", "FairQueue", "Heard", "Inbox"]
+__all__ = ["MOST_BYTES", "MOST_OF_A_CONNECTION", "MOST_OF_A_PROCESS", "FairQueue", "Inbox", "Turn"]
 
 Item = TypeVar("Item")
 
@@ -27,6 +29,8 @@ MOST_OF_A_CONNECTION: Final = 64
 MOST_OF_A_PROCESS: Final = 1024
 MOST_BYTES: Final = 8 << 20
 """Bytes of one process's waiting requests; a single one may always wait."""
+WORTH_AN_ANSWER_BYTES: Final = 1 << 16
+"""A longer request that is refused unread is dropped: finding its number takes too long."""
 MOST_REMEMBERED: Final = 4096
 """Processes whose clocks are remembered; those forgotten when idle lose a debt of milliseconds."""
 
@@ -54,8 +58,10 @@ class FairQueue(Generic[Item]):
     def __len__(self) -> int:
         return self._waiting
 
-    def add(self, process: Hashable, connection: Hashable, item: Item, nbytes: int) -> bool:
-        """Let a request wait; False if too many of its connection or process do already."""
+    def add(
+        self, process: Hashable, connection: Hashable, item: Item, nbytes: int, *, always: bool = False
+    ) -> bool:
+        """Let something wait; False if too much of its connection or process does, unless ``always``."""
         line = self._lines.get(process)
         if line is None:
             if len(self._lines) >= MOST_REMEMBERED:
@@ -64,12 +70,12 @@ class FairQueue(Generic[Item]):
         if not line.count:
             line.clock_s = max(line.clock_s, self._clock_s)
             self._line_up(process, line)
-        elif line.count >= MOST_OF_A_PROCESS or line.nbytes + nbytes > MOST_BYTES:
+        elif not always and (line.count >= MOST_OF_A_PROCESS or line.nbytes + nbytes > MOST_BYTES):
             return False
         items = line.connections.get(connection)
         if items is None:
             items = line.connections[connection] = deque()
-        elif len(items) >= MOST_OF_A_CONNECTION:
+        elif not always and len(items) >= MOST_OF_A_CONNECTION:
             return False
         items.append((item, nbytes))
         line.count += 1
@@ -112,12 +118,21 @@ class FairQueue(Generic[Item]):
 
 
 @dataclass(eq=False, slots=True)
-class Heard:
-    """One request as it came: on which connection, its first frame, and whether there were more."""
+class Turn:
+    """What is served next: a request as it came, or one that has waited and can be answered.
+
+    Attributes
+    ----------
+    body, several_frames
+        A request's first frame, and whether there were more.
+    answer
+        Answers one that has waited; None for a request that has just come.
+    """
 
     connection: Connection
-    body: bytes
-    several_frames: bool
+    body: bytes = b""
+    several_frames: bool = False
+    answer: Callable[[], None] | None = None
 
     @property
     def process(self) -> Hashable:
@@ -126,39 +141,38 @@ class Heard:
 
 
 class Inbox:
-    """Requests heard and not yet served.
+    """Requests heard and not yet served, and answers that are due."""
 
-    Parameters
-    ----------
-    refuse
-        Called with a request that was heard beyond what one process may have waiting.
-    """
-
-    def __init__(self, statistics: StatisticsWriter, refuse: Callable[[Heard], None]) -> None:
+    def __init__(self, statistics: StatisticsWriter) -> None:
         self._statistics = statistics
-        self._refuse = refuse
-        self._queue: FairQueue[Heard] = FairQueue()
+        self._queue: FairQueue[Turn] = FairQueue()
 
     def __len__(self) -> int:
         return len(self._queue)
 
     def hear(self, connection: Connection, body: bytes, several: bool) -> None:
-        """Let a request wait for its turn."""
+        """Let a request wait for its turn, or refuse it: its process may have so many waiting."""
         self._statistics.add("requests")
         self._statistics.add("bytes_received", len(body))
-        heard = Heard(connection, body, several)
-        if self._queue.add(heard.process, connection, heard, len(body)):
+        turn = Turn(connection, body, several)
+        if self._queue.add(turn.process, connection, turn, len(body)):
             connection.waiting_bytes += len(body)
-        else:
-            self._refuse(heard)
+        elif len(body) <= WORTH_AN_ANSWER_BYTES:
+            error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
+            connection.refuse(request_number(body), error)
 
-    def take(self) -> Heard | None:
-        """Take the request whose turn it is; tell `served` afterwards."""
+    def due(self, connection: Connection, answer: Callable[[], None]) -> None:
+        """Have ``answer`` called when it is the turn of this connection's process."""
+        turn = Turn(connection, answer=answer)
+        self._queue.add(turn.process, connection, turn, 0, always=True)
+
+    def take(self) -> Turn | None:
+        """Take what is to be served now; tell `served` afterwards."""
         turn = self._queue.take()
         return None if turn is None else turn[1]
 
-    def served(self, heard: Heard, seconds: float) -> None:
-        """A request taken has been served."""
-        heard.connection.waiting_bytes -= len(heard.body)
-        heard.connection.reweigh()
-        self._queue.served(heard.process, seconds)
+    def served(self, turn: Turn, seconds: float) -> None:
+        """What was taken has been served."""
+        turn.connection.waiting_bytes -= len(turn.body)
+        turn.connection.reweigh()
+        self._queue.served(turn.process, seconds)

@@ -30,6 +30,7 @@ from shmmap.daemon.records import Key
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
+from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
@@ -102,11 +103,14 @@ class InnerDaemon:
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
         self.loads = self.scheduler.loads
+        self.hold_answers = False
+        self.due: list[Callable[[], None]] = []
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.cache,
             self.scheduler,
             quota_bytes=quota_bytes,
+            due=self._answer,
             clock=self.now_s,
         )
         self.scheduler.on_settled = self._on_settled
@@ -115,6 +119,13 @@ class InnerDaemon:
             self.sessions, OperatorPins(self.cache, self.scheduler), self.map_switch, self.loads,
             self.event_log,
         )  # fmt: skip
+
+    def _answer(self, _connection: Connection, answer: Callable[[], None]) -> None:
+        """An answer is due; kept while `hold_answers`."""
+        if self.hold_answers:
+            self.due.append(answer)
+        else:
+            answer()
 
     def _on_settled(self, key: Key) -> None:
         self.settled.append(key)

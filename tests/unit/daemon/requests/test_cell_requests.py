@@ -114,3 +114,34 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
     assert one.cells.next_deadline_s() == math.inf
     assert 9 not in [reply.request for _, reply in one.replies]
     assert sorted(one.settled) == sorted(one.ledger.by_key), "each load has ended once"
+
+
+def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
+    """A load that many waited for answers nobody by itself: each answer has its own turn, if still wanted."""
+    one = inner(small_map.root)
+    sessions = [one.session(str(number)) for number in range(3)]
+    one.hold_answers = True
+    for session in sessions:
+        for number in range(4):
+            one.cells.selected(session, Selected(number, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.run_until(lambda: one.settled)
+    assert (len(one.due), one.replies) == (12, [])
+    one.cells.answer_overdue(one.now_s() + 60.0)
+    assert len(one.due) == 12, "each is due once"
+    one.cells.forget(sessions[1])
+    for count, answer in enumerate(one.due):
+        before = len(one.replies)
+        answer()
+        assert len(one.replies) - before == (0 if 4 <= count < 8 else 1)
+    assert len(one.cells) == 0
+
+
+def test_whose_patience_ends_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    one.hold_answers = True
+    one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=5.0), one.now_s())
+    one.cells.answer_overdue(one.now_s() + 6.0)
+    assert (len(one.due), one.replies, one.cells.next_deadline_s()) == (1, [], float("inf"))
+    one.due[0]()
+    ((_, reply),) = one.replies
+    assert [cell.id for cell in reply.pending] == ["0_0.pcd"]

@@ -6,7 +6,12 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.requests.pending_request import MOST_OF_A_SESSION, PendingRequest, WaitingList
+from shmmap.daemon.requests.pending_request import (
+    MOST_OF_A_SESSION,
+    OVERDUE_AT_ONCE,
+    PendingRequest,
+    WaitingList,
+)
 from shmmap.daemon.transport.sessions import Session, Sessions
 from tests.support import connections
 
@@ -33,6 +38,18 @@ def test_one_session_has_its_share() -> None:
     assert waiting.has_room(mine)
 
 
+def test_many_that_are_overdue_are_taken_little_by_little() -> None:
+    waiting: WaitingList = WaitingList()
+    for owner in sessions(2 * OVERDUE_AT_ONCE // MOST_OF_A_SESSION):
+        for number in range(MOST_OF_A_SESSION):
+            waiting.add(waiting_request(owner, float(number)))
+    taken: list[PendingRequest] = []
+    while part := waiting.overdue(1e9):
+        assert len(part) == OVERDUE_AT_ONCE
+        taken += part
+    assert len(set(map(id, taken))) == len(waiting) == 2 * OVERDUE_AT_ONCE
+
+
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 50), st.booleans())))
 def test_against_a_plain_list(steps: list[tuple[int, int, bool]]) -> None:
     owners = sessions(3)
@@ -47,6 +64,10 @@ def test_against_a_plain_list(steps: list[tuple[int, int, bool]]) -> None:
             waiting.remove(gone)
         assert list(waiting) == model
         assert len(waiting) == len(model)
-        assert waiting.next_deadline_s() == min((r.deadline_s for r in model), default=float("inf"))
-        assert waiting.overdue(25.0) == [r for r in model if r.deadline_s <= 25.0]
+        undue = [r for r in model if not r.due]
+        assert waiting.next_deadline_s() == min((r.deadline_s for r in undue), default=float("inf"))
+        overdue = waiting.overdue(25.0)
+        assert sorted(map(id, overdue)) == sorted(id(r) for r in undue if r.deadline_s <= 25.0)
+        for one in overdue:
+            one.due = True
         assert waiting.of(owners[owner]) == [r for r in model if r.session is owners[owner]]

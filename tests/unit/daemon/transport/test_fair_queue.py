@@ -125,3 +125,13 @@ def test_the_quiet_one_waits_for_each_loud_one_once(loud: int) -> None:
     while serve(turns, 0.01) != "quiet":
         before += 1
     assert before <= loud
+
+
+def test_what_must_be_answered_is_never_refused() -> None:
+    turns: FairQueue[str] = FairQueue()
+    for _ in range(MOST_OF_A_CONNECTION):
+        assert turns.add("p", "c", "loud", 0)
+    assert not turns.add("p", "c", "more", 0)
+    assert turns.add("p", "c", "answer", 0, always=True)
+    assert turns.add("q", "d", "quiet", 0)
+    assert "quiet" in [serve(turns, 1.0) for _ in range(3)], "nobody waits for a loud process's answers"
