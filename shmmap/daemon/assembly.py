@@ -19,7 +19,14 @@ from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.host.instance_names import lock_name, lock_path, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
-from shmmap.daemon.host.signals import KEEP_SIGNAL, RELOAD_SIGNAL, STOP_SIGNALS, ServingSignals, StartSignals
+from shmmap.daemon.host.signals import (
+    KEEP_SIGNAL,
+    RELOAD_SIGNAL,
+    STOP_SIGNALS,
+    ServingSignals,
+    StartSignals,
+    ignore_signals,
+)
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
@@ -241,8 +248,7 @@ class Service:
         It may come in the middle of the first one's work, so it trusts the disk alone.
         """
         del number, frame
-        for again in STOP_SIGNALS:  # one after the other they would pile up in here
-            signal.signal(again, signal.SIG_IGN)
+        ignore_signals()  # one after the other they would pile up in here
         directory, instance = self._memory.directory, self._config.instance
         locks = (directory.path + lock_name(instance), lock_path(self._socket_path))
         ours = [events_path(self._socket_path), *([self._socket_path] if self._activated is None else [])]

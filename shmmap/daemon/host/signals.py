@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import signal
 import socket
 from collections.abc import Iterator
@@ -99,5 +100,9 @@ class ServingSignals:
 
 def ignore_signals() -> None:
     """From here on nothing stops the process but its own end."""
-    for number in (*STOP_SIGNALS, KEEP_SIGNAL):
+    numbers = (*STOP_SIGNALS, KEEP_SIGNAL)
+    libc = ctypes.CDLL(None)
+    for number in numbers:  # the kernel first: Python complains of one that comes while its handler changes
+        libc.signal(number, 1)  # SIG_IGN
+    for number in numbers:
         signal.signal(number, signal.SIG_IGN)
