@@ -105,14 +105,13 @@ class CellRequests:
         note_area(session, area)
         layers = limits.admitted_layers(self._cache, message.layers)
         found = self._cache.catalogue.query(area)
-        if len(layers) == 1 and area.z is None and self._quota.is_out_of_reach(session):
+        if len(layers) == 1 and area.z is None:
             warm = warm_difference(self._cache, message, found, layers[0])
-            if warm is not None:
+            if warm is not None and self._quota.has_room(session, warm.residents):
                 answer = Answer([resident.handle for resident in warm.residents], warm.residents)
                 self._answers.reply(session, message.request, answer, warm.removed, warm.removed_packed)
                 # the bookkeeping can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
-                self._account(session, warm.held)
                 self._answers.hand_out(session, answer, now_s)
                 return
         lacks = difference(self._cache, message, self._cache.at_height(found.tolist(), area.z), layers)
@@ -120,14 +119,7 @@ class CellRequests:
             session, message.request, lacks.cells, removed=lacks.removed, removed_packed=lacks.removed_packed,
             held_old=lacks.old, area=area,
         )  # fmt: skip
-        self._account(session, lacks.held)
         self._begin(wanted, message.wait, now_s)
-
-    def _account(self, session: Session, held: set[int]) -> None:
-        """The client says what it holds: note what it dropped since, and free it where possible."""
-        dropped = session.held.keys() - held
-        if dropped:
-            self.let_go(session.drop(dropped))
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these."""

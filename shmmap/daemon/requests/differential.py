@@ -26,12 +26,11 @@ __all__ = ["Difference", "WarmDifference", "difference", "warm_difference"]
 
 @dataclass(eq=False, slots=True)
 class WarmDifference:
-    """The difference where all of the area is in memory; ``held`` are the versions the client has."""
+    """The difference where all of the area is in memory."""
 
     residents: list[Resident]
     removed: tuple[str, ...]
     removed_packed: bytes
-    held: set[int]
 
 
 def warm_difference(
@@ -69,7 +68,7 @@ def warm_difference(
             removed = _removed_names(cache, named, gone, current, layer)
         if message.packed:
             removed_packed = pack_versions(gone if not named else gone.intersection(packed))
-    return WarmDifference([warm[index] for index in missing], removed, removed_packed, held)
+    return WarmDifference([warm[index] for index in missing], removed, removed_packed)
 
 
 def _removed_names(
@@ -97,15 +96,12 @@ class Difference:
         What to drop, as the reply says it.
     old
         Ids of cells in the area that the client holds in an older version.
-    held
-        Versions the client says it has.
     """
 
     cells: list[tuple[int, str]] = field(default_factory=list)
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
     old: set[str] = field(default_factory=set)
-    held: set[int] = field(default_factory=set)
 
 
 def difference(
@@ -115,20 +111,16 @@ def difference(
     version_of, id_of = cache.layers.version, cache.catalogue.id
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
-    result = Difference(held=set(packed))
+    result = Difference()
     has: dict[int, set[str]] = {}
     removed: dict[str, None] = {}
     for cell in message.held:
         index = cache.index_of(cell.id)
-        if cell.version is not None:
-            result.held.add(cell.version)
         if index is None or index not in inside:
             removed[cell.id] = None
             continue
         for layer in layers if cell.layers is None else canonical_layers(cell.layers):
-            if cell.version is None:
-                result.held.add(version_of(index, layer))
-            elif cell.version != version_of(index, layer):
+            if cell.version is not None and cell.version != version_of(index, layer):
                 result.old.add(id_of(index))
                 continue
             has.setdefault(index, set()).add(layer)

@@ -15,7 +15,7 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.records import Key
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
 from shmmap.errors import BadRequest, Busy
@@ -152,15 +152,13 @@ class SessionQuota:
     cache: CellCache
     clock: Callable[[], float]
 
-    def is_out_of_reach(self, session: Session) -> bool:
-        """Whether the session could have everything that is in memory."""
-        return session.held_bytes + self.cache.ledger.resident_bytes <= self.nbytes
+    def has_room(self, session: Session, residents: Sequence[Resident]) -> bool:
+        """Whether the session may surely have these, too."""
+        return session.held_bytes + sum(resident.nbytes for resident in residents) <= self.nbytes
 
     def check(self, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> None:
         """Note in ``wanted.refused`` what is too much, farthest cells first; ``cold`` is not in memory."""
         session, cache, warm = wanted.session, self.cache, self.cache.warm.layers
-        if self.is_out_of_reach(session) and not cold:
-            return
         chilled = set(cold)
         sizes = [
             cache.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes

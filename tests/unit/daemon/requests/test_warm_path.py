@@ -83,3 +83,31 @@ def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
         resident.handle = encode_handle(msgspec.structs.replace(handle, points=4711))
     for request, reply in ((3, differential(inner, 3, EVERYWHERE, [])), (4, inner.everything(4))):
         assert {cell.points for cell in reply.cells} == {4711}, request
+
+
+def test_a_full_cache_takes_the_short_way_too(
+    warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is in memory may come to more than one session may have; what it has and gets does not."""
+    inner, everything = warm
+    monkeypatch.setattr(cell_requests, "difference", long_way)
+    sizes = [cell.bytes for cell in everything.cells]
+    inner.cells._quota.nbytes = sum(sizes[:2])
+    assert inner.ledger.resident_bytes > inner.cells._quota.nbytes
+    held = [cell.version for cell in everything.cells]
+    assert len(differential(inner, 2, EVERYWHERE, held[2:]).cells) == 2
+    with pytest.raises(LongWay):
+        differential(inner, 3, EVERYWHERE, held[3:])
+
+
+def test_what_another_request_got_is_not_forgotten(warm: tuple[InnerDaemon, Cells]) -> None:
+    """Two windows of one client: each says what it holds, and the session has both's until it lets go."""
+    inner, everything = warm
+    session = inner.session()
+    half = Differential(2, HALF)
+    inner.cells.differential(session, half, inner.now_s())
+    inner.cells.differential(session, Differential(3, EVERYWHERE), inner.now_s())
+    inner.cells.differential(session, half, inner.now_s())
+    held = {cell.version for cell in everything.cells}
+    assert session.held.keys() == held
+    assert session.held_bytes == sum(cell.bytes for cell in everything.cells)
