@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+import traceback
 from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
@@ -56,7 +57,5 @@ class Defects:
 
 def _place() -> tuple[str, int]:
     """File and line that raised the exception being handled."""
-    trace = sys.exc_info()[2]
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    return (trace.tb_frame.f_code.co_filename, trace.tb_lineno) if trace is not None else ("", 0)
+    *_, (frame, line) = traceback.walk_tb(sys.exc_info()[2])
+    return frame.f_code.co_filename, line

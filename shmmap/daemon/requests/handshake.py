@@ -63,11 +63,11 @@ class Handshake:
             self.sessions.departed.pop(earlier.slot, None)
             earlier.connect(connection)
             return earlier
-        spare = self.sessions.spare() if self.sessions.full else None
-        if spare is not None:
-            self.leave(spare)
         if self.sessions.full:
-            raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
+            spare = self.sessions.spare()
+            if spare is None:
+                raise BadRequest(f"there are {Sessions.LIMIT} sessions already")
+            self.leave(spare)
         session = self.sessions.open(connection, message.client, now_s, slot=message.session)
         self.statistics.add("sessions_opened")
         self.event_log.publish(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shmmap.daemon.transport.listener import Listener
     from shmmap.daemon.transport.sessions import Session
 
-__all__ = ["Connection", "Peer", "peer_of"]
+__all__ = ["Connection", "Peer"]
 
 MOST_UNREAD_BYTES: Final = 16 << 20
 """Of replies; whoever leaves more does not read them."""
@@ -43,18 +43,13 @@ class Peer:
     pid: int = 0
 
 
-def peer_of(connected: socket.socket) -> Peer:
-    """Return who connected, according to the kernel."""
-    raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    pid, uid, gid = _CREDENTIALS.unpack(raw)
-    return Peer(uid, gid, pid)
-
-
 class Connection:
     """A connected Unix socket on which a client speaks ZMTP.
 
     Attributes
     ----------
+    open : bool
+        Whether it is not closed yet.
     session : Session or None
         Who has said hello on it.
     unsent_bytes : int
@@ -66,7 +61,11 @@ class Connection:
     """
 
     def __init__(self, connected: socket.socket, listener: Listener) -> None:
-        self.peer = peer_of(connected)
+        # according to the kernel
+        credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        pid, uid, gid = _CREDENTIALS.unpack(credentials)
+        self.peer = Peer(uid, gid, pid)
+        self.open = True
         self.session: Session | None = None
         self.unsent_bytes = 0
         self.waiting_bytes = 0
@@ -80,11 +79,6 @@ class Connection:
         self.fd = connected.fileno()
         self._watched.watch(self.fd, self._turn)
         self._send(GREETING)
-
-    @property
-    def open(self) -> bool:
-        """Whether it is not closed yet."""
-        return self.fd >= 0
 
     def reply(self, body: bytes) -> None:
         """Send a reply; whoever leaves too much unread loses the connection, and the replies with it."""
@@ -130,7 +124,7 @@ class Connection:
         """Close it."""
         self._watched.unwatch(self.fd)
         self._socket.close()
-        self.fd = -1
+        self.open = False
         self._forget_unsent()
 
     def flush(self) -> None:

@@ -46,17 +46,12 @@ class Connections:
     ----------
     nbytes : int
         What is kept for them.
-    count : int
     short : bool
         There is no descriptor to spare.
-    ended : int
-        Connections that were ended because they took too much.
     """
 
     def __init__(self) -> None:
         self.nbytes = 0
-        self.count = 0
-        self.ended = 0
         self._of: defaultdict[int, dict[Connection, None]] = defaultdict(dict)
         self.short = False
         self._waiting: list[Callable[[], None]] = []
@@ -66,7 +61,6 @@ class Connections:
 
     def add(self, connection: Connection) -> None:
         """A connection was accepted."""
-        self.count += 1
         self._of[connection.peer.pid][connection] = None
         # the kernel gives the lowest number that is free: all below are taken
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
@@ -74,7 +68,6 @@ class Connections:
 
     def remove(self, connection: Connection) -> None:
         """A connection is closed; whoever waits for room may try again."""
-        self.count -= 1
         mine = self._of[connection.peer.pid]
         del mine[connection]
         if not mine:
@@ -92,14 +85,14 @@ class Connections:
         if not self.short:
             return True
         pid, mine = max(self._of.items(), key=lambda item: len(item[1]))
-        share = max(LEAST_SHARE, self.count // (2 * len(self._of)))
+        share = max(LEAST_SHARE, sum(map(len, self._of.values())) // (2 * len(self._of)))
         if len(mine) <= share:
             self._waiting.append(go_on)  # many processes with a few each: newcomers have to wait
             return False
         had = len(mine)
         for one in sorted(mine, key=lambda one: one.session is not None)[: min(had - share, ENDED_AT_ONCE)]:
             one.end()
-        self._tell(pid, had - len(mine), f"it had {had} connections")
+        _tell(pid, had - len(mine), f"it had {had} connections")
         return True
 
     def weigh(self, more_bytes: int) -> None:
@@ -109,7 +102,7 @@ class Connections:
             pid, mine = max(self._of.items(), key=lambda item: sum(one.weight for one in item[1]))
             for one in mine:
                 one.cut()
-            self._tell(pid, len(mine), TOO_MUCH)
+            _tell(pid, len(mine), TOO_MUCH)
             ctypes.CDLL(None).malloc_trim(0)
 
     def deliver(self, seconds: float) -> None:
@@ -127,10 +120,6 @@ class Connections:
                     del unread[fd]
         for one in self:
             one.close()
-
-    def _tell(self, pid: int, count: int, reason: str) -> None:
-        self.ended += count
-        log.warning("connections ended", pid=pid, count=count, reason=reason)
 
 
 @dataclass(eq=False, slots=True)
@@ -177,3 +166,7 @@ class Listener:
                 return
             connected.setblocking(False)
             self.connections.add(Connection(connected, self))
+
+
+def _tell(pid: int, count: int, reason: str) -> None:
+    log.warning("connections ended", pid=pid, count=count, reason=reason)

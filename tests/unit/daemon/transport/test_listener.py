@@ -113,6 +113,10 @@ class Loop:
         one.connect(f"ipc://{self.path}")
         return one
 
+    @property
+    def count(self) -> int:
+        return len(list(self.connections))
+
     def of(self, pid: int) -> list[Connection]:
         return [one for one in self.connections if one.peer.pid == pid]
 
@@ -179,12 +183,12 @@ def test_libzmq_s_client(loop: Loop) -> None:
         loop.turn()
     assert loop.ended == [connection]
     connection.reply(b"to nobody")
-    assert loop.connections.count == 0
+    assert loop.count == 0
 
 
 def test_the_wrong_type_of_socket(loop: Loop) -> None:
     one = loop.raw(GREETING + READY.replace(b"DEALER", b"REQ" + bytes(3)))
-    assert loop.connections.count == 0
+    assert loop.count == 0
     while one.recv(4096):
         pass
 
@@ -233,7 +237,7 @@ def test_replies_that_are_not_read(loop: Loop) -> None:
     assert connection.unsent_bytes == 0
     loop.settle()
     assert loop.ended == [connection]
-    assert (loop.connections.count, loop.connections.nbytes) == (0, 0)
+    assert (loop.count, loop.connections.nbytes) == (0, 0)
 
 
 def test_half_a_message_from_each(loop: Loop, other: int) -> None:
@@ -249,7 +253,7 @@ def test_half_a_message_from_each(loop: Loop, other: int) -> None:
     assert set(loop.ended) > set(mine)
     assert {one.peer.pid for one in loop.connections} == {other}
     assert loop.connections.nbytes == 0
-    assert loop.connections.ended == len(mine) + 1
+    assert len(loop.ended) == len(mine) + 1
 
 
 def test_a_message_that_is_too_long(loop: Loop) -> None:
@@ -272,7 +276,7 @@ def test_more_connections_than_descriptors(loop: Loop, other: int, monkeypatch: 
     loop.raw()
     assert set(loop.of(os.getpid())) == set(with_session)
     assert len(loop.of(other)) == 3
-    assert loop.connections.ended == len(loop.ended) == 5
+    assert len(loop.ended) == 5
     assert not loop.connections.short
 
 
@@ -281,12 +285,12 @@ def test_newcomers_wait_where_nobody_has_many(loop: Loop, monkeypatch: pytest.Mo
     highest = max(one.fd for one in loop.connections)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (highest + 49, highest + 49))
     loop.raw()
-    assert (loop.connections.count, loop.connections.short) == (2, True)
+    assert (loop.count, loop.connections.short) == (2, True)
     loop.raw(GREETING)
-    assert (loop.connections.count, loop.ended) == (2, [])
+    assert (loop.count, loop.ended) == (2, [])
     first.close()
     loop.settle()
-    assert (loop.connections.count, len(loop.ended)) == (2, 1)
+    assert (loop.count, len(loop.ended)) == (2, 1)
 
 
 def test_what_was_said_last_is_delivered(loop: Loop) -> None:
