@@ -29,6 +29,7 @@ from shmmap.demo.localization import Localization, LocalizationResult
 from shmmap.demo.outage import OutageResult, drive_through_outage
 from shmmap.demo.three_programs import ThreeProgramsResult, run_three_programs
 from shmmap.demo.watched_daemon import Traffic, WatchedDaemon, statistics_now
+from shmmap.processes.end_with_parent import with_us
 from shmmap.processes.interrupts import scratch_directory
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.statistics.cell_rows import CellRow
@@ -145,7 +146,7 @@ def run_demo(
         show = _Show(settings, town, options, progress)
         rounds = {count: Round(*show.compare(count)) for count in settings.counts if count != many}
         private = show.private(many)
-        with DaemonProcess(town.path, *options) as daemon:
+        with DaemonProcess(town.path, *options, command=with_us()) as daemon:
             watched = WatchedDaemon(daemon)
             with Fleet("shared", daemon.endpoint, settings.radius, many) as fleet:
                 rounds[many] = Round(show.shared(fleet, watched), private)
@@ -154,7 +155,7 @@ def run_demo(
                 outage = drive_through_outage(fleet, daemon, town.onward, progress)
         result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
         if localization is None:
-            with DaemonProcess(town.path, *options) as daemon:
+            with DaemonProcess(town.path, *options, command=with_us()) as daemon:
                 result.programs = run_three_programs(settings, daemon, scratch, progress)
         elif localization.missing:
             result.missing = localization.missing
@@ -174,7 +175,7 @@ class _Show:
     def compare(self, count: int) -> tuple[DriveResult, DriveResult]:
         """Drive with a copy each, then on a daemon of their own; returns shared, private."""
         private = self.private(count)
-        with DaemonProcess(self._town.path, *self._options) as daemon:
+        with DaemonProcess(self._town.path, *self._options, command=with_us()) as daemon:
             watched = WatchedDaemon(daemon)
             with Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet:
                 return self.shared(fleet, watched), private

@@ -21,6 +21,7 @@ from shmmap.demo.program import Program
 from shmmap.demo.scans import SEEN_METRES
 from shmmap.demo.watched_daemon import statistics_now
 from shmmap.errors import InternalError
+from shmmap.processes.end_with_parent import with_us
 from shmmap.testing.daemon_process import DaemonProcess
 
 __all__ = ["Localization", "LocalizationResult"]
@@ -130,7 +131,7 @@ class Localization:
         started_s = time.perf_counter()
         first_pose_s = math.nan
         with contextlib.ExitStack() as stack:
-            daemon = stack.enter_context(DaemonProcess(map_path, *options))
+            daemon = stack.enter_context(DaemonProcess(map_path, *options, command=with_us()))
             before_s = cpu_seconds(descendants(daemon.pid))
             program = Program("shmmap-ndt", _PROGRAM, self._words(daemon), self._work, piped=True)
             document: dict[str, Any] = {}

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.errors import BadRequest
 from tests.support.daemon_process import ROOT, processes_marked, wait_ended
+from tests.support.patience import Patience
 from tests.support.small_demo import SMALL
 
 
@@ -154,6 +156,22 @@ def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, stage: str, number: 
     assert (demo.process.returncode, err) == (130, "")
     assert demo.leftovers() == []
     assert [path.name for path in tmp_path.iterdir()] == ["tmp"], "no picture of half a drive"
+
+
+@pytest.mark.parametrize("stage", ["Driving, 2 processes on the copy", "Localizing"])
+def test_a_killed_demo_leaves_no_process_and_no_memory(tmp_path: Path, stage: str) -> None:
+    """Its directories stay where temporary files are, for nobody is left to remove them."""
+    demo = Demo(tmp_path)
+    until(demo, stage)
+    demo.process.kill()
+    demo.process.communicate()
+    waiting = Patience()
+    while waiting(bool(processes_marked(demo.mark))):
+        pass
+    directories = [*Path("/dev/shm").glob(f"shmmap-test-{demo.process.pid}-*")]
+    assert [list(one.iterdir()) for one in directories] == [[]] * len(directories)
+    for left in (*directories, *Path("/tmp").glob(f"shmmap-test-{demo.process.pid}-*")):
+        shutil.rmtree(left)
 
 
 def test_a_demo_whose_daemon_dies_says_so_and_leaves_nothing(tmp_path: Path) -> None:
