@@ -154,19 +154,20 @@ class AttachedSegment:
 
 
 def _open(name: str, shm_dir: str) -> int:
-    """Open a segment, never waiting: a pipe that has its name by now would make the opener wait for ever.
+    """Open a segment, never waiting: a pipe that has its name by now would make the opener wait for ever."""
+    if shm_dir == DEFAULT_SHM_DIR:
+        # no size=: passing one would resize the segment under everybody's feet
+        return int(posix_ipc.SharedMemory(name, flags=os.O_NONBLOCK, read_only=True).fd)
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    return os.open(f"{shm_dir}/{name.lstrip('/')}", flags)
 
-    So an open that meets the daemon's lease, held for a moment to see whether anybody uses the segment, is
-    tried again.
-    """
+
+def _open_soon(name: str, shm_dir: str) -> int:
+    """Open a segment on which the daemon has a lease, held for a moment to see whether anybody uses it."""
     end_s = time.monotonic() + LEASE_S
     while True:
         try:
-            if shm_dir == DEFAULT_SHM_DIR:
-                # no size=: passing one would resize the segment under everybody's feet
-                return int(posix_ipc.SharedMemory(name, flags=os.O_NONBLOCK, read_only=True).fd)
-            flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-            return os.open(f"{shm_dir}/{name.lstrip('/')}", flags)
+            return _open(name, shm_dir)
         except BlockingIOError:  # noqa: PERF203  it is the only way to find out
             if time.monotonic() > end_s:
                 raise
@@ -215,7 +216,10 @@ def attach(
         It may not be opened by this user, or cannot be mapped.
     """
     try:
-        fd = _open(name, shm_dir)
+        try:
+            fd = _open(name, shm_dir)
+        except BlockingIOError:
+            fd = _open_soon(name, shm_dir)
     except (FileNotFoundError, posix_ipc.ExistentialError) as error:
         raise StaleHandle(f"segment {name} is gone", hint="ask the daemon again") from error
     except (PermissionError, posix_ipc.PermissionsError) as error:
