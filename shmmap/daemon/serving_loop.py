@@ -76,10 +76,7 @@ class ServingLoop:
         return min(max(0.0, until_s - time.monotonic()), BEAT_S)
 
     def _turn(self, ready: list[int]) -> None:
-        for fd in ready:
-            callback = self.watched.callbacks.get(fd)
-            if callback is not None:  # another one's may have ended it
-                self._guarded(callback)
+        self._hear(ready)
         self._guarded(self._serve)
         self._guarded(self.cache.tell_all)
         self._look_after_the_rest(time.monotonic())
@@ -94,14 +91,20 @@ class ServingLoop:
             if self.defects.met():
                 raise
 
+    def _hear(self, ready: list[int]) -> None:
+        for fd in ready:
+            callback = self.watched.callbacks.get(fd)
+            if callback is not None:  # another one's may have ended it
+                self._guarded(callback)
+
     def _serve(self) -> None:
-        """Serve those whose turn it is, for a bounded time."""
+        """Serve those whose turn it is, for a bounded time; between any two of them hear who has come."""
         start_s = time.monotonic()
         end_s = start_s + SERVE_S
         while start_s < end_s and (turn := self.inbox.take()) is not None:
             if turn.answer is not None:
                 self._guarded(turn.answer)
-            else:
+            elif turn.connection.open:  # else nobody waits for an answer
                 self.dispatch.handle(turn)
             self.cache.tell_all()
             now_s = time.monotonic()
@@ -109,6 +112,8 @@ class ServingLoop:
             if turn.answer is None:
                 self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s = now_s
+            if len(self.inbox):
+                self._hear(self.watched.poll(0))
 
     def _look_after_the_rest(self, now_s: float) -> None:
         """What has its own time: deadlines, surveys, statistics."""

@@ -27,7 +27,9 @@ MOST_UNREAD_BYTES: Final = 16 << 20
 """Of replies; whoever leaves more does not read them."""
 READ_BYTES: Final = 1 << 16
 """Taken off a connection per turn of the loop."""
-FRAMES_AT_ONCE: Final = 16
+FRAMES_AT_ONCE: Final = 4
+MOST_WAITING: Final = 48
+"""Requests of a connection that are taken off it and wait; about, for some come at once."""
 LIGHT_BYTES: Final = 1 << 12
 """What is kept for every client, and does not count."""
 TOO_MUCH: Final = "it made the daemon take too much memory"
@@ -54,8 +56,8 @@ class Connection:
         Who has said hello on it.
     unsent_bytes : int
         What the kernel does not take, because the client does not read.
-    waiting_bytes : int
-        Of requests that wait to be served.
+    waiting, waiting_bytes : int
+        Requests that wait to be served.
     weight : int
         All memory that is kept for it, bytes.
     """
@@ -68,8 +70,9 @@ class Connection:
         self.open = True
         self.session: Session | None = None
         self.unsent_bytes = 0
-        self.waiting_bytes = 0
+        self.waiting = self.waiting_bytes = 0
         self.weight = 0
+        self._reading = True
         self._socket = connected
         self._listener = listener
         self._watched = listener.watched
@@ -107,10 +110,10 @@ class Connection:
             self._incoming.forget()
             self._forget_unsent()
             self.reweigh()
-            with contextlib.suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)
             if reason:
                 log.warning("connections ended", pid=self.peer.pid, count=1, reason=reason)
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
 
     def end(self) -> None:
         """Close it now and tell its owner; only the loop itself may, between one thing and the next."""
@@ -127,7 +130,14 @@ class Connection:
         self.open = False
         self._forget_unsent()
 
-    def flush(self) -> None:
+    def deliver(self, seconds: float) -> None:
+        """Wait at most so long until what was sent is read."""
+        with contextlib.suppress(OSError):
+            self._socket.settimeout(seconds)
+            for data in self._unsent:
+                self._socket.sendall(data)
+
+    def _flush(self) -> None:
         """Send what was not taken at once."""
         while self._unsent:
             data = self._unsent[0]
@@ -143,8 +153,21 @@ class Connection:
                 self._unsent[0] = data[taken:]
                 return
             self._unsent.popleft()
-        if self.open:
-            self._watched.watch_writing(self.fd, False)
+        self._watch()
+
+    def wait(self, more: int, more_bytes: int) -> None:
+        """So many more of its requests wait: of too many, the kernel keeps the rest."""
+        self.waiting += more
+        self.waiting_bytes += more_bytes
+        reading = self.waiting < MOST_WAITING if self._reading else self.waiting <= MOST_WAITING // 2
+        if self.open and reading != self._reading:
+            self._reading = reading
+            self._watch()
+            if reading and self._incoming.more:
+                self._watched.call_again(self.fd)
+
+    def _watch(self) -> None:
+        self._watched.watch_for(self.fd, reading=self._reading, writing=bool(self._unsent))
 
     def reweigh(self) -> None:
         """Tell the owner when more or less is kept than before."""
@@ -167,9 +190,9 @@ class Connection:
                 return  # the other end is closed: the loop is about to hear of it
             if taken == len(data):
                 return
-            self._watched.watch_writing(self.fd, True)
         self._unsent.append(memoryview(data)[taken:])
         self.unsent_bytes += len(data) - taken
+        self._watch()
         self.reweigh()
 
     def _turn(self) -> None:
@@ -178,29 +201,33 @@ class Connection:
             self.end()
             return
         if self._unsent:
-            self.flush()
-        if not self._incoming.more:
+            self._flush()
+        if not self._reading or not self._incoming.more:
             try:
-                data = self._socket.recv(READ_BYTES)
+                data = self._socket.recv(READ_BYTES, 0 if self._reading else socket.MSG_PEEK)
             except BlockingIOError:
-                self.reweigh()
-                return
+                data = None
             except OSError:
                 data = b""
-            if not data:
+            if data == b"":
                 self.end()
                 return
-            self._incoming.add(data)
+            if data and self._reading:
+                self._incoming.add(data)
+        if self._reading:
+            self._take_messages()
+        self.reweigh()
+
+    def _take_messages(self) -> None:
         try:
             for body, several in self._incoming.messages(FRAMES_AT_ONCE):
                 self._listener.hear(self, body, several)
-            if self._incoming.more:
+            if self._incoming.more and self._reading:
                 self._watched.call_again(self.fd)
         except ProtocolMismatch:
             self.end()  # not one of our clients
         except BadRequest as error:
             self.cut(f"{error.message}: {TOO_MUCH}")
-        self.reweigh()
 
     def _forget_unsent(self) -> None:
         self._unsent.clear()

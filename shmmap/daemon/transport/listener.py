@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import ctypes
 import resource
-import select
 import socket
 import time
 from collections import defaultdict
@@ -89,10 +88,10 @@ class Connections:
         if len(mine) <= share:
             self._waiting.append(go_on)  # many processes with a few each: newcomers have to wait
             return False
-        had = len(mine)
-        for one in sorted(mine, key=lambda one: one.session is not None)[: min(had - share, ENDED_AT_ONCE)]:
+        count = min(len(mine) - share, ENDED_AT_ONCE)
+        _tell(pid, count, f"it had {len(mine)} connections")
+        for one in sorted(mine, key=lambda one: one.session is not None)[:count]:
             one.end()
-        _tell(pid, had - len(mine), f"it had {had} connections")
         return True
 
     def weigh(self, more_bytes: int) -> None:
@@ -100,25 +99,16 @@ class Connections:
         self.nbytes += more_bytes
         if more_bytes > 0 and self.nbytes > MEMORY_ALLOWANCE_BYTES:
             pid, mine = max(self._of.items(), key=lambda item: sum(one.weight for one in item[1]))
+            _tell(pid, len(mine), TOO_MUCH)
             for one in mine:
                 one.cut()
-            _tell(pid, len(mine), TOO_MUCH)
             ctypes.CDLL(None).malloc_trim(0)
 
     def deliver(self, seconds: float) -> None:
         """Wait at most so long for clients to read what was sent to them, and close all connections."""
         end_s = time.monotonic() + seconds
-        unread = {one.fd: one for one in self if one.unsent_bytes}
-        poll = select.poll()
-        for fd in unread:
-            poll.register(fd, select.POLLOUT)
-        while unread and (left_s := end_s - time.monotonic()) > 0:
-            for fd, _events in poll.poll(left_s * 1000):
-                unread[fd].flush()
-                if not unread[fd].unsent_bytes:
-                    poll.unregister(fd)
-                    del unread[fd]
         for one in self:
+            one.deliver(max(0.0, end_s - time.monotonic()))
             one.close()
 
 

@@ -32,9 +32,9 @@ class WatchedDescriptors:
         self.callbacks[fd] = callback
         self._epoll.register(fd, select.EPOLLIN)
 
-    def watch_writing(self, fd: int, also: bool) -> None:
-        """Call its callback also when ``fd``, which is watched, can be written to."""
-        self._epoll.modify(fd, select.EPOLLIN | select.EPOLLOUT if also else select.EPOLLIN)
+    def watch_for(self, fd: int, *, reading: bool, writing: bool) -> None:
+        """Call a watched descriptor's callback when it can be read or written; always when it is closed."""
+        self._epoll.modify(fd, reading * select.EPOLLIN | writing * select.EPOLLOUT)
 
     def call_again(self, fd: int) -> None:
         """Call its callback in the next turn, whatever the kernel says."""

@@ -17,7 +17,15 @@ from typing import Any, cast
 import pytest
 import zmq
 
-from shmmap.daemon.transport.connection import MOST_UNREAD_BYTES, READ_BYTES, Connection, Peer
+from shmmap.daemon.transport.connection import (
+    FRAMES_AT_ONCE,
+    MOST_UNREAD_BYTES,
+    MOST_WAITING,
+    READ_BYTES,
+    Connection,
+    Peer,
+)
+from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.listener import LEAST_SHARE, MEMORY_ALLOWANCE_BYTES, Connections, Listener
 from shmmap.daemon.transport.socket_file import listen_at
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
@@ -203,7 +211,32 @@ def test_a_turn_does_little(loop: Loop) -> None:
         before = len(loop.heard)
         loop.turn()
         most = max(most, len(loop.heard) - before)
-    assert most == 16
+    assert most == FRAMES_AT_ONCE
+
+
+def test_what_nobody_serves_yet_stays_in_the_kernel(loop: Loop) -> None:
+    """A loud client is not read any more until some of its requests were served."""
+    one = loop.raw(GREETING + READY)
+    inbox = Inbox(cast("StatisticsWriter", loop.counts))
+    loop.listener.hear = inbox.hear
+    one.sendall(framed(b"x") * 500)
+    loop.settle()
+    waiting = len(inbox)
+    assert MOST_WAITING <= waiting < MOST_WAITING + FRAMES_AT_ONCE
+    served = 0
+    while (turn := inbox.take()) is not None:
+        inbox.served(turn, 0.001)
+        served += 1
+        loop.settle()
+        assert len(inbox) < MOST_WAITING + FRAMES_AT_ONCE
+    assert served == 500
+    assert loop.counts["errors_returned"] == 0
+    one.sendall(framed(b"x") * 500)
+    loop.settle()
+    one.close()
+    waits = Patience()
+    while waits(not loop.ended):
+        loop.turn()
 
 
 def test_many_connections_take_turns(loop: Loop) -> None:
