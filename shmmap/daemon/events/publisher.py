@@ -20,8 +20,7 @@ __all__ = ["EventPublisher", "events_path"]
 MOST_UNREAD_BYTES: Final = 1 << 20
 """Of events kept for a subscriber that does not read; further ones are lost to it."""
 MAX_SUBSCRIPTION_BYTES: Final = 64
-_SUBSCRIBE: Final = b"\x01"
-_UNSUBSCRIBE: Final = b"\x00"
+_SUBSCRIBE: Final = b"\x01"  # and a prefix
 
 
 def events_path(request_path: str) -> str:
@@ -61,7 +60,7 @@ class EventPublisher:
             one.tell(data, MOST_UNREAD_BYTES)
 
     def _hear(self, connection: Connection, body: bytes, several: bool) -> None:
-        if several or body not in (_SUBSCRIBE, _UNSUBSCRIBE):
+        if several or body not in (_SUBSCRIBE, b"\x00"):
             connection.cut("it subscribed to some of the events: only all can be subscribed to")
         elif body == _SUBSCRIBE:
             self._subscribers[connection] = None

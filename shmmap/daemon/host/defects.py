@@ -44,7 +44,8 @@ class Defects:
         Its traceback is logged, unless that of the same place was just now.
         """
         self._statistics.add("defects")
-        place, now_s = _place(), self._now_s()
+        *_, (frame, line) = traceback.walk_tb(sys.exc_info()[2])
+        place, now_s = (frame.f_code.co_filename, line), self._now_s()
         if now_s >= self._told_s.get(place, -math.inf) + TELL_AGAIN_S:
             self._told_s[place] = now_s
             log.exception(
@@ -53,9 +54,3 @@ class Defects:
         met = self._met[place]
         met.append(now_s)
         return len(met) == MOST and now_s - met[0] <= WITHIN_S
-
-
-def _place() -> tuple[str, int]:
-    """File and line that raised the exception being handled."""
-    *_, (frame, line) = traceback.walk_tb(sys.exc_info()[2])
-    return frame.f_code.co_filename, line

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One daemon per instance: libzmq lets a second bind steal a live socket, so a lock comes first."""
+"""One daemon per instance: whoever binds takes a live socket's place, so a lock comes first."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 
 Those who ask take turns, and of each one's loads the nearest comes first: however many cells one process
 asks for, another one's cells do not wait for more than a fair share of them.  Turns are by bytes, as
-`shmmap.daemon.transport.fair_queue` has them by time.  What nobody waits for (checks of adopted segments,
+`shmmap.daemon.transport.inbox` has them by time.  What nobody waits for (checks of adopted segments,
 pinned cells) comes when nothing else is queued.
 """
 

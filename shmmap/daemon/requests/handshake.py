@@ -63,7 +63,7 @@ class Handshake:
             self.sessions.departed.pop(earlier.slot, None)
             earlier.connect(connection)
             return earlier
-        if self.sessions.full:
+        if len(self.sessions) >= Sessions.LIMIT:
             spare = self.sessions.spare()
             if spare is None:
                 raise BadRequest(f"there are {Sessions.LIMIT} sessions already")

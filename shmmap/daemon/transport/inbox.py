@@ -20,13 +20,12 @@ from shmmap.errors import Busy
 from shmmap.protocol.codec import request_number
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MOST_BYTES", "MOST_OF_A_CONNECTION", "MOST_OF_A_PROCESS", "FairQueue", "Inbox", "Turn"]
+__all__ = ["MOST_BYTES", "MOST_OF_A_PROCESS", "FairQueue", "Inbox", "Turn"]
 
 Item = TypeVar("Item")
 
-MOST_OF_A_CONNECTION: Final = 64
-"""Requests of one connection that may wait; the client library has one under way at a time."""
 MOST_OF_A_PROCESS: Final = 1024
+"""Requests that may wait; of one connection fewer are taken off it at a time."""
 MOST_BYTES: Final = 8 << 20
 """Bytes of one process's waiting requests; a single one may always wait."""
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
@@ -61,7 +60,7 @@ class FairQueue(Generic[Item]):
     def add(
         self, process: Hashable, connection: Hashable, item: Item, nbytes: int, *, always: bool = False
     ) -> bool:
-        """Let something wait; False if too much of its connection or process does, unless ``always``."""
+        """Let something wait; False if too much of its process does, unless ``always``."""
         line = self._lines.get(process)
         if line is None:
             if len(self._lines) >= MOST_REMEMBERED:
@@ -72,12 +71,7 @@ class FairQueue(Generic[Item]):
             self._line_up(process, line)
         elif not always and (line.count >= MOST_OF_A_PROCESS or line.nbytes + nbytes > MOST_BYTES):
             return False
-        items = line.connections.get(connection)
-        if items is None:
-            items = line.connections[connection] = deque()
-        elif not always and len(items) >= MOST_OF_A_CONNECTION:
-            return False
-        items.append((item, nbytes))
+        line.connections.setdefault(connection, deque()).append((item, nbytes))
         line.count += 1
         line.nbytes += nbytes
         self._waiting += 1

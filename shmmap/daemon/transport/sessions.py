@@ -160,11 +160,6 @@ class Sessions:
         """The session whose lock byte is ``slot``."""
         return self._by_slot.get(slot)
 
-    @property
-    def full(self) -> bool:
-        """Whether no more sessions are accepted."""
-        return len(self._by_slot) >= self.LIMIT
-
     def spare(self) -> Session | None:
         """The session to give up when there are too many; None when everybody has just one.
 

@@ -128,11 +128,8 @@ class Incoming:
             raise ProtocolMismatch("no ZMTP 3 with the NULL mechanism")
         del self._buffer[: len(GREETING)]
         self._greeted = True
-        self._say(
-            framed(
-                b"\x05READY" + _property(b"Socket-Type", self._kind) + _property(b"Identity", b""), _COMMAND
-            )
-        )
+        ready = b"\x05READY" + _property(b"Socket-Type", self._kind) + _property(b"Identity", b"")
+        self._say(framed(ready, _COMMAND))
         return True
 
     def _frame(self, start: int) -> tuple[int, int, int] | None:
