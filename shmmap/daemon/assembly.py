@@ -186,7 +186,7 @@ class Service:
         """A few times a second, from the loop itself: whoever is hung does not beat."""
         memory, now_s = self._memory, time.monotonic()
         self._manager.beat(now_s, self._status)
-        self._handshake.beat()
+        self._handshake.look_after_departed()
         self._pins.keep(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()

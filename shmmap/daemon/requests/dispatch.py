@@ -84,6 +84,7 @@ class Dispatch:
             self.authorization.require(connection.peer, now_s)
             self.operators.handle(session, message, now_s)
         elif isinstance(message, messages.Stats):
+            self.handshake.look_after_departed()
             self.survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
         else:
             connection.reply(encode(self.queries.answer(message)))

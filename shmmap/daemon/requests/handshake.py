@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final
 
 from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.events.log import EventLog
@@ -19,6 +21,8 @@ from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Handshake"]
+
+DEPARTED_AT_ONCE: Final = 256
 
 
 @dataclass(eq=False, slots=True)
@@ -88,8 +92,11 @@ class Handshake:
         else:
             self.leave(session)
 
-    def beat(self) -> None:
-        """End those who had departed before the last survey began and map nothing."""
+    def look_after_departed(self) -> None:
+        """End those whose process is gone, and those that a survey begun since then found to map nothing."""
+        for session in list(islice(self.sessions.departed.values(), DEPARTED_AT_ONCE)):
+            if session.peer.pid and not os.path.exists(f"/proc/{session.peer.pid}"):
+                self.leave(session)
         if self.survey.usage is not self._seen:
             self._seen = self.survey.usage
             for session in self._departed_before:
@@ -97,11 +104,9 @@ class Handshake:
             self._departed_before = list(self.sessions.departed.values())
 
     def _settle(self, session: Session, usage: Usage) -> None:
-        if session.slot not in self.sessions.departed or session.slot in usage.shares:
-            return
-        if not usage.by_slot and os.path.exists(f"/proc/{session.peer.pid}"):
-            return  # nobody can tell what it maps, but that it is there
-        self.leave(session)
+        known = usage.by_slot or not session.peer.pid  # else it stays while its process is there
+        if known and session.slot in self.sessions.departed and session.slot not in usage.shares:
+            self.leave(session)
 
     def leave(self, session: Session) -> None:
         """A client is gone, or said goodbye: what it held may be free now."""
