@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from itertools import islice
-from typing import Final
 
 from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.events.log import EventLog
@@ -21,8 +19,6 @@ from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Handshake"]
-
-DEPARTED_AT_ONCE: Final = 256
 
 
 @dataclass(eq=False, slots=True)
@@ -94,7 +90,7 @@ class Handshake:
 
     def look_after_departed(self) -> None:
         """End those whose process is gone, and those that a survey begun since then found to map nothing."""
-        for session in list(islice(self.sessions.departed.values(), DEPARTED_AT_ONCE)):
+        for session in list(self.sessions.departed.values()):
             if session.peer.pid and not os.path.exists(f"/proc/{session.peer.pid}"):
                 self.leave(session)
         if self.survey.usage is not self._seen:

@@ -21,12 +21,11 @@ GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0"
 _MORE: Final = 1
 _LONG: Final = 2
 _COMMAND: Final = 4
-_SHORT_BYTES: Final = 255
 
 
 def framed(body: bytes, flags: int = 0) -> bytes:
     """Return one frame: a message, unless ``flags`` say otherwise."""
-    if len(body) <= _SHORT_BYTES:
+    if len(body) < 256:
         return bytes((flags, len(body))) + body
     return bytes((flags | _LONG,)) + len(body).to_bytes(8, "big") + body
 
