@@ -20,6 +20,7 @@ STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1
 """Ends the daemon and leaves the segments to its next life: see `shmmap.daemon.main`."""
 RELOAD_SIGNAL: Final = signal.SIGHUP
+_libc: Final = ctypes.CDLL(None)  # found now: it must be quick when signals pile up
 _ALL: Final = (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL)
 
 
@@ -101,8 +102,7 @@ class ServingSignals:
 def ignore_signals() -> None:
     """From here on nothing stops the process but its own end."""
     numbers = (*STOP_SIGNALS, KEEP_SIGNAL)
-    libc = ctypes.CDLL(None)
     for number in numbers:  # the kernel first: Python complains of one that comes while its handler changes
-        libc.signal(number, 1)  # SIG_IGN
+        _libc.signal(number, 1)  # SIG_IGN
     for number in numbers:
         signal.signal(number, signal.SIG_IGN)
