@@ -23,8 +23,8 @@ def near_cells_hint(client: Client, unknown: Sequence[str]) -> str:
 
     if not unknown:
         return ""
-    listed = client.metadata()
-    names = [cell.id.rpartition("/")[2] for cell in listed] if len(listed) <= _MOST_CELLS else []
+    few = client.welcome.cells <= _MOST_CELLS
+    names = [cell.id.rpartition("/")[2] for cell in client.metadata()] if few else []
     near: dict[str, None] = {}
     for one in unknown[:3]:
         near.update(dict.fromkeys(difflib.get_close_matches(one.rpartition("/")[2], names, n=1, cutoff=0.8)))

@@ -187,6 +187,8 @@ class Service:
         memory, now_s = self._memory, time.monotonic()
         self._manager.beat(now_s, self._status)
         self._handshake.look_after_departed()
+        if not any(self._connections):  # nobody can leave who would make room
+            self._connections.try_again()
         self._pins.keep(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The serving loop: one thread, and nothing in it that waits for a disk.
 
-Requests come first; between them the loop hears its loaders, watches its clients' processes and
-frees memory.  Files are read and layers built elsewhere (`shmmap.daemon.loading.worker_main`).
+Requests come first; between them the loop hears its clients and loaders, and frees memory.  Files are read
+and layers built elsewhere (`shmmap.daemon.loading.worker_main`).
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class ServingLoop:
                 self._guarded(turn.answer)
             elif turn.connection.open:  # else nobody waits for an answer
                 self.dispatch.handle(turn)
-            self.cache.tell_all()
+            self._guarded(self.cache.tell_all)
             now_s = time.monotonic()
             self.inbox.served(turn, now_s - start_s)
             if turn.answer is None:

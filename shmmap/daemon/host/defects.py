@@ -48,9 +48,7 @@ class Defects:
         place, now_s = (frame.f_code.co_filename, line), self._now_s()
         if now_s >= self._told_s.get(place, -math.inf) + TELL_AGAIN_S:
             self._told_s[place] = now_s
-            log.exception(
-                "defect", place=f"{place[0]}:{place[1]}", hint="please report it: the daemon goes on"
-            )
+            log.exception("defect", place=f"{place[0]}:{place[1]}", hint="please report it")
         met = self._met[place]
         met.append(now_s)
         return len(met) == MOST and now_s - met[0] <= WITHIN_S

@@ -70,15 +70,13 @@ class Handshake:
             self.leave(spare)
         session = self.sessions.open(connection, message.client, now_s, slot=message.session)
         self.statistics.add("sessions_opened")
-        self.event_log.publish(
-            events.Joined, session.slot, session.peer.pid, session.peer.uid, session.client
-        )
+        peer = session.peer
+        self.event_log.publish(events.Joined, session.slot, peer.pid, peer.uid, session.client)
         return session
 
     def hung_up(self, connection: Connection) -> None:
         """A connection has ended; its session ends when the kernel says that it maps nothing."""
-        session = connection.session
-        if session is None:
+        if (session := connection.session) is None:
             return
         session.disconnect()
         self.cells.forget(session)

@@ -80,7 +80,7 @@ class Connection:
         self._unsent: deque[memoryview] = deque()
         self._cut = False
         self.fd = connected.fileno()
-        self._watched.watch(self.fd, self._turn)
+        self._watched.watch(self.fd, self._ready)
         self._send(GREETING)
 
     def reply(self, body: bytes) -> None:
@@ -155,7 +155,7 @@ class Connection:
             self._unsent.popleft()
         self._watch()
 
-    def wait(self, more: int, more_bytes: int) -> None:
+    def note_waiting(self, more: int, more_bytes: int) -> None:
         """So many more of its requests wait: of too many, the kernel keeps the rest."""
         self.waiting += more
         self.waiting_bytes += more_bytes
@@ -195,7 +195,7 @@ class Connection:
         self._watch()
         self.reweigh()
 
-    def _turn(self) -> None:
+    def _ready(self) -> None:
         """Something came, the client reads again, or the other end is closed."""
         if self._cut:
             self.end()

@@ -150,7 +150,7 @@ class Inbox:
         self._statistics.add("bytes_received", len(body))
         turn = Turn(connection, body, several)
         if self._queue.add(turn.process, connection, turn, len(body)):
-            connection.wait(1, len(body))
+            connection.note_waiting(1, len(body))
         elif len(body) <= WORTH_AN_ANSWER_BYTES:
             error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
             connection.refuse(request_number(body), error)
@@ -168,6 +168,6 @@ class Inbox:
     def served(self, turn: Turn, seconds: float) -> None:
         """What was taken has been served."""
         if turn.answer is None:
-            turn.connection.wait(-1, -len(turn.body))
+            turn.connection.note_waiting(-1, -len(turn.body))
             turn.connection.reweigh()
         self._queue.served(turn.process, seconds)

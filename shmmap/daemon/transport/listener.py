@@ -66,11 +66,15 @@ class Connections:
         self.short = connection.fd >= limit - max(LEAST_RESERVE, limit // 16)
 
     def remove(self, connection: Connection) -> None:
-        """A connection is closed; whoever waits for room may try again."""
+        """A connection is closed."""
         mine = self._of[connection.peer.pid]
         del mine[connection]
         if not mine:
             del self._of[connection.peer.pid]
+        self.try_again()
+
+    def try_again(self) -> None:
+        """Let whoever waits for room see whether there is some."""
         self.short = False
         waiting, self._waiting = self._waiting, []
         for go_on in waiting:
@@ -83,8 +87,8 @@ class Connections:
         """
         if not self.short:
             return True
-        pid, mine = max(self._of.items(), key=lambda item: len(item[1]))
-        share = max(LEAST_SHARE, sum(map(len, self._of.values())) // (2 * len(self._of)))
+        pid, mine = max(self._of.items(), key=lambda item: len(item[1]), default=(0, {}))
+        share = max(LEAST_SHARE, sum(map(len, self._of.values())) // (2 * len(self._of) or 1))
         if len(mine) <= share:
             self._waiting.append(go_on)  # many processes with a few each: newcomers have to wait
             return False

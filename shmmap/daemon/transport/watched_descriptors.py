@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptors that the serving loop hears: clients' connections and processes, loaders, the kernel."""
+"""Descriptors that the serving loop hears: clients' connections, loaders, the kernel."""
 
 from __future__ import annotations
 

@@ -326,6 +326,16 @@ def test_newcomers_wait_where_nobody_has_many(loop: Loop, monkeypatch: pytest.Mo
     assert (loop.count, len(loop.ended)) == (2, 1)
 
 
+def test_a_machine_without_descriptors_is_asked_again(loop: Loop) -> None:
+    """With nobody connected, nobody's leaving makes room."""
+    loop.connections.short = True
+    loop.raw(GREETING)
+    assert loop.count == 0
+    loop.connections.try_again()
+    loop.settle()
+    assert loop.count == 1
+
+
 def test_what_was_said_last_is_delivered(loop: Loop) -> None:
     one = loop.raw(GREETING + READY)
     (connection,) = loop.connections
