@@ -131,9 +131,9 @@ def check_cells_argument(args: argparse.Namespace, verb: str, *, optional: bool 
     area = area_from(args)
     given = [bool(args.cells), area is not None, getattr(args, "all", False)]
     if sum(given) > 1 or (not any(given) and not optional):
-        choices = "cells, or an area" + (", or --all" if "all" in args else "")
-        only = ", only one of them" if any(given) else ""
-        raise BadRequest(f"{verb}: give {choices}{only}", hint=f"shmmap {verb} --help")
+        choices = "cells, an area or --all" if "all" in args else "cells or an area"
+        only = "only one of: " if any(given) else ""
+        raise BadRequest(f"{verb}: give {only}{choices}", hint=f"shmmap {verb} --help")
     return area
 
 

@@ -50,7 +50,7 @@ def choose_pins(directory: ShmDirectory) -> PinWatch:
     support = probe_pins(directory)
     if support.source is not PinSource.LEASES:
         log.warning("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor")
-    log.info("who uses a segment", known_from=support.source.value)
+    log.info("use of segments is detected", by=support.source.value)
     return PinWatch(
         directory, support.source, events=support.close_events and support.source is not PinSource.SESSIONS
     )

@@ -190,9 +190,9 @@ def test_common_options_may_stand_before_the_verb() -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["evict"], "evict: give cells, or an area, or --all"),
-        (["unpin", "--all", "0_0.pcd"], "unpin: give cells, or an area, or --all, only one of them"),
-        (["pin", "--circle", "1,2,3", "0_0.pcd"], "pin: give cells, or an area, only one of them"),
+        (["evict"], "evict: give cells, an area or --all"),
+        (["unpin", "--all", "0_0.pcd"], "unpin: give only one of: cells, an area or --all"),
+        (["pin", "--circle", "1,2,3", "0_0.pcd"], "pin: give only one of: cells or an area"),
     ],
 )
 def test_which_cells_are_meant_has_to_be_clear(
