@@ -53,6 +53,7 @@ class FairQueue(Generic[Item]):
         self._clock_s = 0.0
         self._number = 0
         self._waiting = 0
+        self._taken: Hashable = None  # whose turn it is
 
     def __len__(self) -> int:
         return self._waiting
@@ -68,7 +69,8 @@ class FairQueue(Generic[Item]):
             line = self._lines[process] = _Line(self._clock_s)
         if not line.count:
             line.clock_s = max(line.clock_s, self._clock_s)
-            self._line_up(process, line)
+            if process != self._taken:  # else `served` does it
+                self._line_up(process, line)
         elif not always and (line.count >= MOST_OF_A_PROCESS or line.nbytes + nbytes > MOST_BYTES):
             return False
         line.connections.setdefault(connection, deque()).append((item, nbytes))
@@ -80,11 +82,12 @@ class FairQueue(Generic[Item]):
     def take(self) -> tuple[Hashable, Item] | None:
         """Take the request to serve now, and whose it is; None when nothing waits.
 
-        Tell `served` before anything else.
+        Tell `served` before the next one; meanwhile more may come.
         """
         if not self._ready:
             return None
         self._clock_s, _, process = heapq.heappop(self._ready)
+        self._taken = process
         line = self._lines[process]
         connection, items = next(iter(line.connections.items()))
         item, nbytes = items.popleft()
@@ -98,7 +101,7 @@ class FairQueue(Generic[Item]):
 
     def served(self, process: Hashable, seconds: float) -> None:
         """Serving the request just taken took this long."""
-        line = self._lines[process]
+        line, self._taken = self._lines[process], None
         line.clock_s += seconds
         if line.count:
             self._line_up(process, line)

@@ -133,3 +133,14 @@ def test_what_must_be_answered_is_never_refused() -> None:
     assert turns.add("p", "c", "answer", 0, always=True)
     assert turns.add("q", "d", "quiet", 0)
     assert "quiet" in [serve(turns, 1.0) for _ in range(3)], "nobody waits for a loud process's answers"
+
+
+def test_what_comes_for_a_process_while_it_is_served() -> None:
+    """An answer may be due because of the request that is being served: it has one turn, not two."""
+    turns: FairQueue[str] = FairQueue()
+    turns.add("p", "c", "first", 0)
+    turn = turns.take()
+    assert turn == ("p", "first")
+    turns.add("p", "c", "answer", 0, always=True)
+    turns.served("p", 0.1)
+    assert [serve(turns, 1.0), serve(turns, 1.0), len(turns)] == ["answer", None, 0]
