@@ -78,7 +78,6 @@ class ServingLoop:
     def _turn(self, ready: list[int]) -> None:
         self._hear(ready)
         self._guarded(self._serve)
-        self._guarded(self.cache.tell_all)
         self._look_after_the_rest(time.monotonic())
         self._guarded(self.scheduler.pump, time.monotonic())
         self._guarded(self.cache.tell_all)

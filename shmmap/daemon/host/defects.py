@@ -19,8 +19,7 @@ __all__ = ["Defects"]
 
 MOST: Final = 100
 WITHIN_S: Final = 10.0
-"""So many exceptions of one place in such a time are more than one can go on with."""
-TELL_AGAIN_S: Final = 10.0
+"""So many exceptions of one place in such a time are more than one can go on with; one of them is logged."""
 
 
 class Defects:
@@ -46,7 +45,7 @@ class Defects:
         self._statistics.add("defects")
         *_, (frame, line) = traceback.walk_tb(sys.exc_info()[2])
         place, now_s = (frame.f_code.co_filename, line), self._now_s()
-        if now_s >= self._told_s.get(place, -math.inf) + TELL_AGAIN_S:
+        if now_s >= self._told_s.get(place, -math.inf) + WITHIN_S:
             self._told_s[place] = now_s
             log.exception("defect", place=f"{place[0]}:{place[1]}", hint="please report it")
         met = self._met[place]

@@ -111,7 +111,7 @@ class FairQueue(Generic[Item]):
         heapq.heappush(self._ready, (line.clock_s, self._number, process))
 
     def _forget_idle(self) -> None:
-        self._lines = {process: line for process, line in self._lines.items() if line.count}
+        self._lines = {p: line for p, line in self._lines.items() if line.count or p == self._taken}
 
 
 @dataclass(eq=False, slots=True)
@@ -165,8 +165,7 @@ class Inbox:
 
     def take(self) -> Turn | None:
         """Take what is to be served now; tell `served` afterwards."""
-        turn = self._queue.take()
-        return None if turn is None else turn[1]
+        return taken[1] if (taken := self._queue.take()) else None
 
     def served(self, turn: Turn, seconds: float) -> None:
         """What was taken has been served."""

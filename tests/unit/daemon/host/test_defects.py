@@ -9,7 +9,7 @@ from typing import cast
 
 import pytest
 
-from shmmap.daemon.host.defects import MOST, TELL_AGAIN_S, WITHIN_S, Defects
+from shmmap.daemon.host.defects import MOST, WITHIN_S, Defects
 from shmmap.statistics.writer import StatisticsWriter
 
 
@@ -48,5 +48,5 @@ def test_a_hundred_in_ten_seconds_at_one_place(caplog: pytest.LogCaptureFixture)
     assert counts == {"defects": 5 * MOST - 1}
     told = [record.getMessage() for record in caplog.records]
     lasted_s = 3 * WITHIN_S + 3 * WITHIN_S
-    assert 3 < len(told) <= lasted_s / TELL_AGAIN_S + 2
+    assert 3 < len(told) <= lasted_s / WITHIN_S + 2
     assert "there" in caplog.text
