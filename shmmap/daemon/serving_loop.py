@@ -59,7 +59,7 @@ class ServingLoop:
     def answer_waiting(self) -> None:
         """Answer those who still wait, unless they are left to the next life."""
         if self._answer_at_end:
-            self.cells.answer_all(time.monotonic())
+            self.cells.answer_all()
             while not self.cache.survey.idle:
                 self.cache.survey.step()
 
@@ -101,14 +101,13 @@ class ServingLoop:
         start_s = time.monotonic()
         end_s = start_s + SERVE_S
         while start_s < end_s and (turn := self.inbox.take()) is not None:
-            if turn.answer is not None:
-                self._guarded(turn.answer)
-            elif turn.connection.open:  # else nobody waits for an answer
-                self.dispatch.handle(turn)
+            if turn.over:
+                turn.work = self.dispatch.handle(turn)
+            self._guarded(turn.go_on)
             self._guarded(self.cache.tell_all)
             now_s = time.monotonic()
             self.inbox.served(turn, now_s - start_s)
-            if turn.answer is None:
+            if turn.asked and turn.over:
                 self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s = now_s
             if len(self.inbox):

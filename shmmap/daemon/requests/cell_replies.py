@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import SPACE_CODES, Key, Resident
-from shmmap.daemon.requests.pending_request import PendingRequest
+from shmmap.daemon.requests.pending_request import PendingRequest, parts
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.codec import encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
@@ -38,8 +39,14 @@ class CellReplies:
     cache: CellCache
     scheduler: Scheduler
 
-    def answer(self, wanted: PendingRequest, now_s: float) -> None:
-        """Send what there is by now of everything that is wanted."""
+    def answer(self, wanted: PendingRequest, now_s: float) -> Generator[None, None, None]:
+        """Send what there is by now of everything that is wanted.
+
+        Raises
+        ------
+        MapChanged, NoSession
+            See `PendingRequest.pause`; nothing was sent.
+        """
         warm = self.cache.warm.layers
         answer = Answer()
         if wanted.area is not None and wanted.area.z is not None:
@@ -47,19 +54,22 @@ class CellReplies:
             wanted.cells = [cell for cell in wanted.cells if cell[0] in inside]
         for cell_id, layer in wanted.unknown:
             answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
-        for index, layer in wanted.cells:
-            resident = warm[layer].get(index) if layer in warm else None
-            if resident is None:  # evicted since the request came, perhaps, and still whole
-                resident = self.cache.find_warm(index, layer, now_s)
-            if resident is not None and not wanted.refused:
-                answer.handles.append(resident.handle)
-                answer.residents.append(resident)
-            else:
-                self._answer_cold(wanted, index, layer, answer, now_s)
+        for number, part in enumerate(parts(wanted.cells)):
+            if number:
+                yield from wanted.pause(self.cache)
+            for index, layer in part:
+                resident = warm[layer].get(index) if layer in warm else None
+                if resident is None:  # evicted since the request came, perhaps, and still whole
+                    resident = self.cache.find_warm(index, layer, now_s)
+                if resident is not None and not wanted.refused:
+                    answer.handles.append(resident.handle)
+                    answer.residents.append(resident)
+                else:
+                    self._answer_cold(wanted, index, layer, answer, now_s)
         self.reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
-        self.hand_out(wanted.session, answer, now_s)
-        if wanted.deadline_s:
+        if wanted.began_s:
             self.cache.statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
+        yield from self.hand_out(wanted.session, answer, now_s)
 
     def reply(
         self, session: Session, request: int, answer: Answer, removed: tuple[str, ...], removed_packed: bytes
@@ -72,14 +82,19 @@ class CellReplies:
         )  # fmt: skip
         session.connection.reply(reply)
 
-    def hand_out(self, session: Session, answer: Answer, now_s: float) -> None:
+    def hand_out(self, session: Session, answer: Answer, now_s: float) -> Iterator[None]:
         """Note who has been given what."""
         for resident in answer.residents:
-            resident.last_use_s = now_s
+            resident.last_use_s = now_s  # from now on it is spared for as long as opening it takes
             resident.hits += 1
-        session.hold(answer.residents)
         self.cache.used.update(answer.residents)
         self.cache.statistics.add("handles_sent", len(answer.handles))
+        for number, residents in enumerate(parts(answer.residents)):
+            if number:
+                yield
+                if session.connection.session is not session:
+                    return
+            session.hold(residents)
 
     def _answer_cold(
         self, wanted: PendingRequest, index: int, layer: str, answer: Answer, now_s: float

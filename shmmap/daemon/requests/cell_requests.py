@@ -4,14 +4,15 @@
 A request first becomes a `PendingRequest`: which cells in which order, minus what the client holds.  If all
 of it is warm the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the
 answer (`cell_replies`) leaves when the last one settled or the client's patience ends, whichever is
-first.
+first.  What concerns many cells is done in parts, a turn of the loop each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import partial
-from typing import Final
+import contextlib
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.cell_replies import Answer, CellReplies
 from shmmap.daemon.requests.differential import difference, warm_difference
-from shmmap.daemon.requests.pending_request import PendingRequest, WaitingList
+from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, WaitingList, parts
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest
@@ -31,6 +32,10 @@ from shmmap.protocol import messages
 __all__ = ["CellRequests", "note_area"]
 
 MAX_WAIT_S: Final = 3600.0
+KEYS_A_STEP: Final = 256
+"""Cells of requests that are over, and requests that a load was for, that are seen to in one turn."""
+
+Result = TypeVar("Result")
 
 
 class CellRequests:
@@ -41,7 +46,7 @@ class CellRequests:
     quota_bytes
         Most bytes one session may keep that no other session also holds.
     due
-        Given a connection and what answers it: called in its process's turn.
+        Given a connection and what answers it, to be done in its process's turns.
     clock
         The serving loop's clock, seconds.
     """
@@ -52,7 +57,7 @@ class CellRequests:
         scheduler: Scheduler,
         *,
         quota_bytes: int,
-        due: Callable[[Connection, Callable[[], None]], None],
+        due: Callable[[Connection, Iterator[None]], None],
         clock: Callable[[], float],
     ) -> None:
         self._cache = cache
@@ -63,63 +68,71 @@ class CellRequests:
         self._now_s = clock
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
         self._answers = CellReplies(cache, scheduler)
-        self._waiting: dict[Key, list[PendingRequest]] = {}
+        self._waiting: dict[Key, dict[PendingRequest, None]] = {}
         self._patient = WaitingList()
+        self._settled: deque[tuple[Key, dict[PendingRequest, None]]] = deque()
+        self._over: deque[PendingRequest] = deque()
 
     def __len__(self) -> int:
         return len(self._patient)
 
     # --- the three verbs ------------------------------------------------------------------------
 
-    def area(self, session: Session, message: messages.Area, now_s: float) -> None:
+    def area(self, session: Session, message: messages.Area) -> Iterator[None]:
         """All cells that touch an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         note_area(session, area)
-        layers = limits.admitted_layers(self._cache, message.layers)
-        indices = self._cache.at_height(self._cache.catalogue.query(area).tolist(), area.z)
-        cells = [(index, layer) for index in indices for layer in layers]
-        self._begin(PendingRequest(session, message.request, cells, area=area), message.wait, now_s)
+        cache = self._cache
+        layers = limits.admitted_layers(cache, message.layers)
+        found = cache.catalogue.query(area)
+        limits.check_count(len(found) * len(layers))
+        cells = [(index, layer) for index in cache.at_height(found.tolist(), area.z) for layer in layers]
+        wanted = PendingRequest(session, message.request, cells, cache.catalogue, area=area)
+        return self._serve(wanted, message.wait)
 
-    def selected(self, session: Session, message: messages.Selected, now_s: float) -> None:
+    def selected(self, session: Session, message: messages.Selected) -> Iterator[None]:
         """Cells by id, in the order asked for."""
         _check_wait(message.wait)
-        layers = limits.admitted_layers(self._cache, message.layers)
+        cache = self._cache
+        layers = limits.admitted_layers(cache, message.layers)
         limits.check_count(len(message.ids) * len(layers))
         cells: list[tuple[int, str]] = []
         unknown: list[tuple[str, str]] = []
-        for cell_id in message.ids:
-            index = self._cache.index_of(cell_id)
-            for layer in layers:
-                if index is None:
-                    unknown.append((cell_id, layer))
-                else:
-                    cells.append((index, layer))
-        self._begin(PendingRequest(session, message.request, cells, unknown=unknown), message.wait, now_s)
+        for number, ids in enumerate(parts(message.ids)):
+            if number:
+                yield
+            indices = [cache.index_of(cell_id) for cell_id in ids]
+            cells += [(index, layer) for index in indices if index is not None for layer in layers]
+            absent = [cell_id for cell_id, index in zip(ids, indices, strict=True) if index is None]
+            unknown += [(cell_id, layer) for cell_id in absent for layer in layers]
+        wanted = PendingRequest(session, message.request, cells, cache.catalogue, unknown=unknown)
+        yield from self._serve(wanted, message.wait)
 
-    def differential(self, session: Session, message: messages.Differential, now_s: float) -> None:
+    def differential(self, session: Session, message: messages.Differential) -> Iterator[None]:
         """Cells that touch an area, minus those the client holds."""
         limits.check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         note_area(session, area)
-        layers = limits.admitted_layers(self._cache, message.layers)
-        found = self._cache.catalogue.query(area)
+        cache = self._cache
+        layers = limits.admitted_layers(cache, message.layers)
+        found = cache.catalogue.query(area)
         if len(layers) == 1 and area.z is None:
-            warm = warm_difference(self._cache, message, found, layers[0])
+            warm = warm_difference(cache, message, found, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
                 answer = Answer([resident.handle for resident in warm.residents], warm.residents)
                 self._answers.reply(session, message.request, answer, warm.removed, warm.removed_packed)
                 # the bookkeeping can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
-                self._answers.hand_out(session, answer, now_s)
-                return
-        lacks = difference(self._cache, message, self._cache.at_height(found.tolist(), area.z), layers)
+                return self._answers.hand_out(session, answer, self._now_s())
+        limits.check_count(len(found) * len(layers))
+        lacks = difference(cache, message, cache.at_height(found.tolist(), area.z), layers)
         wanted = PendingRequest(
-            session, message.request, lacks.cells, removed=lacks.removed, removed_packed=lacks.removed_packed,
-            held_old=lacks.old, area=area,
+            session, message.request, lacks.cells, cache.catalogue, removed=lacks.removed,
+            removed_packed=lacks.removed_packed, held_old=lacks.old, area=area,
         )  # fmt: skip
-        self._begin(wanted, message.wait, now_s)
+        return self._serve(wanted, message.wait)
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these."""
@@ -127,127 +140,197 @@ class CellRequests:
 
     # --- loading and waiting --------------------------------------------------------------------
 
-    def _begin(self, wanted: PendingRequest, wait_s: float | None, now_s: float) -> None:
-        limits.check_count(len(wanted.cells))
-        warm = self._cache.warm.layers
-        find = self._cache.find_warm
-        cold = [
-            (index, layer)
-            for index, layer in wanted.cells
-            if index not in warm.get(layer, {}) and find(index, layer, now_s) is None
-        ]
+    def _serve(self, wanted: PendingRequest, wait_s: float | None) -> Iterator[None]:
+        """Answer a request, or have loaded what is cold of it and let it wait."""
+        waits = False
+        try:
+            waits = yield from self._on_one_map(wanted, lambda: self._begin(wanted, wait_s))
+            if not waits:
+                yield from self._answer(wanted)
+        finally:
+            if not waits:
+                self._let_go(wanted)
+
+    def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
+        """Find what is warm and have the rest loaded; whether the request waits for that."""
+        cache, warm, now_s = self._cache, self._cache.warm.layers, self._now_s()
+        wanted.refused.clear()
+        cold: list[tuple[int, str]] = []
+        sizes: list[int] = []
+        for number, part in enumerate(parts(wanted.cells)):
+            if number:
+                yield from wanted.pause(cache)
+            for index, layer in part:
+                resident = warm[layer].get(index) if layer in warm else None
+                if resident is None:
+                    resident = cache.find_warm(index, layer, now_s)
+                if resident is None:
+                    cold.append((index, layer))
+                sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
         self._statistics.add("hits", len(wanted.cells) - len(cold))
-        self._quota.check(wanted, cold)
-        if cold:
-            limits.check_queue(self._cache.catalogue, self._scheduler.loads, wanted.session, cold)
-            self._statistics.add("misses", len(cold))
-            self._load(wanted, cold, now_s)
-            if wait_s and wanted.outstanding and self._patient.has_room(wanted.session):
-                wanted.began_s, wanted.deadline_s = now_s, now_s + wait_s
-                self._wait(wanted)
-                return
-        self._answers.answer(wanted, now_s)
-
-    def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], now_s: float) -> None:
-        cache = self._cache
-        boxes = cache.catalogue.boxes[np.array([index for index, _ in cold], dtype=np.intp)]
-        for (index, layer), distance in zip(cold, wanted.distances_m(boxes).tolist(), strict=True):
-            key = Key(cache.catalogue.id(index), layer)
-            if key in wanted.refused:
-                continue
-            if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) is not None:
-                wanted.outstanding.add(key)
-
-    def _wait(self, wanted: PendingRequest) -> None:
-        catalogue = self._cache.catalogue
-        wanted.keys = tuple({Key(catalogue.id(index), layer) for index, layer in wanted.cells})
-        for key in wanted.keys:
-            self._cache.ledger.need(key)
-        for key in wanted.outstanding:
-            self._waiting.setdefault(key, []).append(wanted)
+        yield from self._quota.check(wanted, sizes)
+        if not cold:
+            return False
+        limits.check_queue(cache.catalogue, self._scheduler.loads, wanted.session, cold)
+        self._statistics.add("misses", len(cold))
+        waits = bool(wait_s) and self._patient.has_room(wanted)
+        yield from self._load(wanted, cold, note=waits)
+        if not (waits and wanted.outstanding):
+            return False
+        for number, part in enumerate(parts(wanted.cells)):
+            if number:
+                yield from wanted.pause(cache)
+            for index, layer in part:
+                self._need(wanted, Key(cache.catalogue.id(index), layer))
+        wanted.began_s, wanted.deadline_s = now_s, now_s + (wait_s or 0.0)
         self._patient.add(wanted)
+        if not wanted.outstanding:  # they came while the rest was gone through
+            self._answer_in_turn(wanted)
+        return True
 
-    def _stop_waiting(self, wanted: PendingRequest) -> None:
-        for key in wanted.keys:
-            self._cache.ledger.need_no_more(key)
-        for key in wanted.outstanding:
-            waiters = self._waiting.get(key)
-            if waiters is not None:
-                waiters.remove(wanted)
+    def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
+        """Ask for loads; ``note`` which ones, to be told when they end."""
+        cache, now_s = self._cache, self._now_s()
+        for number, part in enumerate(parts(cold)):
+            if number:
+                yield from wanted.pause(cache)
+            boxes = cache.catalogue.boxes[np.array([index for index, _ in part], dtype=np.intp)]
+            for (index, layer), distance in zip(part, wanted.distances_m(boxes).tolist(), strict=True):
+                key = Key(cache.catalogue.id(index), layer)
+                if (
+                    key not in wanted.refused
+                    and self._scheduler.want(index, layer, distance, now_s, wanted.session.asker)
+                    and note
+                ):
+                    self._wait_for(wanted, key)
+
+    def _wait_for(self, wanted: PendingRequest, key: Key) -> None:
+        wanted.outstanding.add(key)
+        self._waiting.setdefault(key, {})[wanted] = None
+
+    def _need(self, wanted: PendingRequest, key: Key) -> None:
+        """Keep what is asked for from making room until the answer is out."""
+        if key not in wanted.keys:
+            wanted.keys[key] = None
+            self._cache.ledger.need(key)
+
+    def _let_go(self, wanted: PendingRequest) -> None:
+        """A request is over: what it needed may go."""
+        if wanted.keys or wanted.outstanding:
+            self._over.append(wanted)
+            self.tidy()
+
+    def tidy(self) -> None:
+        """Tell those who wait of loads that ended, and forget what is over; a bounded part of it."""
+        for _ in range(KEYS_A_STEP):
+            if self._settled:
+                key, waiters = self._settled[0]
                 if not waiters:
-                    del self._waiting[key]
-        self._patient.remove(wanted)
+                    self._settled.popleft()
+                    continue
+                wanted, _ = waiters.popitem()
+                wanted.outstanding.discard(key)
+                if not wanted.outstanding and wanted in self._patient:
+                    self._answer_in_turn(wanted)
+            elif self._over:
+                wanted = self._over[0]
+                if wanted.keys:
+                    self._cache.ledger.need_no_more(wanted.keys.popitem()[0])
+                elif wanted.outstanding:
+                    key = wanted.outstanding.pop()
+                    left = self._waiting.get(key, {})
+                    left.pop(wanted, None)
+                    if not left:
+                        self._waiting.pop(key, None)
+                else:
+                    self._over.popleft()
+            else:
+                break
 
     def settled(self, key: Key) -> None:
         """A load ended: answer the requests it was the last one for."""
-        for wanted in self._waiting.pop(key, ()):
-            wanted.outstanding.discard(key)
-            if not wanted.outstanding and not self._goes_on_waiting(wanted):
-                self._answer_in_turn(wanted)
+        waiters = self._waiting.pop(key, None)
+        if waiters:
+            self._settled.append((key, waiters))
+            self.tidy()
 
     def _answer_in_turn(self, wanted: PendingRequest) -> None:
         """Answer a request that waits; what it asks for stays needed until then."""
         if not wanted.due:
             wanted.due = True
-            self._due(wanted.session.connection, partial(self._answer_now, wanted))
+            self._due(wanted.session.connection, self._answer_now(wanted))
 
-    def _answer_now(self, wanted: PendingRequest) -> None:
-        if wanted in self._patient:  # its session may have ended
-            self._stop_waiting(wanted)
-            self._answers.answer(wanted, self._now_s())
+    def _answer_now(self, wanted: PendingRequest) -> Iterator[None]:
+        """Answer a request that waits, unless there is more to wait for."""
+        if wanted not in self._patient:  # its session has ended
+            return
+        over = True
+        try:
+            if (yield from self._on_one_map(wanted, lambda: self._goes_on_waiting(wanted))):
+                over = False
+                self._patient.again(wanted)
+            else:
+                yield from self._answer(wanted)
+        finally:
+            if over and wanted in self._patient:
+                self._patient.remove(wanted)
+                self._let_go(wanted)
 
-    def _goes_on_waiting(self, wanted: PendingRequest) -> bool:
+    def _answer(self, wanted: PendingRequest) -> Iterator[None]:
+        return self._on_one_map(wanted, lambda: self._answers.answer(wanted, self._now_s()))
+
+    def _on_one_map(
+        self, wanted: PendingRequest, do: Callable[[], Generator[None, None, Result]]
+    ) -> Generator[None, None, Result]:
+        """Go through a request's cells, from the beginning again if the map has changed."""
+        while True:
+            with contextlib.suppress(MapChanged):
+                if wanted.catalogue is self._cache.catalogue:
+                    return (yield from do())
+            yield from wanted.follow(self._cache)
+
+    def _goes_on_waiting(self, wanted: PendingRequest) -> Generator[None, None, bool]:
         """Whether a cell that had settled is cold again, or may fit now, and there is time to load it."""
-        now_s = self._now_s()
-        if now_s >= wanted.deadline_s:
-            return False
-        for index, layer in wanted.cells:
-            key = Key(self._cache.catalogue.id(index), layer)
-            if key in wanted.refused or self._cache.find_warm(index, layer, now_s) is not None:
-                continue
-            if (
-                key not in wanted.outstanding  # it may be asked for twice
-                and key not in self._scheduler.loads.failures
-                and self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker)
-            ):
-                wanted.outstanding.add(key)
-                self._waiting.setdefault(key, []).append(wanted)
+        for number, part in enumerate(parts(wanted.cells)):
+            if number:
+                yield from wanted.pause(self._cache)
+            now_s = self._now_s()
+            if now_s >= wanted.deadline_s:
+                return False
+            for index, layer in part:
+                key = Key(self._cache.catalogue.id(index), layer)
+                if key in wanted.refused or self._cache.find_warm(index, layer, now_s) is not None:
+                    continue
+                if (
+                    key not in wanted.outstanding  # it may be asked for twice
+                    and key not in self._scheduler.loads.failures
+                    and self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker)
+                ):
+                    self._wait_for(wanted, key)
         return bool(wanted.outstanding)
 
     def next_deadline_s(self) -> float:
-        """When the next client's patience ends; infinity when nobody waits."""
-        return self._patient.next_deadline_s()
+        """When there is something to do: when the next client's patience ends; infinity when nobody waits."""
+        return 0.0 if self._settled or self._over else self._patient.next_deadline_s()
 
     def answer_overdue(self, now_s: float) -> None:
-        """Answer those who waited long enough, with what there is."""
+        """Answer those who waited long enough, with what there is; see to what is left to tidy."""
         for wanted in self._patient.overdue(now_s):
             self._answer_in_turn(wanted)
+        self.tidy()
 
     def forget(self, session: Session) -> None:
         """The session ended: nobody waits for its requests any more."""
         for wanted in self._patient.of(session):
-            self._stop_waiting(wanted)
+            self._patient.remove(wanted)
+            self._let_go(wanted)
 
-    def renumber(self, new_index: Callable[[int], int | None], id_of: Callable[[int], str]) -> None:
-        """The catalogue is about to be replaced: follow the cells that requests wait for.
-
-        ``new_index`` maps an old index to the new one, None for a cell that left the map.
-        """
-        for wanted in self._patient:
-            cells = []
-            for index, layer in wanted.cells:
-                now = new_index(index)
-                if now is not None:
-                    cells.append((now, layer))
-                elif wanted.area is None:
-                    wanted.unknown.append((id_of(index), layer))
-            wanted.cells = cells
-
-    def answer_all(self, now_s: float) -> None:
+    def answer_all(self) -> None:
         """Answer everybody now (the daemon stops)."""
         for wanted in self._patient:
-            self._stop_waiting(wanted)
-            self._answers.answer(wanted, now_s)
+            wanted.deadline_s = 0.0
+            for _ in self._answer_now(wanted):
+                pass
 
 
 def _check_wait(wait_s: float | None) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from shmmap.daemon.cache.survey import Survey, Usage
@@ -38,8 +39,8 @@ class Dispatch:
     sampler: Sampler
     defects: Defects
 
-    def handle(self, turn: Turn) -> None:
-        """Answer one request, or say why not."""
+    def handle(self, turn: Turn) -> Iterator[None]:
+        """Answer one request, or say why not; a step at a time where that takes long."""
         data = turn.body
         request = 0
         try:
@@ -47,19 +48,22 @@ class Dispatch:
                 raise BadRequest("a request is one frame")
             message = decode_request(data)
             request = message.request
-            self._route(turn.connection, message)
+            work = self._route(turn.connection, message)
+            if work is not None:
+                yield from work
         except ShmmapError as error:
             turn.connection.refuse(request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
             self.defects.met()
             turn.connection.refuse(request, InternalError("the daemon failed on this request"))
 
-    def _route(self, connection: Connection, message: messages.Request) -> None:
+    def _route(self, connection: Connection, message: messages.Request) -> Iterator[None] | None:
+        """Do what is asked for; what takes longer is returned."""
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
             entered = self.handshake.enter(connection, message, now_s)
             connection.reply(encode(self.queries.welcome(entered, message)))
-            return
+            return None
         session = connection.session
         if session is None:
             raise NoSession("this daemon does not know the session", hint="send hello first")
@@ -69,12 +73,11 @@ class Dispatch:
             if message.intent is not None:
                 session.intent, session.says_where = bounded_intent(message.intent), True
             if isinstance(message, messages.Differential):
-                self.cells.differential(session, message, now_s)
-            elif isinstance(message, messages.Area):
-                self.cells.area(session, message, now_s)
-            else:
-                self.cells.selected(session, message, now_s)
-        elif isinstance(message, messages.Release):
+                return self.cells.differential(session, message)
+            if isinstance(message, messages.Area):
+                return self.cells.area(session, message)
+            return self.cells.selected(session, message)
+        if isinstance(message, messages.Release):
             versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
             self.cells.let_go(session.drop(versions))
             connection.reply(encode(messages.Released(message.request)))
@@ -88,6 +91,7 @@ class Dispatch:
             self.survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
         else:
             connection.reply(encode(self.queries.answer(message)))
+        return None
 
     def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
         self.sampler.measure()

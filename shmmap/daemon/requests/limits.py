@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Final
@@ -16,7 +16,7 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.pending_request import PendingRequest
+from shmmap.daemon.requests.pending_request import PendingRequest, parts
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layers
@@ -156,14 +156,20 @@ class SessionQuota:
         """Whether the session may surely have these, too."""
         return session.held_bytes + sum(resident.nbytes for resident in residents) <= self.nbytes
 
-    def check(self, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> None:
-        """Note in ``wanted.refused`` what is too much, farthest cells first; ``cold`` is not in memory."""
-        session, cache, warm = wanted.session, self.cache, self.cache.warm.layers
-        chilled = set(cold)
-        sizes = [
-            cache.estimate(index, layer) if (index, layer) in chilled else warm[layer][index].nbytes
-            for index, layer in wanted.cells
-        ]
+    def check(self, wanted: PendingRequest, sizes: Sequence[int]) -> Iterator[None]:
+        """Note in ``wanted.refused`` what is too much, farthest cells first.
+
+        Parameters
+        ----------
+        sizes
+            Bytes of each cell that is wanted.
+
+        Raises
+        ------
+        MapChanged, NoSession
+            See `PendingRequest.pause`.
+        """
+        session, cache = wanted.session, self.cache
         if session.held_bytes + sum(sizes) <= self.nbytes:
             return
         cache.survey.drop_unused(session, self.clock() - HAND_OUT_GRACE_S)
@@ -172,19 +178,23 @@ class SessionQuota:
         replaced = {r.key: r.nbytes for r in session.residents() if not cache.is_current(r)}
         boxes = cache.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
         counted: set[tuple[int, str]] = set()
-        for position in np.argsort(wanted.distances_m(boxes), kind="stable").tolist():
-            index, layer = wanted.cells[position]
-            if (index, layer) in counted:
-                continue
-            counted.add((index, layer))
-            key = Key(cache.catalogue.id(index), layer)
-            resident = None if (index, layer) in chilled else warm[layer][index]
-            if resident is not None and resident.sessions:
-                continue  # somebody keeps it anyway, perhaps this session itself
-            left -= sizes[position] - replaced.get(key, 0)
-            if left < 0:
-                quota = format_bytes(self.nbytes)
-                message = f"this client would keep more than its quota of {quota} for itself alone"
-                wanted.refused[key] = ("over_budget", message)
-                cache.statistics.add("refused_quota")
-                cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self.clock())
+        nearest = np.argsort(wanted.distances_m(boxes), kind="stable").tolist()
+        for number, part in enumerate(parts(nearest)):
+            if number:
+                yield from wanted.pause(cache)
+            for position in part:
+                index, layer = wanted.cells[position]
+                if (index, layer) in counted:
+                    continue
+                counted.add((index, layer))
+                key = Key(cache.catalogue.id(index), layer)
+                resident = cache.warm.get(index, layer)
+                if resident is not None and resident.sessions:
+                    continue  # somebody keeps it anyway, perhaps this session itself
+                left -= sizes[position] - replaced.get(key, 0)
+                if left < 0:
+                    quota = format_bytes(self.nbytes)
+                    message = f"this client would keep more than its quota of {quota} for itself alone"
+                    wanted.refused[key] = ("over_budget", message)
+                    cache.statistics.add("refused_quota")
+                    cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self.clock())

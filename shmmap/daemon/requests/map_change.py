@@ -41,8 +41,7 @@ class MapChange:
 
     def _apply(self, catalogue: Catalogue) -> None:
         """Serve another state of the map from now on."""
-        cache, old, statistics = self.cache, self.cache.catalogue, self.cache.statistics
-        self.cells.renumber(lambda index: catalogue.find(old.id(index)), old.id)
+        cache, statistics = self.cache, self.cache.statistics
         change = self.map_switch.switch(catalogue, time.monotonic())
         self.scheduler.drop(change.removed)
         cache.tell_all()

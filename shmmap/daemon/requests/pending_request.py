@@ -1,27 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests for cells that are not answered yet: what each asks for, and whose patience ends next."""
+"""Requests for cells that are not answered yet: what each asks for, and whose patience ends next.
+
+A request may be for very many cells.  Whoever goes through them does so in parts, and lets others have a
+turn between two parts (`PendingRequest.pause`).
+"""
 
 from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session
+from shmmap.errors import NoSession
 from shmmap.geometry import Area, distance_to_boxes
 
-__all__ = ["MOST_OF_A_SESSION", "PendingRequest", "WaitingList"]
+__all__ = ["CELLS_A_STEP", "MOST_OF_A_SESSION", "MapChanged", "PendingRequest", "WaitingList", "parts"]
 
+CELLS_A_STEP: Final = 64
+"""Cells that are gone through in one turn: less than a millisecond, whatever is done with them."""
 MOST_OF_A_SESSION: Final = 64
 """Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
+MOST_REQUESTS: Final = 16_384
+MOST_CELLS_OF_A_PROCESS: Final = 40_000
+MOST_CELLS: Final = 400_000
+"""Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
 
 OVERDUE_AT_ONCE: Final = 256
+
+Item = TypeVar("Item")
+
+
+def parts(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
+    """Give what is gone through in one turn each."""
+    return (items[begin : begin + CELLS_A_STEP] for begin in range(0, len(items), CELLS_A_STEP))
+
+
+class MapChanged(Exception):
+    """Catalogue indices mean other cells now."""
 
 
 @dataclass(eq=False, slots=True)
@@ -32,6 +56,8 @@ class PendingRequest:
     ----------
     cells
         Catalogue index and layer of each handle to send, in reply order.
+    catalogue
+        The state of the map whose indices they are.
     removed, removed_packed
         What the client should drop, as the reply says it.
     unknown
@@ -53,17 +79,51 @@ class PendingRequest:
     session: Session
     request: int
     cells: list[tuple[int, str]]
+    catalogue: CatalogueView
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
     unknown: list[tuple[str, str]] = field(default_factory=list)
     refused: dict[Key, tuple[str, str]] = field(default_factory=dict)
     held_old: set[str] = field(default_factory=set)
     area: Area | None = None
-    keys: tuple[Key, ...] = ()
+    keys: dict[Key, None] = field(default_factory=dict)
     outstanding: set[Key] = field(default_factory=set)
     began_s: float = 0.0
     deadline_s: float = 0.0
     due: bool = False
+
+    def pause(self, cache: CellCache) -> Iterator[None]:
+        """Let others have a turn.
+
+        Raises
+        ------
+        MapChanged
+            Meanwhile another state of the map is served: `follow` it.
+        NoSession
+            Meanwhile the session has ended.
+        """
+        yield
+        if self.session.connection.session is not self.session:
+            raise NoSession("the session ended before the answer was ready", hint="send hello again")
+        if cache.catalogue is not self.catalogue:
+            raise MapChanged
+
+    def follow(self, cache: CellCache) -> Iterator[None]:
+        """Find the cells in the map that is served now, a part a turn; those that left it are unknown."""
+        while (new := cache.catalogue) is not (old := self.catalogue):
+            cells, unknown = [], []
+            for number, part in enumerate(parts(self.cells)):
+                if number:
+                    yield
+                for index, layer in part:
+                    cell_id = old.id(index)
+                    now = new.find(cell_id)
+                    if now is not None:
+                        cells.append((now, layer))
+                    elif self.area is None:
+                        unknown.append((cell_id, layer))
+            self.cells, self.catalogue = cells, new
+            self.unknown += unknown
 
     def distances_m(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far boxes, (N, 4), are from the client, as far as it said where it is.
@@ -85,39 +145,59 @@ class WaitingList:
     """
 
     def __init__(self) -> None:
-        self._requests: dict[PendingRequest, None] = {}
+        self._of: dict[Session, dict[PendingRequest, int]] = {}  # with the number of cells it began with
         self._heap: list[tuple[float, int, PendingRequest]] = []
-        self._counts: Counter[Session] = Counter()
+        self._cells: Counter[int] = Counter()
+        self._count = self._all_cells = 0
         self._number = 0
 
     def __len__(self) -> int:
-        return len(self._requests)
+        return self._count
 
     def __iter__(self) -> Iterator[PendingRequest]:
-        return iter(list(self._requests))
+        return iter([request for requests in self._of.values() for request in requests])
 
-    def has_room(self, session: Session) -> bool:
-        """Whether one more request of the session may wait."""
-        return self._counts[session] < MOST_OF_A_SESSION
+    def has_room(self, request: PendingRequest) -> bool:
+        """Whether this one may wait, too."""
+        count, asker = len(request.cells), request.session.asker
+        return (
+            self._count < MOST_REQUESTS
+            and len(self._of.get(request.session, ())) < MOST_OF_A_SESSION
+            and self._cells[asker] + count <= MOST_CELLS_OF_A_PROCESS
+            and self._all_cells + count <= MOST_CELLS
+        )
 
     def add(self, request: PendingRequest) -> None:
         """A request waits until its ``deadline_s``, which does not change any more."""
+        count = len(request.cells)
+        self._of.setdefault(request.session, {})[request] = count
+        self._cells[request.session.asker] += count
+        self._all_cells += count
+        self._count += 1
+        self.again(request)
+
+    def again(self, request: PendingRequest) -> None:
+        """One that was due goes on waiting."""
         self._number += 1
-        self._requests[request] = None
-        self._counts[request.session] += 1
+        request.due = False
         heapq.heappush(self._heap, (request.deadline_s, self._number, request))
 
     def __contains__(self, request: PendingRequest) -> bool:
-        return request in self._requests
+        return request in self._of.get(request.session, ())
 
     def remove(self, request: PendingRequest) -> None:
         """A request waits no longer."""
-        del self._requests[request]
-        self._counts[request.session] -= 1
-        if not self._counts[request.session]:
-            del self._counts[request.session]
-        if len(self._heap) > 2 * len(self._requests) + 64:
-            self._heap = [entry for entry in self._heap if entry[2] in self._requests]
+        session, asker = request.session, request.session.asker
+        count = self._of[session].pop(request)
+        if not self._of[session]:
+            del self._of[session]
+        self._count -= 1
+        self._all_cells -= count
+        self._cells[asker] -= count
+        if not self._cells[asker]:
+            del self._cells[asker]
+        if len(self._heap) > 2 * self._count + 64:
+            self._heap = [entry for entry in self._heap if entry[2] in self]
             heapq.heapify(self._heap)
 
     def next_deadline_s(self) -> float:
@@ -134,10 +214,8 @@ class WaitingList:
         return found
 
     def _waits(self, request: PendingRequest) -> bool:
-        return request in self._requests and not request.due
+        return request in self and not request.due
 
     def of(self, session: Session) -> list[PendingRequest]:
         """Those of one session."""
-        if session not in self._counts:
-            return []
-        return [request for request in self._requests if request.session is session]
+        return list(self._of.get(session, ()))

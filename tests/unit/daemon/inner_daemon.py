@@ -36,7 +36,7 @@ from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
-from shmmap.protocol.messages import Area, BoxMessage, Cells
+from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Selected
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.identity import DaemonIdentity
@@ -51,6 +51,12 @@ EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 def names(reply: Cells) -> list[str]:
     """File names of the cells that a reply has, in its order."""
     return [Path(cell.id).name for cell in reply.cells]
+
+
+def finish(work: Iterator[None] | None) -> None:
+    """Do all steps of something."""
+    for _ in work or ():
+        pass
 
 
 class InnerDaemon:
@@ -104,7 +110,7 @@ class InnerDaemon:
         self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
         self.loads = self.scheduler.loads
         self.hold_answers = False
-        self.due: list[Callable[[], None]] = []
+        self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.cache,
@@ -120,12 +126,14 @@ class InnerDaemon:
             self.event_log,
         )  # fmt: skip
 
-    def _answer(self, _connection: Connection, answer: Callable[[], None]) -> None:
-        """An answer is due; kept while `hold_answers`."""
-        if self.hold_answers:
-            self.due.append(answer)
-        else:
-            answer()
+    def _answer(self, _connection: Connection, answer: Iterator[None]) -> None:
+        """An answer is due, in the next turn; kept while `hold_answers`."""
+        self.due.append(answer)
+
+    def ask(self, session: Session, message: Area | Differential | Selected) -> None:
+        """Begin to serve a request for cells, and do what of it needs no waiting."""
+        verb = getattr(self.cells, type(message).__name__.lower())
+        finish(verb(session, message))
 
     def _on_settled(self, key: Key) -> None:
         self.settled.append(key)
@@ -156,6 +164,8 @@ class InnerDaemon:
         self.scheduler.lost.end_overdue(now_s)
         self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
+        while not self.hold_answers and self.due:
+            finish(self.due.pop(0))
         self.cache.tell_all()
 
     def run_until(self, done: Callable[[], object]) -> None:
@@ -184,7 +194,7 @@ class InnerDaemon:
 
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
-        self.cells.area(self.session(), Area(request, EVERYWHERE, wait=30.0), self.now_s())
+        self.ask(self.session(), Area(request, EVERYWHERE, wait=30.0))
         return self.cells_of(request)
 
     def path_of(self, segment: str) -> str:
@@ -210,9 +220,7 @@ class InnerDaemon:
 
     def reload(self) -> Catalogue:
         """Read the map again and serve what it is now."""
-        old = self.cache.catalogue
         new = self.origin.load(fresh=True)
-        self.cells.renumber(lambda index: new.find(old.id(index)), old.id)
         self.scheduler.drop(self.map_switch.switch(new, self.now_s()).removed)
         self.cache.tell_all()
         return new

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
@@ -47,8 +48,9 @@ def test_a_defect_beside_a_request_does_not_starve_its_process() -> None:
     inbox = Inbox(statistics)
     handled: list[bytes] = []
 
-    def handle(turn: Turn) -> None:
+    def handle(turn: Turn) -> Iterator[None]:
         handled.append(turn.body)
+        yield from ()
 
     nothing: Any = SimpleNamespace(poll=lambda _timeout_s: [], callbacks={}, tell_all=broken, handle=handle)
     loop = ServingLoop(

@@ -40,7 +40,7 @@ def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: Divi
         before = one.statistics.values["loads_started"]
         for _ in range(3):
             request += 1
-            one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+            one.ask(session, Selected(request, ("0_0.pcd",), wait=30.0))
             assert [failure.code for failure in one.cells_of(request).failed] == ["load_failed"]
         return one.statistics.values["loads_started"] - before
 
@@ -51,7 +51,7 @@ def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: Divi
         one.offset_s += 0.02
         assert tries() == 1
     path.write_bytes(whole)
-    one.cells.selected(session, Selected(999, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.ask(session, Selected(999, ("0_0.pcd",), wait=30.0))
     assert len(one.cells_of(999).cells) == 1
 
 
@@ -65,12 +65,12 @@ def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
     one.stop_clock()
     for request, (passed_s, crashes) in enumerate([(0.0, 1), (0.99, 1), (0.02, 2), (1.98, 2), (0.03, 3)]):
         one.offset_s += passed_s
-        one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+        one.ask(session, Selected(request, ("0_0.pcd",), wait=30.0))
         assert [failure.code for failure in one.cells_of(request).failed] == ["load_failed"]
         assert one.statistics.values["worker_crashes"] == crashes
     path = small_map.pcd_dir / "0_0.pcd"
     path.write_bytes(path.read_bytes())
-    one.cells.selected(session, Selected(99, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.ask(session, Selected(99, ("0_0.pcd",), wait=30.0))
     one.cells_of(99)
     assert one.statistics.values["worker_crashes"] == 4, "another state of the file is tried at once"
 
@@ -132,7 +132,7 @@ def puppet(inner: Inner, small_map: DividedMap) -> Puppet:
 
 
 def ask(one: InnerDaemon, request: int) -> None:
-    one.cells.area(one.session(), Area(request, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    one.ask(one.session(), Area(request, CircleMessage(0, 0, 5), wait=30.0))
 
 
 @pytest.mark.parametrize(
@@ -176,15 +176,15 @@ def test_a_load_that_took_too_long_is_not_tried_again_at_once(puppet: Puppet) ->
     one = puppet.one
     one.stop_clock()
     session = one.session()
-    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
+    one.ask(session, Selected(1, ("0_0.pcd",), wait=300.0))
     puppet.queue(1)
     one.offset_s += 31.0
     for request in (1, 2):
-        one.cells.selected(session, Selected(request, ("0_0.pcd",), wait=300.0), one.now_s())
+        one.ask(session, Selected(request, ("0_0.pcd",), wait=300.0))
         assert [failure.code for failure in one.cells_of(request).failed] == ["load_timeout"]
         assert not one.loads.by_key
     one.offset_s += 1.01
-    one.cells.selected(session, Selected(3, ("0_0.pcd",), wait=300.0), one.now_s())
+    one.ask(session, Selected(3, ("0_0.pcd",), wait=300.0))
     assert len(one.cells_of(3).cells) == 1
     puppet.channel.close()
 
@@ -213,14 +213,14 @@ def test_a_loader_that_cannot_be_killed(puppet: Puppet) -> None:
     stuck = Unkillable()
     puppet.worker.process = stuck  # type: ignore[assignment]
     session = one.session()
-    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=300.0), one.now_s())
+    one.ask(session, Selected(1, ("0_0.pcd",), wait=300.0))
     puppet.queue(1)
     one.offset_s += 31.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
     assert stuck.killed
     assert not one.pool.has_room
     stuck.code = -signal.SIGKILL
-    one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=300.0), one.now_s())
+    one.ask(session, Selected(2, ("20_20.pcd",), wait=300.0))
     assert len(one.cells_of(2).cells) == 1
     sleeper.kill()
     sleeper.wait()
@@ -251,7 +251,7 @@ def test_a_signal_without_a_name(puppet: Puppet) -> None:
 def test_done_without_a_segment(puppet: Puppet) -> None:
     """As when this process has no descriptor left: the load fails, nothing stays reserved for it."""
     one = puppet.one
-    one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=30.0))
     (job,) = puppet.queue(1)
     puppet.say(puppet.done(job))
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_failed"]
@@ -285,7 +285,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
 
 def test_more_needed_than_there_will_ever_be(puppet: Puppet) -> None:
     one = puppet.one
-    one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=30.0))
     (job,) = puppet.queue(1)
     assert worker_messages.decode_to_worker(puppet.channel.recv(65536)) == job
     puppet.say(worker_messages.Need(job.number, one.ledger.budget_bytes))
@@ -299,7 +299,7 @@ def test_more_needed_than_there_will_ever_be(puppet: Puppet) -> None:
 def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     """What cannot be looked at is taken for pinned."""
     one = inner(small_map.root)
-    one.cells.area(one.session(), Area(1, EVERYWHERE, wait=30.0), one.now_s())
+    one.ask(one.session(), Area(1, EVERYWHERE, wait=30.0))
     assert len(one.cells_of(1).cells) == 16
     for resident in list(one.ledger.residents()):
         one.reclaimer.retire(resident, one.now_s())

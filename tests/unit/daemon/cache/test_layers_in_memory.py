@@ -16,7 +16,7 @@ NDT = "ndt(leaf=5.0,min_points=3)"
 
 def ask(one: InnerDaemon, session: Any, number: int, layer: str) -> m.Cells:
     ids = tuple(one.cache.catalogue.id(i) for i in range(len(one.cache.catalogue)))
-    one.cells.selected(session, Selected(number, ids, (layer,), 30.0), one.now_s())
+    one.ask(session, Selected(number, ids, (layer,), 30.0))
     return one.cells_of(number)
 
 

@@ -22,7 +22,7 @@ Inner = Callable[..., InnerDaemon]
 
 
 def load(one: InnerDaemon, request: int) -> Resident:
-    one.cells.selected(one.session(), Selected(request, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.ask(one.session(), Selected(request, ("0_0.pcd",), wait=30.0))
     assert len(one.cells_of(request).cells) == 1
     return one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
 

@@ -16,7 +16,7 @@ CELL = "0_0.pcd"
 
 
 def ask(one: InnerDaemon, request: int, wait_s: float | None = 30.0) -> None:
-    one.cells.selected(one.session(), Selected(request, (CELL,), wait=wait_s), one.now_s())
+    one.ask(one.session(), Selected(request, (CELL,), wait=wait_s))
 
 
 @pytest.fixture

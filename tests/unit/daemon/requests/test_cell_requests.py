@@ -18,7 +18,7 @@ from shmmap.protocol.messages import (
     Selected,
 )
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish
 
 
 @pytest.mark.parametrize("wait", [-1.0, -0.0001, math.nan, math.inf, -math.inf, 3600.5, 1e300])
@@ -30,11 +30,11 @@ def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, wait: float
     if warm:
         one.everything()
     with pytest.raises(BadRequest, match="wait"):
-        one.cells.area(session, Area(2, EVERYWHERE, wait=wait), one.now_s())
+        one.ask(session, Area(2, EVERYWHERE, wait=wait))
     with pytest.raises(BadRequest, match="wait"):
-        one.cells.differential(session, Differential(2, EVERYWHERE, wait=wait), one.now_s())
+        one.ask(session, Differential(2, EVERYWHERE, wait=wait))
     with pytest.raises(BadRequest, match="wait"):
-        one.cells.selected(session, Selected(2, (), wait=wait), one.now_s())
+        one.ask(session, Selected(2, (), wait=wait))
     assert not len(one.cells)
     assert not len(one.loads)
 
@@ -43,10 +43,10 @@ def test_waits_that_are_answered_at_once(inner: Inner, small_map: DividedMap) ->
     one = inner(small_map.root)
     session = one.session()
     for request, wait in ((1, None), (2, 0.0), (3, -0.0)):
-        one.cells.area(session, Area(request, EVERYWHERE, wait=wait), one.now_s())
+        one.ask(session, Area(request, EVERYWHERE, wait=wait))
         (reply,) = [reply for _, reply in one.replies if reply.request == request]
         assert len(reply.pending) == 16
-    one.cells.area(session, Area(4, EVERYWHERE, wait=3600.0), one.now_s())
+    one.ask(session, Area(4, EVERYWHERE, wait=3600.0))
     assert len(one.cells_of(4).cells) == 16
 
 
@@ -66,7 +66,7 @@ def test_areas_at_the_end_of_the_world(
     """Some touch everything and some nothing; memory can still be made and others served afterwards."""
     one = inner(small_map.root)
     session = one.session()
-    one.cells.area(session, Area(1, area, wait=30.0), one.now_s())
+    one.ask(session, Area(1, area, wait=30.0))
     reply = one.cells_of(1)
     assert len(reply.cells) == count
     assert (reply.pending, reply.failed) == ((), ())
@@ -81,19 +81,19 @@ def test_nearest_cells_first(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     session = one.session()
     with one.loaders_standing_still():
-        one.cells.area(session, Area(1, EVERYWHERE), one.now_s())
+        one.ask(session, Area(1, EVERYWHERE))
         nearest = one.loads.next_queued()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-20_-20.pcd"  # of the four that touch the middle
     two = inner(small_map.root)
-    two.cells.area(two.session(), Area(1, CircleMessage(35, 35, 300)), two.now_s())
+    two.ask(two.session(), Area(1, CircleMessage(35, 35, 300)))
     nearest = two.loads.next_queued()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "20_20.pcd"
     two = inner(small_map.root)
     session = two.session()
     session.intent, session.says_where = Intent(-35.0, 35.0), True
-    two.cells.area(session, Area(1, CircleMessage(35, 35, 300)), two.now_s())
+    two.ask(session, Area(1, CircleMessage(35, 35, 300)))
     nearest = two.loads.next_queued()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-40_20.pcd"
@@ -104,8 +104,8 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
     session = one.session()
     with one.loaders_standing_still():
         for request in range(1, 6):
-            one.cells.area(session, Area(request, EVERYWHERE, wait=0.01 * request), one.now_s())
-        one.cells.area(session, Area(9, EVERYWHERE, wait=30.0), one.now_s())
+            one.ask(session, Area(request, EVERYWHERE, wait=0.01 * request))
+        one.ask(session, Area(9, EVERYWHERE, wait=30.0))
         one.run_until(lambda: len(one.cells) == 1)
         one.cells.forget(session)
         assert len(one.cells) == 0
@@ -123,7 +123,7 @@ def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> 
     one.hold_answers = True
     for session in sessions:
         for number in range(4):
-            one.cells.selected(session, Selected(number, ("0_0.pcd",), wait=30.0), one.now_s())
+            one.ask(session, Selected(number, ("0_0.pcd",), wait=30.0))
     one.run_until(lambda: one.settled)
     assert (len(one.due), one.replies) == (12, [])
     one.cells.answer_overdue(one.now_s() + 60.0)
@@ -131,7 +131,7 @@ def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> 
     one.cells.forget(sessions[1])
     for count, answer in enumerate(one.due):
         before = len(one.replies)
-        answer()
+        finish(answer)
         assert len(one.replies) - before == (0 if 4 <= count < 8 else 1)
     assert len(one.cells) == 0
 
@@ -139,9 +139,10 @@ def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> 
 def test_whose_patience_ends_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     one.hold_answers = True
-    one.cells.selected(one.session(), Selected(1, ("0_0.pcd",), wait=5.0), one.now_s())
-    one.cells.answer_overdue(one.now_s() + 6.0)
+    one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=5.0))
+    one.offset_s = 6.0
+    one.cells.answer_overdue(one.now_s())
     assert (len(one.due), one.replies, one.cells.next_deadline_s()) == (1, [], float("inf"))
-    one.due[0]()
+    finish(one.due[0])
     ((_, reply),) = one.replies
     assert [cell.id for cell in reply.pending] == ["0_0.pcd"]

@@ -20,13 +20,13 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
     """It is put back or loaded once more while there is time: never forgotten."""
     one = inner(small_map.root)
     session = one.session()
-    one.cells.selected(session, Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0), one.now_s())
+    one.ask(session, Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0))
     one.cells_of(1)
     first = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
     second = one.cache.warm.layers["points"][one.cache.index_of("20_20.pcd") or 0]
     wanted = ("0_0.pcd", "20_20.pcd", "20_0.pcd")
     with one.loaders_standing_still(), open(one.path_of(second.name.rsplit(".", 1)[1]), "rb"):
-        one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
+        one.ask(session, Selected(2, wanted, wait=30.0))
         one.reclaimer.retire(first, one.now_s() - 1.0)
         one.reclaimer.retire(second, one.now_s() - 1.0)
         one.run_until(lambda: first.name not in one.ledger.retired)
@@ -69,16 +69,16 @@ def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
     one = inner(small_map.root)
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 4 * each + 8192
     reader, other = one.session("reader"), one.session("other")
-    one.cells.area(reader, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    one.ask(reader, Area(1, CircleMessage(0, 0, 5), wait=30.0))
     opened = [os.open(one.path_of(cell.segment), os.O_RDONLY) for cell in one.cells_of(1).cells]
     assert len(opened) == 4
-    one.cells.selected(other, Selected(2, ("20_20.pcd",), wait=3000.0), one.now_s())
+    one.ask(other, Selected(2, ("20_20.pcd",), wait=3000.0))
     request = 10
 
     def answered() -> bool:
         nonlocal request
         request += 1
-        one.cells.area(reader, Area(request, CircleMessage(0, 0, 5)), one.now_s())
+        one.ask(reader, Area(request, CircleMessage(0, 0, 5)))
         return any(reply.request == 2 for _, reply in one.replies)
 
     one.run_until(answered)
@@ -89,7 +89,7 @@ def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
         os.close(fd)
     one.cells.let_go(reader.drop(list(reader.held)))
     one.offset_s += 2.0
-    one.cells.selected(other, Selected(3, ("20_20.pcd",), wait=30.0), one.now_s())
+    one.ask(other, Selected(3, ("20_20.pcd",), wait=30.0))
     assert names(one.cells_of(3)) == ["20_20.pcd"]
 
 
@@ -100,7 +100,7 @@ def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: Di
     one = inner(small_map.root, workers=2)
     half = one.cache.estimate(one.cache.index_of("0_0.pcd") or 0, "points")
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 2 * half + 100_000
-    one.cells.selected(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0), one.now_s())
+    one.ask(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0))
     reply = one.cells_of(1)
     assert len(reply.cells) == 1
     assert [failure.code for failure in reply.failed] == ["over_budget"]
@@ -115,9 +115,9 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
     session = one.session()
     one.stop_clock()  # the cells handed out first stay in their grace
-    one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    one.ask(session, Area(1, CircleMessage(0, 0, 5), wait=30.0))
     assert len(one.cells_of(1).cells) == 4
-    one.cells.selected(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0), one.now_s())
+    one.ask(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0))
     one.run_until(lambda: one.scheduler.room.hungry)
     (worker,) = one.pool
     worker.process.kill()
@@ -137,9 +137,9 @@ def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map:
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
     session = one.session()
     one.stop_clock()
-    one.cells.area(session, Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+    one.ask(session, Area(1, CircleMessage(0, 0, 5), wait=30.0))
     assert len(one.cells_of(1).cells) == 4
-    one.cells.selected(session, Selected(2, ("20_20.pcd",), wait=30.0), one.now_s())
+    one.ask(session, Selected(2, ("20_20.pcd",), wait=30.0))
     one.run_until(lambda: one.scheduler.room.hungry)
     one.offset_s += 0.6
     assert [failure.code for failure in one.cells_of(2).failed] == ["load_timeout"]
@@ -151,7 +151,7 @@ def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap
     one = inner(small_map.root, quota_bytes=quota)
     session, ids = one.session(), ("0_0.pcd",) * 10 + ("20_20.pcd",) * 10
     for request in (1, 2):  # cold, then warm
-        one.cells.selected(session, Selected(request, ids, wait=30.0), one.now_s())
+        one.ask(session, Selected(request, ids, wait=30.0))
         reply = one.cells_of(request)
         assert (names(reply), reply.failed) == (list(ids), ())
     reply = one.everything(3)
@@ -165,12 +165,12 @@ def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
     """It is loaded once more, and the request is answered once."""
     one = inner(small_map.root)
     session = one.session()
-    one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+    one.ask(session, Selected(1, ("0_0.pcd",), wait=30.0))
     one.cells_of(1)
     first = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
     wanted = ("0_0.pcd", "0_0.pcd", "20_0.pcd")
     with one.loaders_standing_still():
-        one.cells.selected(session, Selected(2, wanted, wait=30.0), one.now_s())
+        one.ask(session, Selected(2, wanted, wait=30.0))
         one.reclaimer.retire(first, one.now_s() - 1.0)
         one.run_until(lambda: first.name not in one.ledger.retired)
     assert names(one.cells_of(2)) == list(wanted)

@@ -35,9 +35,9 @@ def test_indices_change_while_requests_wait(inner: Inner, small_map: DividedMap)
     """A cell that comes first in the order, and one that vanishes: others must not be mixed up."""
     one = inner(small_map.root)
     with one.loaders_standing_still():
-        one.cells.area(one.session(), Area(1, CircleMessage(0, 0, 5), wait=30.0), one.now_s())
+        one.ask(one.session(), Area(1, CircleMessage(0, 0, 5), wait=30.0))
         wanted = ["20_20.pcd", "0_0.pcd", "20_20.pcd", "0_-20.pcd"]
-        one.cells.selected(one.session(), Selected(2, tuple(wanted), wait=30.0), one.now_s())
+        one.ask(one.session(), Selected(2, tuple(wanted), wait=30.0))
         one.turn()
         rewrite(small_map, "-100_-100.pcd", 9, (-100, -100))
         small_map.remove_cell("0_-20.pcd")
@@ -60,7 +60,7 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     one = inner(small_map.root)
     session, before = one.session(), one.cache.catalogue.map_version
     with one.loaders_standing_still():
-        one.cells.selected(session, Selected(1, ("0_0.pcd",), wait=30.0), one.now_s())
+        one.ask(session, Selected(1, ("0_0.pcd",), wait=30.0))
         one.turn()
         rewrite(small_map, "0_0.pcd", 33)
     reply = one.cells_of(1)
@@ -128,17 +128,15 @@ def test_heights_of_a_replaced_file_are_unknown(inner: Inner, small_map: Divided
     one = inner(small_map.root)
     session, high = one.session(), CircleMessage(10, 10, 1, 50.0, 60.0)
     one.everything()
-    one.cells.area(session, Area(2, high, wait=30.0), one.now_s())
+    one.ask(session, Area(2, high, wait=30.0))
     assert one.cells_of(2).cells == ()
     columns = random_points(np.random.default_rng(1), (0, 0), 20)
     columns["z"] = columns["z"] + np.float32(52.0)
     small_map.write_cell("0_0.pcd", (0, 0), columns)
     one.reload()
-    one.cells.area(session, Area(3, high, wait=30.0), one.now_s())
+    one.ask(session, Area(3, high, wait=30.0))
     assert names(one.cells_of(3)) == ["0_0.pcd"]
-    one.cells.differential(
-        session, Differential(4, CircleMessage(10, 10, 1, 0.0, 8.0), wait=30.0), one.now_s()
-    )
+    one.ask(session, Differential(4, CircleMessage(10, 10, 1, 0.0, 8.0), wait=30.0))
     assert one.cells_of(4).cells == ()
 
 
@@ -152,7 +150,7 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
         small_map.corners["20_20.pcd"] = (500, 500)
         small_map.write_metadata()
         one.reload()
-        one.cells.selected(one.session(), Selected(2, ("0_0.pcd", "20_20.pcd"), wait=30.0), one.now_s())
+        one.ask(one.session(), Selected(2, ("0_0.pcd", "20_20.pcd"), wait=30.0))
         reply = one.cells_of(2)
         held.close()
     assert [(cell.min_x, cell.min_y) for cell in reply.cells] == [(400.0, 400.0), (500.0, 500.0)]
@@ -160,21 +158,14 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
         assert parse(map_segment(one.path_of(cell.segment))).fields["box"][:2] == (cell.min_x, cell.min_y)
 
 
-def nowhere(index: int) -> int | None:
-    """Say of every cell that it left the map."""
-    del index
-    return None
-
-
 def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     before = one.everything()
     empty = Catalogue.from_cells([])
-    one.cells.renumber(nowhere, one.cache.catalogue.id)
     one.scheduler.drop(one.map_switch.switch(empty, one.now_s()).removed)
     assert one.everything(2) == Cells(2, 77, empty.map_version)
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
-    one.cells.differential(one.session(), Differential(3, EVERYWHERE, packed=packed), one.now_s())
+    one.ask(one.session(), Differential(3, EVERYWHERE, packed=packed))
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
     welcome = one.queries.welcome(one.session(), Hello(4, 1, 0))
     assert (welcome.cells, welcome.bounds) == (0, None)

@@ -45,7 +45,7 @@ class Served:
 
 def ask(inner: InnerDaemon, request: int, area: BoxMessage) -> dict[str, int]:
     """Ask for an area, wait; return the versions of the cells that came."""
-    inner.cells.area(inner.session(), Area(request, area, wait=30.0), inner.now_s())
+    inner.ask(inner.session(), Area(request, area, wait=30.0))
     return {cell.id: cell.version for cell in inner.cells_of(request).cells if not cell.stale}
 
 

@@ -19,9 +19,9 @@ def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: 
     one = inner(small_map.root)
     monkeypatch.setattr(limits, "MOST_CELLS", 15)
     with pytest.raises(BadRequest, match="16 cells in one request; 15 is the most"):
-        one.cells.area(one.session(), Area(1, EVERYWHERE), one.now_s())
+        one.ask(one.session(), Area(1, EVERYWHERE))
     with pytest.raises(BadRequest, match="16 cells"):  # known or not
-        one.cells.selected(one.session(), Selected(2, ("nowhere",) * 16), one.now_s())
+        one.ask(one.session(), Selected(2, ("nowhere",) * 16))
     assert not one.loads.by_key
     assert not one.ledger.by_key
     assert one.replies == []
@@ -39,8 +39,8 @@ def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> Non
         ),
     ):
         with pytest.raises(BadRequest, match="held"):
-            one.cells.differential(one.session(), message, one.now_s())
-    one.cells.differential(one.session(), Differential(2, EVERYWHERE, packed=bytes(8 * many)), one.now_s())
+            one.ask(one.session(), message)
+    one.ask(one.session(), Differential(2, EVERYWHERE, packed=bytes(8 * many)))
     assert len(one.replies) == 1
 
 
@@ -52,16 +52,16 @@ def test_loads_that_one_process_waits_for(
     one = inner(small_map.root)
     with one.loaders_standing_still():
         greedy, other = one.session(), one.session()
-        one.cells.area(greedy, Area(1, EVERYWHERE), one.now_s())
+        one.ask(greedy, Area(1, EVERYWHERE))
         assert len(one.cells_of(1).pending) == 16
-        one.cells.area(greedy, Area(2, EVERYWHERE), one.now_s())
+        one.ask(greedy, Area(2, EVERYWHERE))
         assert len(one.cells_of(2).pending) == 16
         with pytest.raises(Busy, match="5 loads"):
-            one.cells.area(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
-        one.cells.area(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)), one.now_s())
+            one.ask(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)))
+        one.ask(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)))
         assert len(one.cells_of(4).pending) == 16
     one.run_until(lambda: not len(one.loads))
-    one.cells.area(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0), one.now_s())
+    one.ask(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0))
     assert len(one.cells_of(5).cells) == 16
 
 
@@ -69,15 +69,15 @@ def test_layers(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyP
     one = inner(small_map.root)
     session = one.session()
     with pytest.raises(BadRequest, match="17 layers in one request"):
-        one.cells.area(session, Area(1, EVERYWHERE, ("points",) * 17), one.now_s())
-    one.cells.selected(session, Selected(2, ("0_0.pcd",), wait=30.0), one.now_s())
+        one.ask(session, Area(1, EVERYWHERE, ("points",) * 17))
+    one.ask(session, Selected(2, ("0_0.pcd",), wait=30.0))
     assert len(one.cells_of(2).cells) == 1
     monkeypatch.setattr(limits, "LEAST_LAYERS_IN_MEMORY", 1)
     monkeypatch.setattr(limits, "LAYER_TABLES_BYTES", 0)
     other = Selected(3, ("0_0.pcd",), ("voxel(leaf=1.0)",))
     with pytest.raises(BadRequest, match="1 different layers are in memory already"):
-        one.cells.selected(session, other, one.now_s())
-    one.cells.selected(session, Selected(4, ("20_0.pcd",), wait=30.0), one.now_s())
+        one.ask(session, other)
+    one.ask(session, Selected(4, ("20_0.pcd",), wait=30.0))
     assert len(one.cells_of(4).cells) == 1
 
 

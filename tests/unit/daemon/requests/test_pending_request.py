@@ -7,17 +7,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.requests.pending_request import (
+    MOST_CELLS,
+    MOST_CELLS_OF_A_PROCESS,
     MOST_OF_A_SESSION,
     OVERDUE_AT_ONCE,
     PendingRequest,
     WaitingList,
 )
 from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.origin.catalogue import Catalogue
 from tests.support import connections
 
+NOWHERE = Catalogue.from_cells([])
 
-def waiting_request(session: Session, deadline_s: float) -> PendingRequest:
-    return PendingRequest(session, 0, [], deadline_s=deadline_s)
+
+def waiting_request(session: Session, deadline_s: float, cells: int = 0) -> PendingRequest:
+    return PendingRequest(session, 0, [(0, "points")] * cells, NOWHERE, deadline_s=deadline_s)
 
 
 def sessions(count: int) -> list[Session]:
@@ -30,12 +35,32 @@ def test_one_session_has_its_share() -> None:
     waiting: WaitingList = WaitingList()
     requests = [waiting_request(mine, float(n)) for n in range(MOST_OF_A_SESSION)]
     for request in requests:
-        assert waiting.has_room(mine)
+        assert waiting.has_room(request)
         waiting.add(request)
-    assert not waiting.has_room(mine)
-    assert waiting.has_room(other)
+    one_more = waiting_request(mine, 0.0)
+    assert not waiting.has_room(one_more)
+    assert waiting.has_room(waiting_request(other, 0.0))
     waiting.remove(requests[0])
-    assert waiting.has_room(mine)
+    assert waiting.has_room(one_more)
+
+
+def test_cells_that_wait_are_limited() -> None:
+    """However large the requests are, a process has its share of them, and all together a most."""
+    waiting: WaitingList = WaitingList()
+    whole, added = MOST_CELLS_OF_A_PROCESS // 2, []
+    for owner in sessions(MOST_CELLS // MOST_CELLS_OF_A_PROCESS):
+        for _ in range(2):
+            request = waiting_request(owner, 1.0, whole)
+            assert waiting.has_room(request)
+            waiting.add(request)
+            added.append(request)
+        assert not waiting.has_room(waiting_request(owner, 1.0, 1))
+    (stranger,) = sessions(1)
+    assert not waiting.has_room(waiting_request(stranger, 1.0, 1))
+    added[0].cells = []  # what it asks for has left the map meanwhile
+    waiting.remove(added[0])
+    assert waiting.has_room(waiting_request(stranger, 1.0, whole))
+    assert not waiting.has_room(waiting_request(stranger, 1.0, whole + 1))
 
 
 def test_many_that_are_overdue_are_taken_little_by_little() -> None:
@@ -62,7 +87,7 @@ def test_against_a_plain_list(steps: list[tuple[int, int, bool]]) -> None:
         if leave:
             gone = model.pop(deadline % len(model))
             waiting.remove(gone)
-        assert list(waiting) == model
+        assert sorted(map(id, waiting)) == sorted(map(id, model))
         assert len(waiting) == len(model)
         undue = [r for r in model if not r.due]
         assert waiting.next_deadline_s() == min((r.deadline_s for r in undue), default=float("inf"))

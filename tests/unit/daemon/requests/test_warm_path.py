@@ -40,7 +40,7 @@ def differential(
     inner: InnerDaemon, request: int, area: BoxMessage, versions: list[int], **more: object
 ) -> Cells:
     message = Differential(request, area, packed=pack_versions(versions), **more)  # type: ignore[arg-type]
-    inner.cells.differential(inner.session(), message, inner.now_s())
+    inner.ask(inner.session(), message)
     return inner.cells_of(request)
 
 
@@ -74,7 +74,7 @@ def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
     """Replies carry the bytes that each segment was given when it came into memory."""
     inner, everything = warm
     session = inner.session()
-    inner.cells.differential(session, Differential(2, EVERYWHERE), inner.now_s())
+    inner.ask(session, Differential(2, EVERYWHERE))
     (_, first), *_ = [reply for reply in inner.replies if reply[1].request == 2]
     residents = session.residents()
     assert len(residents) == len(first.cells) == len(everything.cells)
@@ -105,9 +105,9 @@ def test_what_another_request_got_is_not_forgotten(warm: tuple[InnerDaemon, Cell
     inner, everything = warm
     session = inner.session()
     half = Differential(2, HALF)
-    inner.cells.differential(session, half, inner.now_s())
-    inner.cells.differential(session, Differential(3, EVERYWHERE), inner.now_s())
-    inner.cells.differential(session, half, inner.now_s())
+    inner.ask(session, half)
+    inner.ask(session, Differential(3, EVERYWHERE))
+    inner.ask(session, half)
     held = {cell.version for cell in everything.cells}
     assert session.held.keys() == held
     assert session.held_bytes == sum(cell.bytes for cell in everything.cells)

@@ -144,3 +144,30 @@ def test_what_comes_for_a_process_while_it_is_served() -> None:
     turns.add("p", "c", "answer", 0, always=True)
     turns.served("p", 0.1)
     assert [serve(turns, 1.0), serve(turns, 1.0), len(turns)] == ["answer", None, 0]
+
+
+def test_what_has_begun_goes_on_before_anything_else_of_its_process() -> None:
+    turns: FairQueue[str] = FairQueue()
+    turns.add("p", "a", "long", 5)
+    turns.add("p", "b", "short", 5)
+    turns.add("q", "c", "other", 5)
+    order = []
+    for _ in range(6):
+        taken = turns.take()
+        assert taken is not None
+        order.append(taken[1])
+        again = taken[1] if taken[1] == "long" and order.count("long") < 4 else None
+        turns.served(taken[0], 1.0, again)
+    assert order == ["long", "other", "long", "long", "long", "short"]
+    assert (len(turns), turns.take()) == (0, None)
+
+
+def test_what_has_begun_is_remembered_however_many_come() -> None:
+    turns: FairQueue[str] = FairQueue()
+    turns.add("p", "a", "long", 5)
+    assert turns.take() == ("p", "long")
+    turns.served("p", 100.0, "long")
+    for number in range(MOST_REMEMBERED + 10):
+        turns.add(number, 0, "other", 1)
+        assert serve(turns, 0.0) == "other"
+    assert turns.take() == ("p", "long")

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A request for very many cells is served in parts, and others have their turns in between."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.requests.pending_request import CELLS_A_STEP
+from shmmap.errors import NoSession
+from shmmap.protocol.codec import pack_versions
+from shmmap.protocol.messages import Area, CircleMessage, Differential, Selected
+from tests.support.divided_map import DividedMap, make_map
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish, names
+
+SIDE = 14
+CELLS = SIDE * SIDE
+PARTS = -(-CELLS // CELLS_A_STEP)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> DividedMap:
+    return make_map(tmp_path_factory.mktemp("large") / "map", columns=SIDE, rows=SIDE, points=5)
+
+
+def steps(work: Iterator[None] | None) -> int:
+    return len(list(work or ()))
+
+
+def test_no_step_is_for_more_cells_than_one_may(inner: Inner, made: DividedMap) -> None:
+    """Cold: found, loads asked for, kept from making room.  Warm: found, answered, noted."""
+    one = inner(str(made.root))
+    session = one.session()
+    wanted: list[int] = []
+    want = one.scheduler.want
+    one.scheduler.want = lambda *arguments: wanted.append(arguments[0]) or want(*arguments)  # type: ignore[method-assign,func-returns-value]
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=30.0))
+    before, most = 0, 0
+    for _ in work:
+        most, before = max(most, len(wanted) - before), len(wanted)
+    assert most == CELLS_A_STEP
+    assert len(one.cells_of(1).cells) == CELLS
+    assert steps(one.cells.area(session, Area(2, EVERYWHERE, wait=30.0))) == 3 * (PARTS - 1)
+    ids = tuple(cell.id for cell in one.cells_of(2).cells)
+    assert steps(one.cells.selected(session, Selected(3, ids))) == 4 * (PARTS - 1)
+    assert len(one.cells_of(3).cells) == CELLS
+    held = pack_versions([cell.version for cell in one.cells_of(2).cells])
+    assert steps(one.cells.differential(session, Differential(4, EVERYWHERE, packed=held))) == 0
+    assert steps(one.cells.differential(session, Differential(5, EVERYWHERE))) == PARTS - 1
+    assert len(one.cells_of(5).cells) == CELLS
+
+
+def test_others_are_answered_between_its_parts(inner: Inner, made: DividedMap) -> None:
+    one = inner(str(made.root))
+    one.everything()
+    work = one.cells.area(one.session("large"), Area(2, EVERYWHERE))
+    next(work)
+    one.ask(one.session("small"), Area(3, CircleMessage(0, 0, 5)))
+    assert [reply.request for _, reply in one.replies] == [1, 3]
+    finish(work)
+    assert [reply.request for _, reply in one.replies] == [1, 3, 2]
+    assert len(one.cells_of(2).cells) == CELLS
+
+
+def test_nothing_stays_of_one_whose_client_leaves_meanwhile(inner: Inner, made: DividedMap) -> None:
+    """Wherever it is then: the loads that were asked for end, and nothing is kept for it."""
+    one = inner(str(made.root))
+    for count in range(1, 3 * PARTS - 3):
+        session = one.session()
+        work = one.cells.area(session, Area(count, EVERYWHERE, wait=30.0))
+        for _ in range(count):
+            next(work)
+        one.cells.forget(session)
+        one.sessions.close(session)
+        del work  # as the loop does once the connection has ended
+        one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
+        assert (one.ledger._needed, one.cells._waiting, len(one.cells)) == ({}, {}, 0)
+    assert one.replies == []
+
+
+def test_a_session_that_ends_meanwhile_is_told(inner: Inner, made: DividedMap) -> None:
+    one = inner(str(made.root))
+    session = one.session()
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=30.0))
+    next(work)
+    one.sessions.close(session)
+    with pytest.raises(NoSession):
+        finish(work)
+    one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
+    assert (one.ledger._needed, one.cells._waiting) == ({}, {})
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_map_changes_meanwhile(inner: Inner, tmp_path: Path, warm: bool) -> None:
+    """At any of its steps: it is answered for the map as it is then, once."""
+    made = make_map(tmp_path / "map", columns=SIDE, rows=SIDE, points=5)
+    one = inner(str(made.root))
+    if warm:
+        one.everything(999)
+    gone = sorted(made.corners)
+    for count in range(1, 3 * PARTS - 3):
+        work = one.cells.area(one.session(), Area(count, EVERYWHERE, wait=30.0))
+        for _ in range(count):
+            next(work, None)
+        cells, answered = sorted(made.corners), any(reply.request == count for _, reply in one.replies)
+        del made.corners[gone.pop(0)]  # every index after it is another one's now
+        made.write_metadata()
+        one.reload()
+        finish(work)
+        assert names(one.cells_of(count)) == (cells if answered else cells[1:])
+        assert len([reply for _, reply in one.replies if reply.request == count]) == 1
+    one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
+    assert (one.ledger._needed, one.cells._waiting) == ({}, {})
+
+
+def test_many_loads_end_while_it_is_gone_through(inner: Inner, made: DividedMap) -> None:
+    """All of what it would wait for is there before it waits: it is answered all the same."""
+    one = inner(str(made.root))
+    session = one.session()
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=3000.0))
+    for _ in range(2 * PARTS - 1):  # found, and loads asked for
+        next(work)
+    one.run_until(lambda: one.ledger.resident_count == CELLS)
+    finish(work)
+    assert len(one.cells_of(1).cells) == CELLS
