@@ -108,14 +108,24 @@ class Service:
         operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, cache.survey)
         change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log)
-        watched.watch(reloader.fd, change.collect)
+        watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
         dispatch = Dispatch(
             handshake, cells, queries, operators, authorization, cache.survey, sampler, defects
         )
         self._handshake = handshake
         self._loop = ServingLoop(
-            watched, self._inbox, dispatch, operators, cells, cache, scheduler, sampler, statistics, defects
+            watched,
+            self._inbox,
+            dispatch,
+            operators,
+            cells,
+            cache,
+            scheduler,
+            sampler,
+            statistics,
+            defects,
+            memory.event_log,
         )
 
     def run(self, started_s: float) -> None:
@@ -211,7 +221,7 @@ class Service:
     def _watch_map(self) -> None:
         if self._config.watch:
             watch = FileWatch(self._directories(self._memory.cache.catalogue.id_prefix))
-            self._memory.watched.watch(watch.fd, lambda: watch.drain(time.monotonic()))
+            self._memory.watched.watch(watch.fd, lambda: watch.drain(time.monotonic()), "map")
             self._file_watch = watch
 
     def _directories(self, id_prefix: str) -> set[str]:

@@ -100,9 +100,11 @@ class MapInMemory:
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
         self.cache.tell_all()
         if pins.fd >= 0:
-            self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(time.monotonic()))
+            self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(time.monotonic()), "memory")
         if self.cache.names.fd >= 0:
-            self.watched.watch(self.cache.names.fd, lambda: self.cache.hear_of_names(time.monotonic()))
+            self.watched.watch(
+                self.cache.names.fd, lambda: self.cache.hear_of_names(time.monotonic()), "memory"
+            )
 
     def close(self, *, keep: bool) -> None:
         """End the loaders, and take every name away or leave those of the segments to the next life."""

@@ -2,17 +2,19 @@
 """The serving loop: one thread, and nothing in it that waits for a disk.
 
 Requests come first; between them the loop hears its clients and loaders, and frees memory.  Files are read
-and layers built elsewhere (`shmmap.daemon.loading.worker_main`).
+and layers built elsewhere (`shmmap.daemon.loading.worker_main`).  A turn goes from one look at the
+descriptors to the next; whoever has just sent something waits for it: each is measured, none may be long.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.requests.cell_requests import CellRequests
@@ -21,12 +23,16 @@ from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.telemetry.sampler import BEAT_S, Sampler
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.protocol.events import LongTurn
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["ServingLoop"]
 
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
+LONG_TURN_NS: Final = 10_000_000
+"""Processor time of a turn that is worth an event."""
+TOLD_S: Final = 1.0
 
 
 @dataclass(eq=False, slots=True)
@@ -43,8 +49,13 @@ class ServingLoop:
     sampler: Sampler
     statistics: StatisticsWriter
     defects: Defects
+    event_log: EventLog
     stopping: bool = False
     _answer_at_end: bool = True
+    _turn_began_ns: int = field(default_factory=time.thread_time_ns)
+    _most_s: float = 0.0
+    _most_of_it: str = "beat"
+    _told_s: float = float("-inf")
 
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
@@ -53,8 +64,9 @@ class ServingLoop:
 
     def run(self) -> None:
         """Serve until `stop`; then answer those who still wait."""
+        self._turn_began_ns = time.thread_time_ns()
         while not self.stopping:
-            self._turn(self.watched.poll(self._patience_s()))
+            self._turn(self._poll(self._patience_s()))
 
     def answer_waiting(self) -> None:
         """Answer those who still wait, unless they are left to the next life."""
@@ -75,26 +87,43 @@ class ServingLoop:
         )
         return min(max(0.0, until_s - time.monotonic()), BEAT_S)
 
+    def _poll(self, timeout_s: float) -> list[int]:
+        """End a turn, wait, and begin the next one."""
+        now_ns = time.thread_time_ns()
+        took_ns = now_ns - self._turn_began_ns
+        self._turn_began_ns = now_ns
+        self.statistics.add_turn(self._most_of_it, took_ns)
+        if took_ns > LONG_TURN_NS and (now_s := time.monotonic()) >= self._told_s + TOLD_S:
+            self._told_s = now_s
+            self.event_log.publish(LongTurn, self._most_of_it, took_ns)
+        self._most_s, self._most_of_it = 0.0, "beat"
+        return self.watched.poll(timeout_s)
+
     def _turn(self, ready: list[int]) -> None:
         self._hear(ready)
-        self._guarded(self._serve)
+        self._serve()
         self._look_after_the_rest(time.monotonic())
-        self._guarded(self.scheduler.pump, time.monotonic())
-        self._guarded(self.cache.tell_all)
+        self._guarded("memory", self.scheduler.pump, time.monotonic())
+        self._guarded("memory", self.cache.tell_all)
 
-    def _guarded(self, call: Callable[..., object], *arguments: object) -> None:
+    def _guarded(self, kind: str, call: Callable[..., object], *arguments: object) -> None:
         """Call what must not end the daemon if it fails, unless that happens again and again."""
+        begin_s = time.monotonic()
         try:
             call(*arguments)
         except Exception:  # a defect: one client's trouble must not be everybody's
             if self.defects.met():
                 raise
+        took_s = time.monotonic() - begin_s
+        if took_s > self._most_s:
+            self._most_s, self._most_of_it = took_s, kind
 
     def _hear(self, ready: list[int]) -> None:
+        watched = self.watched
         for fd in ready:
-            callback = self.watched.callbacks.get(fd)
+            callback = watched.callbacks.get(fd)
             if callback is not None:  # another one's may have ended it
-                self._guarded(callback)
+                self._guarded(watched.kinds[fd], callback)
 
     def _serve(self) -> None:
         """Serve those whose turn it is, for a bounded time; between any two of them hear who has come."""
@@ -103,21 +132,23 @@ class ServingLoop:
         while start_s < end_s and (turn := self.inbox.take()) is not None:
             if turn.over:
                 turn.work = self.dispatch.handle(turn)
-            self._guarded(turn.go_on)
-            self._guarded(self.cache.tell_all)
+                self._guarded("requests", turn.go_on)
+            else:
+                self._guarded("answers", turn.go_on)
+            self._guarded("memory", self.cache.tell_all)
             now_s = time.monotonic()
             self.inbox.served(turn, now_s - start_s)
             if turn.asked and turn.over:
                 self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
             start_s = now_s
             if len(self.inbox):
-                self._hear(self.watched.poll(0))
+                self._hear(self._poll(0))
 
     def _look_after_the_rest(self, now_s: float) -> None:
         """What has its own time: deadlines, surveys, statistics."""
-        self._guarded(self.scheduler.lost.end_overdue, now_s)
-        self._guarded(self.cells.answer_overdue, now_s)
-        self._guarded(self.cache.survey.turn, now_s)
-        self._guarded(self.sampler.turn, now_s)
+        self._guarded("loaders", self.scheduler.lost.end_overdue, now_s)
+        self._guarded("answers", self.cells.answer_overdue, now_s)
+        self._guarded("survey", self.cache.survey.turn, now_s)
+        self._guarded("beat", self.sampler.turn, now_s)
         if now_s >= self.operators.stop_by_s:
             self.stop()

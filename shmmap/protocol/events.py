@@ -25,6 +25,7 @@ __all__ = [
     "Joined",
     "Left",
     "Loaded",
+    "LongTurn",
     "Pressure",
     "Recent",
     "Reloaded",
@@ -135,6 +136,16 @@ class Reloaded(_Numbered, tag="reload", frozen=True):
     error: str = ""
 
 
+class LongTurn(_Numbered, tag="long_turn", frozen=True):
+    """A turn of the daemon's loop took ``cpu_ns`` of processor time, more than it should.
+
+    ``kind`` is what took most of it, see `shmmap.statistics.counters.TURN_KINDS`; at most one a second.
+    """
+
+    kind: str
+    cpu_ns: int
+
+
 class Joined(_Numbered, tag="joined", frozen=True):
     """A client opened a session; pid 0 where the kernel does not tell."""
 
@@ -161,7 +172,18 @@ class Beat(_Numbered, tag="beat", frozen=True):
 
 
 Event: TypeAlias = (
-    Epoch | Loaded | Changed | Evicted | Failed | Retried | Pressure | Reloaded | Joined | Left | Beat
+    Epoch
+    | Loaded
+    | Changed
+    | Evicted
+    | Failed
+    | Retried
+    | Pressure
+    | Reloaded
+    | LongTurn
+    | Joined
+    | Left
+    | Beat
 )
 
 

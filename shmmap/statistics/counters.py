@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["COUNTERS", "COUNTER_NAMES", "HISTOGRAMS", "SPANS", "WINDOWED", "Counter"]
+__all__ = ["COUNTERS", "COUNTER_NAMES", "HISTOGRAMS", "SPANS", "TURN_KINDS", "WINDOWED", "Counter"]
 
 
 class Counter(NamedTuple):
@@ -33,6 +33,18 @@ WINDOWED: Final = {
     "refused_over_budget": "Cells refused because the budget is full",
 }
 """Counters of which the last 10 s, 1 min and 10 min are told: whether the cache is large enough."""
+
+TURN_KINDS: Final = {
+    "clients": "clients were heard",
+    "requests": "a request was served, or the first part of a large one",
+    "answers": "another part of a large request was served, or one that waited was answered",
+    "loaders": "a loader was heard, and what it loaded published",
+    "memory": "loads were handed out, room made and memory freed",
+    "survey": "the kernel was asked who uses segments",
+    "beat": "the statistics were written",
+    "map": "another state of the map was taken over",
+}
+"""What a turn of the serving loop is named after: what took most of it."""
 
 COUNTERS: Final = (
     Counter("requests", "counter", "", "Requests received, well-formed or not"),
@@ -87,6 +99,10 @@ COUNTERS: Final = (
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
     *(
+        Counter(f"longest_turn_{kind}_ns", "gauge", "ns", f"Longest turn in which {text}")
+        for kind, text in TURN_KINDS.items()
+    ),
+    *(
         Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")
         for name, text in WINDOWED.items()
         for span in SPANS
@@ -97,6 +113,7 @@ COUNTER_NAMES: Final = tuple(counter.name for counter in COUNTERS)
 
 HISTOGRAMS: Final = (
     Counter("request", "histogram", "ns", "Serving loop's time for one request, waiting for loads left out"),
+    Counter("turn", "histogram", "ns", "Processor time of a turn of the serving loop: others wait so long"),
     Counter("wait", "histogram", "ns", "From a request that had to wait for loads to its answer"),
     Counter("load", "histogram", "ns", "From handing a load to a worker to its published segment"),
 )

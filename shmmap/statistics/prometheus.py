@@ -63,7 +63,8 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
         value: float = found.counters[counter.name]
         name = counter.name
         if counter.unit == "ns":
-            name, value = name.removesuffix("_unix_ns") + "_timestamp_seconds", value * 1e-9
+            name = name.replace("_unix_ns", "_timestamp_ns").removesuffix("_ns") + "_seconds"
+            value *= 1e-9
         if counter.kind == "counter":
             name += "_total"
         yield from one(name, counter.kind, counter.help, value)

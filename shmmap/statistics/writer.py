@@ -16,6 +16,7 @@ import struct
 import time
 from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
+from typing import Final
 
 from shmmap.errors import ConfigError
 from shmmap.logfmt import log
@@ -23,7 +24,7 @@ from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
 from shmmap.segment.names import statistics_name
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
-from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS
+from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, TURN_KINDS
 from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
@@ -47,6 +48,8 @@ def _always(nbytes: int) -> bool:
 
 
 _FREE_ROW = pack_cell(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
+
+_LONGEST: Final = {kind: f"longest_turn_{kind}_ns" for kind in TURN_KINDS}
 
 
 class StatisticsWriter:
@@ -158,6 +161,13 @@ class StatisticsWriter:
         values = self._durations[name]
         values[0] += duration_ns
         values[1 + bucket_of(duration_ns)] += 1
+
+    def add_turn(self, kind: str, duration_ns: int) -> None:
+        """Count a turn of the serving loop, named after what took most of it (`TURN_KINDS`)."""
+        self.add_duration("turn", duration_ns)
+        name = _LONGEST[kind]
+        if duration_ns > self.values[name]:
+            self.values[name] = duration_ns
 
     def show_clients(self, rows: Sequence[ClientRow]) -> None:
         """Show these clients, from the next beat on; at most 256, and as many as there is room for."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
 from shmmap.doctor.cache_size import cache_verdict
+from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
     from shmmap.statistics.client_rows import ClientRow
@@ -21,6 +22,7 @@ __all__ = ["Line", "budget_parts", "screen"]
 Line: TypeAlias = list[tuple[str, str]]  # (text, style) pieces
 
 LABEL: Final = 12
+WORTH_TELLING_NS: Final = 1_000_000
 _WIDE: Final = 100  # columns from which there is room for everything about a client
 _SHORTEST_NAME: Final = 14
 SPAN_TITLES: Final = (("10s", "10 s"), ("1min", "1 min"), ("10min", "10 min"))
@@ -92,6 +94,7 @@ def screen(
     if verdict.hint:
         lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
     lines += _latencies(found, earlier)
+    lines += _flowing("loop", _longest_turns(counters), width)
     lines += _flowing("queue", _loads(counters), width)
     lines += _flowing("segments", _segments(counters), width)
     lines.append([])
@@ -202,6 +205,17 @@ def _quantiles(histogram: Histogram) -> str:
     if median is None or slow is None:
         return "none yet "
     return f"p50 {format_duration(median)}   p99 {format_duration(slow)}   {histogram.total:,} "
+
+
+def _longest_turns(counters: dict[str, int]) -> list[Line]:
+    """What others have waited for at most, longest first: some that took over a millisecond, else one."""
+    longest = {kind: counters.get(f"longest_turn_{kind}_ns", 0) for kind in TURN_KINDS}
+    shown = sorted(longest, key=lambda kind: -longest[kind])
+    told = [kind for kind in shown if longest[kind] >= WORTH_TELLING_NS][:3] or shown[:1]
+    return [
+        [("longest turns:", "")],
+        *([(f"{format_duration(longest[kind] * 1e-9)} ({kind})", "")] for kind in told),
+    ]
 
 
 def _loads(counters: dict[str, int]) -> list[Line]:

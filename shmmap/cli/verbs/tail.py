@@ -21,6 +21,7 @@ from shmmap.cli.screens.output import (
     print_line,
     rows_text,
 )
+from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Happening
@@ -29,8 +30,8 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   one object a line: {"event": "epoch" | "loaded" | "changed" | "evicted" | "failed" | "retried" |
-  "pressure" | "reload" | "joined" | "left", "seq", "epoch": hex, "time": Unix seconds, and what the
-  protocol's table of events says of that kind; versions and sessions as hex}, or
+  "pressure" | "reload" | "long_turn" | "joined" | "left", "seq", "epoch": hex, "time": Unix seconds,
+  and what the protocol's table of events says of that kind; versions and sessions as hex}, or
   {"event": "missed", "epoch": hex, "first", "last"} for events that the daemon does not keep any more.
 Live on a terminal or with --follow; else it ends after the events the daemon has kept.
 Exit code: 0, or 69 when no daemon answers."""
@@ -47,8 +48,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="events: loads, evictions, failures, clients",
         description="Print the events of the last minute, then new ones as they happen: cells loaded, "
-        "changed, evicted, failed, retried; cells refused for lack of memory; reloads; clients that "
-        "connect and leave; the daemon's start and end.",
+        "changed, evicted, failed, retried; cells refused for lack of memory; reloads; turns of the "
+        "daemon's loop that took long; clients that connect and leave; the daemon's start and end.",
         json=_JSON,
     )
     parser.add_argument(
@@ -172,6 +173,11 @@ def _reload(f: dict[str, Any]) -> str:
     return f"the map was read again; cells: {counts}"
 
 
+def _long_turn(f: dict[str, Any]) -> str:
+    what = TURN_KINDS.get(f["kind"], f["kind"])
+    return f"everybody waited for {format_duration(f['cpu_ns'] * 1e-9)} while {what}"
+
+
 def _epoch(f: dict[str, Any]) -> str:
     adopted = f", {f['adopted']:,} segments of the previous daemon kept" if f["adopted"] else ""
     return f"the daemon is {f['what']}: {f['cells']:,} cells in the map{adopted}"
@@ -193,6 +199,7 @@ _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "retried": lambda f: f"{f['id']} {f['layer']}  again after {f['code']}",
     "pressure": _pressure,
     "reload": _reload,
+    "long_turn": _long_turn,
     "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",
     "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, held {format_bytes(f['bytes'])}",
     "missed": lambda f: f"events {f['first']:,} to {f['last']:,}: the daemon does not keep them any more",

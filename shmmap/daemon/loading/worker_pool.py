@@ -132,7 +132,7 @@ class WorkerPool:
         ours.setblocking(False)
         worker = Worker(process, ours)
         self._workers[worker.fd] = worker
-        self.watched.watch(worker.fd, lambda: self.on_message(worker))
+        self.watched.watch(worker.fd, lambda: self.on_message(worker), "loaders")
         return worker
 
     def submit(self, job: worker_messages.Job | worker_messages.Check, now_s: float) -> bool:

@@ -20,16 +20,19 @@ class WatchedDescriptors:
     ----------
     callbacks : dict
         What to call, by descriptor.
+    kinds : dict
+        What that is, by descriptor, one of `shmmap.statistics.counters.TURN_KINDS`.
     """
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
         self.callbacks: dict[int, Callable[[], None]] = {}
+        self.kinds: dict[int, str] = {}
         self._again: list[int] = []
 
-    def watch(self, fd: int, callback: Callable[[], None]) -> None:
+    def watch(self, fd: int, callback: Callable[[], None], kind: str = "clients") -> None:
         """Call ``callback`` from the loop whenever ``fd`` is readable, or its other end is closed."""
-        self.callbacks[fd] = callback
+        self.callbacks[fd], self.kinds[fd] = callback, kind
         self._epoll.register(fd, select.EPOLLIN)
 
     def watch_for(self, fd: int, *, reading: bool, writing: bool) -> None:
@@ -43,6 +46,7 @@ class WatchedDescriptors:
     def unwatch(self, fd: int) -> None:
         """Stop watching; before the descriptor is closed."""
         if self.callbacks.pop(fd, None) is not None:
+            del self.kinds[fd]
             self._epoll.unregister(fd)
 
     def poll(self, timeout_s: float) -> list[int]:

@@ -3,21 +3,31 @@
 
 from __future__ import annotations
 
+import math
+import os
+import time
 from collections import Counter
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
 from shmmap.daemon.host.defects import Defects
-from shmmap.daemon.serving_loop import ServingLoop
+from shmmap.daemon.serving_loop import LONG_TURN_NS, ServingLoop
 from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.daemon.transport.inbox import Inbox, Turn
+from shmmap.protocol.events import LongTurn, Recent, decode_event
+from shmmap.statistics.histogram import Histogram
 from shmmap.statistics.writer import StatisticsWriter
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import Inner
 
 
 class Counts(Counter[str]):
     def add(self, name: str, value: int = 1) -> None:
         self[name] += value
+
+    def add_turn(self, kind: str, nanoseconds: int) -> None:
+        self[f"turn of {kind}"] += nanoseconds
 
     def add_duration(self, name: str, nanoseconds: int) -> None:
         assert nanoseconds >= 0
@@ -54,7 +64,17 @@ def test_a_defect_beside_a_request_does_not_starve_its_process() -> None:
 
     nothing: Any = SimpleNamespace(poll=lambda _timeout_s: [], callbacks={}, tell_all=broken, handle=handle)
     loop = ServingLoop(
-        nothing, inbox, nothing, nothing, nothing, nothing, nothing, nothing, statistics, Defects(statistics)
+        nothing,
+        inbox,
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        statistics,
+        Defects(statistics),
+        nothing,
     )
     connection = cast("Connection", Client())
     for body in (b"first", b"second", b"third"):
@@ -63,3 +83,44 @@ def test_a_defect_beside_a_request_does_not_starve_its_process() -> None:
         loop._serve()
     assert handled == [b"first", b"second", b"third"]
     assert counts["defects"] == 3
+
+
+def test_turns_are_measured(inner: Inner, small_map: DividedMap) -> None:
+    """Processor time from one look at the descriptors to the next, named after what took most of it."""
+    one = inner(small_map.root)
+    busy_s = 0.02
+
+    def compute() -> None:
+        os.read(read, 1)
+        end_s = time.thread_time() + busy_s
+        while time.thread_time() < end_s:
+            pass
+
+    read, write = os.pipe()
+    one.watched.watch(read, compute, "loaders")
+    nothing: Any = SimpleNamespace(
+        turn=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None, next_s=math.inf,
+        end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
+    )  # fmt: skip
+    nothing.lost = nothing.survey = nothing
+    loop = ServingLoop(
+        one.watched, Inbox(one.statistics), nothing, nothing, nothing, nothing, nothing, nothing,
+        one.statistics, Defects(one.statistics), one.event_log,
+    )  # fmt: skip
+    told = one.event_log.last
+    try:
+        for _ in range(2):
+            os.write(write, b"x")
+            loop._turn(loop._poll(0))
+        loop._poll(0)
+    finally:
+        one.watched.unwatch(read)
+        os.close(read)
+        os.close(write)
+    values = one.statistics.values
+    assert values["longest_turn_loaders_ns"] >= busy_s * 1e9
+    assert Histogram.of(one.statistics._durations["turn"]).total == 3
+    page = one.event_log.page(Recent(1, after=told))
+    event = decode_event(page.events[0])
+    assert isinstance(event, LongTurn)
+    assert (event.kind, event.cpu_ns >= LONG_TURN_NS) == ("loaders", True)

@@ -42,7 +42,7 @@ ARCHITECTURE = Path(DAEMON).with_name("ARCHITECTURE.md")
 HELLO = m.Hello(1, *m.PROTOCOL_VERSION, "walker")
 EVERYWHERE = m.BoxMessage(-1e4, -1e4, 1e4, 1e4)
 PATIENCE_S = 60.0
-LEFT_OUT = {"poll", "_patience_s", "_look_after_the_rest"}
+LEFT_OUT = {"_poll", "_patience_s", "_look_after_the_rest"}
 
 
 class Walker:
@@ -103,7 +103,7 @@ class WholeDaemon:
 
     def turn(self) -> None:
         loop = self.service._loop
-        loop._turn(loop.watched.poll(loop._patience_s()))
+        loop._turn(loop._poll(loop._patience_s()))
 
     def turn_until(self, done: Callable[[], object]) -> None:
         end_s = time.monotonic() + PATIENCE_S

@@ -60,6 +60,8 @@ def found(shm: ShmDirectory) -> Iterator[Snapshot]:
     writer.set("last_reload_unix_ns", 1_500_000_000_500_000_000)
     for duration_ns in (500, 3_000_000, 3_500_000, 10**13):
         writer.add_duration("load", duration_ns)
+    writer.add_turn("requests", 12_000_000)
+    writer.add_turn("requests", 11_000_000)
     writer.beat()
     yield read_statistics("unit", shm.path)
     writer.close()
@@ -72,6 +74,8 @@ def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:
     assert types["shmmap_budget_bytes"] == "gauge"
     assert samples["shmmap_last_reload_timestamp_seconds", ""] == 1_500_000_000.5
     told = {name.removeprefix("shmmap_").removesuffix("_total") for name in types}
+    assert samples["shmmap_longest_turn_requests_seconds", ""] == 0.012
+    told |= {f"{name.removesuffix('_seconds')}_ns" for name in told}
     expected = {c.name for c in COUNTERS if not c.name.endswith(("_10s", "_1min", "_10min"))}
     assert expected - {"last_reload_unix_ns"} <= told
     assert {f"{h.name}_seconds" for h in HISTOGRAMS} <= told
