@@ -111,7 +111,15 @@ class Service:
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
         dispatch = Dispatch(
-            handshake, cells, queries, operators, authorization, cache.survey, sampler, defects
+            handshake,
+            cells,
+            queries,
+            operators,
+            authorization,
+            cache.survey,
+            sampler,
+            defects,
+            self._inbox.due,
         )
         self._handshake = handshake
         self._loop = ServingLoop(

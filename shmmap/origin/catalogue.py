@@ -211,12 +211,13 @@ class Catalogue:
         cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]
         return xxh3_64_intdigest(np.ascontiguousarray(cells).data)
 
-    def query(self, area: Area) -> Indices:
+    def query(self, area: Area, most: int | None = None) -> Indices:
         """Cells whose box touches ``area``, ascending (which is id order).
 
-        Borders are closed.  The area's z range plays no part: heights are known only after loading.
+        Borders are closed.  The area's z range plays no part: heights are known only after loading.  If there
+        are more than ``most``, some of them, more than ``most``, in no order.
         """
-        return self._index.query(area)
+        return self._index.query(area, most)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,13 +18,16 @@ from numpy.typing import NDArray
 
 from shmmap.geometry import Area
 
-__all__ = ["SpatialIndex"]
+__all__ = ["SpatialIndex", "touches"]
 
 Indices = NDArray[np.intp]
 Floats = NDArray[np.float64]
 
 # Below this many cells the exact test on all of them is faster than any search.
 _LINEAR_CELLS = 5000
+
+# Candidates that are tested at a time where it is enough to know that very many touch an area.
+_AT_ONCE = 1 << 15
 
 # float32 keeps 24 bits: an area test on float32-rounded values (Autoware's) may move a border by half
 # a unit in the last place, 2**-24 of its magnitude; twice that on the box and on the query side.
@@ -102,18 +105,38 @@ class SpatialIndex:
         """Memory of the boxes and the search structure."""
         return int(self.boxes.nbytes) + sum(grid.nbytes for grid in self._grids)
 
-    def query(self, area: Area) -> Indices:
-        """Rows of ``boxes`` that touch ``area`` (closed borders, its z range ignored), ascending."""
+    def query(self, area: Area, most: int | None = None) -> Indices:
+        """Rows of ``boxes`` that touch ``area`` (closed borders, its z range ignored), ascending.
+
+        If there are more than ``most``, some of them, more than ``most``, in no order: to find all takes
+        time that grows with their number.
+        """
         if not self._grids:
-            return np.flatnonzero(_touched(area, self.boxes))
+            return np.flatnonzero(touches(area, self.boxes))
         min_x, min_y, max_x, max_y = area.bounds
         slack = _ROUNDING * max(abs(min_x), abs(min_y), abs(max_x), abs(max_y))
         bounds = (min_x - slack, min_y - slack, max_x + slack, max_y + slack)
         found = [grid.candidates(bounds) for grid in self._grids]
         candidates = found[0] if len(found) == 1 else np.concatenate(found)
-        hit = candidates[_touched(area, self.boxes.T.take(candidates, axis=1).T)]
+        if most is not None and len(candidates) > _AT_ONCE:
+            hit = self._touching(area, candidates, most)
+            if len(hit) > most:
+                return hit
+        else:
+            hit = candidates[touches(area, self.boxes.T.take(candidates, axis=1).T)]
         hit.sort()
         return hit
+
+    def _touching(self, area: Area, candidates: Indices, most: int) -> Indices:
+        """Those of many candidates that touch an area, until they are more than ``most``."""
+        found, count = [], 0
+        for begin in range(0, len(candidates), _AT_ONCE):
+            some = candidates[begin : begin + _AT_ONCE]
+            found.append(some[touches(area, self.boxes.T.take(some, axis=1).T)])
+            count += len(found[-1])
+            if count > most:
+                break
+        return np.concatenate(found)
 
 
 def _has_extent(boxes: Floats) -> bool:
@@ -122,7 +145,8 @@ def _has_extent(boxes: Floats) -> bool:
         return bool(np.isfinite(boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)).all())
 
 
-def _touched(area: Area, boxes: Floats) -> NDArray[np.bool_]:
+def touches(area: Area, boxes: Floats) -> NDArray[np.bool_]:
+    """Which of boxes, (N, 4), touch an area; (N,) bool."""
     # squares of distances beyond 1e154 m overflow to infinity, which compares as it should
     with np.errstate(over="ignore"):
         return area.overlaps(boxes)

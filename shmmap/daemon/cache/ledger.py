@@ -10,6 +10,7 @@ Times are seconds on any one clock, injected by the caller.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 from shmmap.daemon.records import Key, Resident, Retired
@@ -48,6 +49,7 @@ class Ledger:
         self.unchecked_count = 0
         self._by_name: dict[str, Resident] = {}
         self._needed: dict[Key, int] = {}
+        self._layers: Counter[str] = Counter()
 
     # --- sums ---------------------------------------------------------------------------------
 
@@ -85,6 +87,11 @@ class Ledger:
         """The segment of that name, if it can be handed out."""
         return self._by_name.get(name)
 
+    def of_cell(self, cell_id: str) -> list[Resident]:
+        """All layers of one cell that can be handed out."""
+        found = (self.by_key.get(Key(cell_id, layer)) for layer in self._layers)
+        return [resident for resident in found if resident is not None]
+
     def everything(self) -> list[Resident]:
         """All segments in memory, retired ones included, largest first."""
         found = [*self._by_name.values(), *(retired.resident for retired in self.retired.values())]
@@ -108,6 +115,7 @@ class Ledger:
         """A segment is in service now; returns the version it supersedes, to be retired by name."""
         old = self.by_key.get(resident.key)
         self.by_key[resident.key] = self._by_name[resident.name] = resident
+        self._layers[resident.key.layer] += 1
         self.resident_bytes += resident.nbytes
         self.unchecked_count += not resident.checked
         if old is not None:
@@ -123,6 +131,9 @@ class Ledger:
 
     def _leave_service(self, resident: Resident) -> None:
         del self._by_name[resident.name]
+        self._layers[resident.key.layer] -= 1
+        if not self._layers[resident.key.layer]:
+            del self._layers[resident.key.layer]
         self.unchecked_count -= not resident.checked
         self.resident_bytes -= resident.nbytes
         self.add_retired(resident)

@@ -44,8 +44,11 @@ class CatalogueView(Protocol):
     def boxes(self) -> NDArray[np.float64]:
         """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame."""
 
-    def query(self, area: Area) -> NDArray[np.intp]:
-        """Cells whose box touches ``area``, ascending (which is id order)."""
+    def query(self, area: Area, most: int | None = None) -> NDArray[np.intp]:
+        """Cells whose box touches ``area``, ascending (which is id order).
+
+        If there are more than ``most``, some of them, more than ``most``, in no order.
+        """
 
     def find(self, cell: str) -> int | None:
         """Index of a cell by its id or a unique base name; None where there is none."""

@@ -32,8 +32,8 @@ from shmmap.protocol import messages
 __all__ = ["CellRequests", "note_area"]
 
 MAX_WAIT_S: Final = 3600.0
-KEYS_A_STEP: Final = 256
-"""Cells of requests that are over, and requests that a load was for, that are seen to in one turn."""
+KEYS_A_STEP: Final = 64
+"""Cells of requests and sessions that are over, and requests that a load was for, that one turn sees to."""
 
 Result = TypeVar("Result")
 
@@ -72,6 +72,7 @@ class CellRequests:
         self._patient = WaitingList()
         self._settled: deque[tuple[Key, dict[PendingRequest, None]]] = deque()
         self._over: deque[PendingRequest] = deque()
+        self._left: deque[tuple[Session, list[Resident]]] = deque()
 
     def __len__(self) -> int:
         return len(self._patient)
@@ -85,7 +86,7 @@ class CellRequests:
         note_area(session, area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        found = cache.catalogue.query(area)
+        found = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         cells = [(index, layer) for index in cache.at_height(found.tolist(), area.z) for layer in layers]
         wanted = PendingRequest(session, message.request, cells, cache.catalogue, area=area)
@@ -117,7 +118,7 @@ class CellRequests:
         note_area(session, area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        found = cache.catalogue.query(area)
+        found = cache.catalogue.query(area, limits.MOST_CELLS)
         if len(layers) == 1 and area.z is None:
             warm = warm_difference(cache, message, found, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
@@ -244,6 +245,14 @@ class CellRequests:
                         self._waiting.pop(key, None)
                 else:
                     self._over.popleft()
+            elif self._left:
+                session, held = self._left[0]
+                if held:
+                    resident = held.pop()
+                    session.drop_segment(resident)
+                    self.let_go([resident])
+                else:
+                    self._left.popleft()
             else:
                 break
 
@@ -311,7 +320,7 @@ class CellRequests:
 
     def next_deadline_s(self) -> float:
         """When there is something to do: when the next client's patience ends; infinity when nobody waits."""
-        return 0.0 if self._settled or self._over else self._patient.next_deadline_s()
+        return 0.0 if self._settled or self._over or self._left else self._patient.next_deadline_s()
 
     def answer_overdue(self, now_s: float) -> None:
         """Answer those who waited long enough, with what there is; see to what is left to tidy."""
@@ -324,6 +333,12 @@ class CellRequests:
         for wanted in self._patient.of(session):
             self._patient.remove(wanted)
             self._let_go(wanted)
+
+    def left(self, session: Session) -> None:
+        """The session is no more: what it held may be free now."""
+        self.forget(session)
+        self._left.append((session, session.residents()))
+        self.tidy()
 
     def answer_all(self) -> None:
         """Answer everybody now (the daemon stops)."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from shmmap.daemon.cache.survey import Survey, Usage
@@ -15,6 +15,7 @@ from shmmap.daemon.requests.limits import bounded_intent
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
+from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import Turn
@@ -28,7 +29,13 @@ __all__ = ["Dispatch"]
 
 @dataclass(eq=False, slots=True)
 class Dispatch:
-    """Hands each request to what answers it; a defect met by one request does not end the others'."""
+    """Hands each request to what answers it; a defect met by one request does not end the others'.
+
+    Parameters
+    ----------
+    due
+        Given a connection and what answers it, to be done in its process's turns.
+    """
 
     handshake: Handshake
     cells: CellRequests
@@ -38,6 +45,7 @@ class Dispatch:
     survey: Survey
     sampler: Sampler
     defects: Defects
+    due: Callable[[Connection, Iterator[None]], None]
 
     def handle(self, turn: Turn) -> Iterator[None]:
         """Answer one request, or say why not; a step at a time where that takes long."""
@@ -78,21 +86,30 @@ class Dispatch:
                 return self.cells.area(session, message)
             return self.cells.selected(session, message)
         if isinstance(message, messages.Release):
-            versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
-            self.cells.let_go(session.drop(versions))
-            connection.reply(encode(messages.Released(message.request)))
-        elif isinstance(message, messages.Bye):
+            return self._release(session, message)
+        if isinstance(message, messages.Bye):
             self.handshake.leave(session)
         elif isinstance(message, OPERATOR_REQUESTS):
             self.authorization.require(connection.peer, now_s)
-            self.operators.handle(session, message, now_s)
-        elif isinstance(message, messages.Stats):
+            return self.operators.handle(session, message, now_s)
+        if isinstance(message, messages.Stats):
             self.handshake.look_after_departed()
-            self.survey.ask(session, lambda usage: self._tell_stats(session, message, usage))
+            self.survey.ask(
+                session, lambda usage: self.due(connection, self._tell_stats(session, message, usage))
+            )
         else:
             connection.reply(encode(self.queries.answer(message)))
         return None
 
-    def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> None:
+    def _release(self, session: Session, message: messages.Release) -> Iterator[None]:
+        versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
+        for number, some in enumerate(parts(versions)):
+            if number:
+                yield
+            self.cells.let_go(session.drop(some))
+        session.connection.reply(encode(messages.Released(message.request)))
+
+    def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:
         self.sampler.measure()
-        session.connection.reply(encode(self.queries.stats(message, usage, time.monotonic())))
+        reply = yield from self.queries.stats(message, usage, time.monotonic())
+        session.connection.reply(encode(reply))

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.events.log import EventLog
@@ -19,6 +21,9 @@ from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Handshake"]
+
+LOOKED_AT: Final = 64
+"""Departed sessions that are looked at at a time."""
 
 
 @dataclass(eq=False, slots=True)
@@ -37,7 +42,8 @@ class Handshake:
     event_log: EventLog
     operators: OperatorRequests
     survey: Survey
-    _seen: Usage | None = None
+    _seen: Usage = field(default_factory=Usage)
+    _settling: list[Session] = field(default_factory=list)
     _departed_before: list[Session] = field(default_factory=list)
 
     def enter(self, connection: Connection, message: Hello, now_s: float) -> Session:
@@ -88,14 +94,17 @@ class Handshake:
 
     def look_after_departed(self) -> None:
         """End those whose process is gone, and those that a survey begun since then found to map nothing."""
-        for session in list(self.sessions.departed.values()):
+        departed = self.sessions.departed
+        for slot in list(itertools.islice(departed, LOOKED_AT)):
+            session = departed[slot] = departed.pop(slot)  # the others come first next time
             if session.peer.pid and not os.path.exists(f"/proc/{session.peer.pid}"):
                 self.leave(session)
-        if self.survey.usage is not self._seen:
+        if not self._settling and self.survey.usage is not self._seen:
             self._seen = self.survey.usage
-            for session in self._departed_before:
-                self._settle(session, self._seen)
-            self._departed_before = list(self.sessions.departed.values())
+            self._settling, self._departed_before = self._departed_before, list(departed.values())
+        for session in self._settling[-LOOKED_AT:]:
+            self._settle(session, self._seen)
+        del self._settling[-LOOKED_AT:]
 
     def _settle(self, session: Session, usage: Usage) -> None:
         known = usage.by_slot or not session.peer.pid  # else it stays while its process is there
@@ -104,11 +113,10 @@ class Handshake:
 
     def leave(self, session: Session) -> None:
         """A client is gone, or said goodbye: what it held may be free now."""
-        held, pid = session.residents(), session.peer.pid
-        if held:
+        pid = session.peer.pid
+        if session.held:
             log.info("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
         self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
-        self.cells.forget(session)
         self.sessions.close(session)
-        self.cells.let_go(held)
+        self.cells.left(session)
         self.operators.left(session)

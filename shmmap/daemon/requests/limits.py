@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 MOST_CELLS: Final = 20_000
-"""Cells, in all layers together, of one request: about half a second of the loop when all are cold."""
+"""Cells, in all layers together, of one request."""
 MOST_QUEUED: Final = 20_000
 """A process of whose loads so many wait may add none; each takes 2 kB of the daemon's memory."""
 MOST_HELD: Final = 100_000
@@ -58,7 +58,7 @@ def check_count(count: int) -> None:
     """
     if count > MOST_CELLS:
         raise BadRequest(
-            f"{count} cells in one request; {MOST_CELLS} is the most",
+            f"more than {MOST_CELLS} cells in one request",
             hint="ask for a smaller area, or for some ids at a time",
         )
 

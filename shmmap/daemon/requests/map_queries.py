@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
+
+import numpy as np
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -18,9 +21,12 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
+from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, UnknownCell
+from shmmap.geometry import Area
 from shmmap.layers.registry import kinds
+from shmmap.origin.spatial_index import touches
 from shmmap.protocol import messages
 from shmmap.protocol.events import Recent
 
@@ -28,6 +34,8 @@ __all__ = ["MapQueries"]
 
 PAGE_ROWS: Final = 500
 """Longest metadata page: making one takes the serving loop about a millisecond."""
+LOOKED_AT: Final = 20_000
+"""Cells that are tested for one page of an area's metadata, retired segments that are looked through."""
 
 
 @dataclass(eq=False, slots=True)
@@ -80,25 +88,50 @@ class MapQueries:
 
     def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
         cache, catalogue = self.cache, self._catalogue
-        indices: Sequence[int] = range(len(catalogue))
-        if message.area is not None:
-            indices = catalogue.query(messages.area_from_message(message.area)).tolist()
         removed: tuple[str, ...] = ()
         known = True
-        if message.since is not None:
+        start, limit = max(0, message.start), max(1, min(message.limit, PAGE_ROWS))
+        area = messages.area_from_message(message.area) if message.area is not None else None
+        if message.since is None:
+            page, following = self._page(area, start, limit)
+        else:
             change = self.map_switch.changes_since(message.since)
             known = change is not None
-            if change is not None:
-                touched = {i for cell in change[0] if (i := cache.index_of(cell)) is not None}
-                indices = [i for i in indices if i in touched] if message.area else sorted(touched)
-                removed = tuple(map(cache.wire_id, change[1])) if message.start == 0 else ()
-        start = max(0, message.start)
-        end = start + max(1, min(message.limit, PAGE_ROWS))
-        rows = tuple(map(self._row, indices[start:end]))
-        following = end if end < len(indices) else None
+            if change is None:
+                page, following = self._page(area, start, limit)
+            else:
+                touched = sorted({i for cell in change[0] if (i := cache.index_of(cell)) is not None})
+                if area is not None:
+                    boxes = catalogue.boxes[np.array(touched, dtype=np.intp)]
+                    touched = list(itertools.compress(touched, touches(area, boxes).tolist()))
+                page = touched[start : start + limit]
+                following = start + limit if start + limit < len(touched) else None
+                removed = tuple(map(cache.wire_id, change[1])) if start == 0 else ()
+        rows = tuple(map(self._row, page))
         return messages.MetadataPage(
             message.request, self.cache.epoch, catalogue.map_version, rows, following, known, removed
         )
+
+    def _page(self, area: Area | None, start: int, limit: int) -> tuple[Sequence[int], int | None]:
+        """Cells from a catalogue index on, and where the next page begins.
+
+        In a large area only some cells are looked at: a page may have few rows or none, and not be the last.
+        """
+        catalogue = self._catalogue
+        count = len(catalogue)
+        if area is None:
+            end = min(start + limit, count)
+            return range(start, end), end if end < count else None
+        found = catalogue.query(area, LOOKED_AT)
+        if len(found) <= LOOKED_AT:
+            found = found[found.searchsorted(start) :]
+            more = len(found) > limit
+            return found[:limit].tolist(), int(found[limit]) if more else None
+        end = min(start + LOOKED_AT, count)
+        found = np.flatnonzero(touches(area, catalogue.boxes[start:end])) + start
+        if len(found) > limit:
+            return found[:limit].tolist(), int(found[limit])
+        return found.tolist(), end if end < count else None
 
     def _row(self, index: int) -> messages.MetadataRow:
         catalogue = self._catalogue
@@ -106,13 +139,18 @@ class MapQueries:
         wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.stamp(index).size
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
-    def stats(self, message: messages.Stats, usage: Usage, now_s: float) -> messages.StatsReply:
-        """Answer a request for statistics with what a survey found."""
-        nothing = Share()
-        rows = tuple(_session_row(one, usage.shares.get(one.slot, nothing), now_s) for one in self.sessions)
+    def stats(
+        self, message: messages.Stats, usage: Usage, now_s: float
+    ) -> Generator[None, None, messages.StatsReply]:
+        """Answer a request for statistics with what a survey found, some sessions a turn."""
+        rows: list[messages.SessionRow] = []
+        for number, sessions in enumerate(parts(tuple(self.sessions))):
+            if number:
+                yield
+            rows += [_session_row(one, usage.shares.get(one.slot, Share()), now_s) for one in sessions]
         return messages.StatsReply(
             message.request, self.cache.epoch, self._catalogue.map_version,
-            dict(self.cache.statistics.values), rows, usage.unknown, usage.unknown_bytes,
+            dict(self.cache.statistics.values), tuple(rows), usage.unknown, usage.unknown_bytes,
         )  # fmt: skip
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
@@ -120,7 +158,9 @@ class MapQueries:
         index = cache.index_of(message.id)
         # a cell that left the map while somebody maps it still shows, with version 0
         ids = {message.id, cache.id_prefix + message.id} if index is None else {catalogue.id(index)}
-        found = [resident for resident in cache.ledger.everything() if resident.key.cell_id in ids]
+        found = [resident for cell_id in sorted(ids) for resident in cache.ledger.of_cell(cell_id)]
+        retired = itertools.islice(cache.ledger.retired.values(), LOOKED_AT)
+        found += [one.resident for one in retired if one.resident.key.cell_id in ids]
         shown = tuple(map(self._segment, found))
         if index is None:
             if not found or not message.id:

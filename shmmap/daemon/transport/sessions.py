@@ -190,8 +190,7 @@ class Sessions:
         return session
 
     def close(self, session: Session) -> None:
-        """End a session and its bookkeeping."""
-        session.drop(list(session.held))
+        """End a session; what it held is for the caller to drop."""
         session.disconnect()
         self._by_slot.pop(session.slot, None)
         self.departed.pop(session.slot, None)

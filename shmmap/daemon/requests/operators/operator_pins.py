@@ -8,7 +8,7 @@ cannot be loaded is tried again.  Pins end with `unpin` or with the daemon.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
@@ -17,7 +17,9 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import Key
-from shmmap.errors import OverBudget
+from shmmap.daemon.requests.limits import check_count
+from shmmap.daemon.requests.pending_request import parts
+from shmmap.errors import BadRequest, OverBudget
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
 from shmmap.protocol.messages import PinnedCell
@@ -27,13 +29,32 @@ __all__ = ["OperatorPins", "cells_named"]
 
 LOOKS_AT_ONCE: Final = 64
 """Pins looked at per beat: about a fifth of a millisecond."""
+MOST_PINS: Final = 20_000
 
 
-def cells_named(cache: CellCache, ids: Iterable[str]) -> tuple[set[str], tuple[str, ...]]:
-    """Return the whole ids of cells that an operator names, and those names that are no cell's."""
-    indices = {cell: cache.index_of(cell) for cell in ids}
-    known = {cache.catalogue.id(index) for index in indices.values() if index is not None}
-    return known, tuple(cell for cell, index in indices.items() if index is None)
+def cells_named(
+    cache: CellCache, ids: Sequence[str]
+) -> Generator[None, None, tuple[list[str], tuple[str, ...]]]:
+    """Return the whole ids of cells that an operator names, and those names that are no cell's.
+
+    Raises
+    ------
+    BadRequest
+        They are too many.
+    """
+    check_count(len(ids))
+    known: dict[str, None] = {}
+    unknown: list[str] = []
+    for number, some in enumerate(parts(ids)):
+        if number:
+            yield
+        for cell in some:
+            index = cache.index_of(cell)
+            if index is None:
+                unknown.append(cell)
+            else:
+                known[cache.catalogue.id(index)] = None
+    return list(known), tuple(dict.fromkeys(unknown))
 
 
 @dataclass(eq=False, slots=True)
@@ -46,7 +67,8 @@ class OperatorPins:
 
     cache: CellCache
     scheduler: Scheduler
-    _keys: OrderedDict[Key, None] = field(default_factory=OrderedDict)
+    _keys: OrderedDict[Key, int] = field(default_factory=OrderedDict)  # with their bytes, as last known
+    _total: int = 0
 
     def __contains__(self, key: Key) -> bool:
         return key in self._keys
@@ -55,38 +77,55 @@ class OperatorPins:
         """Layers in which a cell is pinned."""
         return tuple(sorted(key.layer for key in self._keys if key.cell_id == cell_id))
 
-    def pin(self, message: messages.Pin, now_s: float) -> messages.Pinned:
+    def pin(self, message: messages.Pin, now_s: float) -> Generator[None, None, messages.Pinned]:
         """Pin cells; without ids, say what is pinned.
 
         Raises
         ------
         OverBudget
             All pins together would take more than the budget.
+        BadRequest
+            They are too many.
         """
-        cells, unknown = cells_named(self.cache, message.ids)
-        wanted = {Key(cell, layer) for cell in cells for layer in canonical_layers(message.layers)}
+        if not message.ids:
+            return (yield from self._answer(message.request, list(self._keys), ()))
+        cells, unknown = yield from cells_named(self.cache, message.ids)
+        wanted = [Key(cell, layer) for cell in cells for layer in canonical_layers(message.layers)]
+        check_count(len(wanted))
+        new = {}
+        for number, some in enumerate(parts(wanted)):
+            if number:
+                yield
+            new.update({key: self._size(key) for key in some if key not in self._keys})
         ledger = self.cache.ledger
-        total = sum(map(self._size, self._keys.keys() | wanted))
-        if wanted and total + ledger.overhead_bytes > ledger.budget_bytes:
+        total = self._total + sum(new.values())
+        if total + ledger.overhead_bytes > ledger.budget_bytes:
             raise OverBudget(
                 f"with these cells {format_bytes(total)} would be pinned; the budget is"
                 f" {format_bytes(ledger.budget_bytes)}",
                 hint="unpin others, or serve with a larger --budget",
             )
-        for key in wanted - self._keys.keys():
-            ledger.need(key)
-            self._keys[key] = None
-        for key in wanted:
-            self._keep(key, now_s)
-        return self._answer(message.request, wanted if message.ids else self._keys, unknown)
+        if len(self._keys) + len(new) > MOST_PINS:
+            raise BadRequest(f"more than {MOST_PINS} cells would be pinned", hint="unpin others")
+        for number, some in enumerate(parts(wanted)):
+            if number:
+                yield
+            for key in some:
+                if key not in self._keys:
+                    ledger.need(key)
+                    self._keys[key] = new[key]
+                    self._total += new[key]
+                self._keep(key, now_s)
+        return (yield from self._answer(message.request, wanted, unknown))
 
-    def unpin(self, message: messages.Unpin) -> messages.Pinned:
+    def unpin(self, message: messages.Unpin) -> Generator[None, None, messages.Pinned]:
         """Let cells go, all without ids; answers with what stays pinned."""
-        cells, unknown = cells_named(self.cache, message.ids or ())
-        for key in [key for key in self._keys if message.ids is None or key.cell_id in cells]:
-            del self._keys[key]
+        cells, unknown = yield from cells_named(self.cache, message.ids or ())
+        named = set(cells)
+        for key in [key for key in self._keys if message.ids is None or key.cell_id in named]:
+            self._total -= self._keys.pop(key)
             self.cache.ledger.need_no_more(key)
-        return self._answer(message.request, self._keys, unknown)
+        return (yield from self._answer(message.request, list(self._keys), unknown))
 
     def keep(self, now_s: float) -> None:
         """Look at some pins: what is not in memory at its current version is loaded."""
@@ -95,6 +134,9 @@ class OperatorPins:
             self._keep(key, now_s)
 
     def _keep(self, key: Key, now_s: float) -> None:
+        size = self._size(key)
+        self._total += size - self._keys[key]
+        self._keys[key] = size
         index = self.cache.index_of(key.cell_id)
         if index is not None and self.cache.find_warm(index, key.layer, now_s) is None:
             self.scheduler.want(index, key.layer, BACKGROUND, now_s)
@@ -106,8 +148,15 @@ class OperatorPins:
         index = self.cache.index_of(key.cell_id)
         return 0 if index is None else self.cache.estimate(index, key.layer)
 
-    def _answer(self, request: int, keys: Iterable[Key], unknown: tuple[str, ...]) -> messages.Pinned:
-        return messages.Pinned(request, tuple(map(self._row, sorted(keys))), unknown)
+    def _answer(
+        self, request: int, keys: Sequence[Key], unknown: tuple[str, ...]
+    ) -> Generator[None, None, messages.Pinned]:
+        rows: list[PinnedCell] = []
+        for number, some in enumerate(parts(keys)):
+            if number:
+                yield
+            rows += map(self._row, some)
+        return messages.Pinned(request, tuple(rows), unknown)
 
     def _row(self, key: Key) -> PinnedCell:
         resident, failure = self.cache.ledger.by_key.get(key), self.scheduler.loads.failures.get(key)

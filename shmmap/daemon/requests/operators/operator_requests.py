@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -20,6 +21,8 @@ from shmmap.protocol.codec import encode
 __all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
 
 OPERATOR_REQUESTS: Final = (messages.Reload, messages.Evict, messages.Pin, messages.Unpin, messages.Shutdown)
+EVICTED_AT_ONCE: Final = 16
+"""Segments retired in one turn: each is renamed, and the kernel asked who uses it."""
 FAREWELL_S: Final = 1.0
 """How long a stop waits for the one who asked for it: its libzmq drops a reply that was not read when the
 connection ends (ZMQ_IMMEDIATE)."""
@@ -42,16 +45,19 @@ class OperatorRequests:
     _asked_to_stop: Session | None = None
     _reloading: set[tuple[int, int]] = field(default_factory=set)
 
-    def handle(self, session: Session, message: messages.Request, now_s: float) -> None:
+    def handle(self, session: Session, message: messages.Request, now_s: float) -> Iterator[None]:
         """Carry out one request and answer it, a reload when it is over."""
         if isinstance(message, messages.Reload):
             self._reload(session, message)
         elif isinstance(message, messages.Evict):
-            session.connection.reply(encode(self._evict(message, now_s)))
+            evicted = yield from self._evict(message, now_s)
+            session.connection.reply(encode(evicted))
         elif isinstance(message, messages.Pin):
-            session.connection.reply(encode(self.pins.pin(message, now_s)))
+            pinned = yield from self.pins.pin(message, now_s)
+            session.connection.reply(encode(pinned))
         elif isinstance(message, messages.Unpin):
-            session.connection.reply(encode(self.pins.unpin(message)))
+            pinned = yield from self.pins.unpin(message)
+            session.connection.reply(encode(pinned))
         elif isinstance(message, messages.Shutdown):
             log.info("stopping", requested_by_pid=session.peer.pid, uid=session.peer.uid)
             session.connection.reply(encode(messages.Stopping(message.request)))
@@ -80,11 +86,25 @@ class OperatorRequests:
 
         self.reloader.ask(answer)
 
-    def _evict(self, message: messages.Evict, now_s: float) -> messages.Evicted:
-        cells, unknown = cells_named(self.cache, message.ids or ())
-        residents = self.cache.ledger.residents()
-        chosen = [r for r in residents if message.ids is None or r.key.cell_id in cells]
-        loose = [resident for resident in chosen if resident.key not in self.pins]
-        freed = sum(self.cache.reclaimer.retire(resident, now_s) for resident in loose)
-        kept = len(chosen) - len(loose)
-        return messages.Evicted(message.request, freed, len(loose) - freed, unknown, kept)
+    def _evict(self, message: messages.Evict, now_s: float) -> Generator[None, None, messages.Evicted]:
+        ledger, reclaimer = self.cache.ledger, self.cache.reclaimer
+        unknown: tuple[str, ...] = ()
+        if message.ids is None:
+            chosen = list(ledger.residents())
+        else:
+            cells, unknown = yield from cells_named(self.cache, message.ids)
+            chosen = []
+            for cell in cells:
+                chosen += ledger.of_cell(cell)
+                yield
+        freed = kept = 0
+        for number, resident in enumerate(chosen):
+            if number % EVICTED_AT_ONCE == EVICTED_AT_ONCE - 1:
+                yield
+            if ledger.resident_named(resident.name) is not resident:
+                continue  # somebody else had it evicted meanwhile
+            if resident.key in self.pins:
+                kept += 1
+            else:
+                freed += reclaimer.retire(resident, now_s)
+        return messages.Evicted(message.request, freed, len(chosen) - kept - freed, unknown, kept)

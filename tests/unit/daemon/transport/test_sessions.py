@@ -68,6 +68,7 @@ def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
                 c.slot for c, has in zip(clients, model, strict=True) if number in has
             }
     for client in clients:
+        client.drop(list(client.held))
         sessions.close(client)
     assert len(sessions) == 0
     assert all(not segment.sessions for segment in segments)

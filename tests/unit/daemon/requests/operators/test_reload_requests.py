@@ -14,7 +14,7 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.messages import Reload, Reloaded
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import InnerDaemon
+from tests.unit.daemon.inner_daemon import InnerDaemon, finish
 
 
 def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map: DividedMap) -> None:
@@ -25,7 +25,7 @@ def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map:
     read: list[Catalogue] = []
     failed: list[ShmmapError] = []
     for number in (7, 7, 7, 8):
-        operators.handle(session, Reload(number), 0.0)
+        finish(operators.handle(session, Reload(number), 0.0))
 
     def collect() -> None:
         assert select.select([reloader.fd], [], [], 30.0)[0]
@@ -33,7 +33,7 @@ def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map:
 
     collect()
     assert [(type(reply), reply.request) for _, reply in one.replies] == [(Reloaded, 7)]
-    operators.handle(session, Reload(7), 0.0)  # answered: this is another one
+    finish(operators.handle(session, Reload(7), 0.0))  # answered: this is another one
     collect()
     collect()
     assert [reply.request for _, reply in one.replies] == [7, 8, 7]
