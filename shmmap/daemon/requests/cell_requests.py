@@ -10,7 +10,6 @@ first.  What concerns many cells is done in parts, a turn of the loop each.
 from __future__ import annotations
 
 import contextlib
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Final, TypeVar
 
@@ -32,8 +31,6 @@ from shmmap.protocol import messages
 __all__ = ["CellRequests", "note_area"]
 
 MAX_WAIT_S: Final = 3600.0
-KEYS_A_STEP: Final = 64
-"""Cells of requests and sessions that are over, and requests that a load was for, that one turn sees to."""
 
 Result = TypeVar("Result")
 
@@ -68,11 +65,7 @@ class CellRequests:
         self._now_s = clock
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
         self._answers = CellReplies(cache, scheduler)
-        self._waiting: dict[Key, dict[PendingRequest, None]] = {}
-        self._patient = WaitingList()
-        self._settled: deque[tuple[Key, dict[PendingRequest, None]]] = deque()
-        self._over: deque[PendingRequest] = deque()
-        self._left: deque[tuple[Session, list[Resident]]] = deque()
+        self._patient = WaitingList(cache.ledger, self._answer_in_turn, self.let_go)
 
     def __len__(self) -> int:
         return len(self._patient)
@@ -150,7 +143,7 @@ class CellRequests:
                 yield from self._answer(wanted)
         finally:
             if not waits:
-                self._let_go(wanted)
+                self._patient.let_go(wanted)
 
     def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
         """Find what is warm and have the rest loaded; whether the request waits for that."""
@@ -182,7 +175,7 @@ class CellRequests:
             if number:
                 yield from wanted.pause(cache)
             for index, layer in part:
-                self._need(wanted, Key(cache.catalogue.id(index), layer))
+                self._patient.need(wanted, Key(cache.catalogue.id(index), layer))
         wanted.began_s, wanted.deadline_s = now_s, now_s + (wait_s or 0.0)
         self._patient.add(wanted)
         if not wanted.outstanding:  # they came while the rest was gone through
@@ -203,65 +196,15 @@ class CellRequests:
                     and self._scheduler.want(index, layer, distance, now_s, wanted.session.asker)
                     and note
                 ):
-                    self._wait_for(wanted, key)
-
-    def _wait_for(self, wanted: PendingRequest, key: Key) -> None:
-        wanted.outstanding.add(key)
-        self._waiting.setdefault(key, {})[wanted] = None
-
-    def _need(self, wanted: PendingRequest, key: Key) -> None:
-        """Keep what is asked for from making room until the answer is out."""
-        if key not in wanted.keys:
-            wanted.keys[key] = None
-            self._cache.ledger.need(key)
-
-    def _let_go(self, wanted: PendingRequest) -> None:
-        """A request is over: what it needed may go."""
-        if wanted.keys or wanted.outstanding:
-            self._over.append(wanted)
-            self.tidy()
-
-    def tidy(self) -> None:
-        """Tell those who wait of loads that ended, and forget what is over; a bounded part of it."""
-        for _ in range(KEYS_A_STEP):
-            if self._settled:
-                key, waiters = self._settled[0]
-                if not waiters:
-                    self._settled.popleft()
-                    continue
-                wanted, _ = waiters.popitem()
-                wanted.outstanding.discard(key)
-                if not wanted.outstanding and wanted in self._patient:
-                    self._answer_in_turn(wanted)
-            elif self._over:
-                wanted = self._over[0]
-                if wanted.keys:
-                    self._cache.ledger.need_no_more(wanted.keys.popitem()[0])
-                elif wanted.outstanding:
-                    key = wanted.outstanding.pop()
-                    left = self._waiting.get(key, {})
-                    left.pop(wanted, None)
-                    if not left:
-                        self._waiting.pop(key, None)
-                else:
-                    self._over.popleft()
-            elif self._left:
-                session, held = self._left[0]
-                if held:
-                    resident = held.pop()
-                    session.drop_segment(resident)
-                    self.let_go([resident])
-                else:
-                    self._left.popleft()
-            else:
-                break
+                    self._patient.wait_for(wanted, key)
 
     def settled(self, key: Key) -> None:
         """A load ended: answer the requests it was the last one for."""
-        waiters = self._waiting.pop(key, None)
-        if waiters:
-            self._settled.append((key, waiters))
-            self.tidy()
+        self._patient.settled(key)
+
+    def tidy(self) -> None:
+        """Do some of what requests and sessions that are over leave to do."""
+        self._patient.tidy()
 
     def _answer_in_turn(self, wanted: PendingRequest) -> None:
         """Answer a request that waits; what it asks for stays needed until then."""
@@ -283,7 +226,7 @@ class CellRequests:
         finally:
             if over and wanted in self._patient:
                 self._patient.remove(wanted)
-                self._let_go(wanted)
+                self._patient.let_go(wanted)
 
     def _answer(self, wanted: PendingRequest) -> Iterator[None]:
         return self._on_one_map(wanted, lambda: self._answers.answer(wanted, self._now_s()))
@@ -315,12 +258,12 @@ class CellRequests:
                     and key not in self._scheduler.loads.failures
                     and self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker)
                 ):
-                    self._wait_for(wanted, key)
+                    self._patient.wait_for(wanted, key)
         return bool(wanted.outstanding)
 
     def next_deadline_s(self) -> float:
         """When there is something to do: when the next client's patience ends; infinity when nobody waits."""
-        return 0.0 if self._settled or self._over or self._left else self._patient.next_deadline_s()
+        return self._patient.next_deadline_s()
 
     def answer_overdue(self, now_s: float) -> None:
         """Answer those who waited long enough, with what there is; see to what is left to tidy."""
@@ -332,13 +275,12 @@ class CellRequests:
         """The session ended: nobody waits for its requests any more."""
         for wanted in self._patient.of(session):
             self._patient.remove(wanted)
-            self._let_go(wanted)
+            self._patient.let_go(wanted)
 
     def left(self, session: Session) -> None:
         """The session is no more: what it held may be free now."""
         self.forget(session)
-        self._left.append((session, session.residents()))
-        self.tidy()
+        self._patient.left(session)
 
     def answer_all(self) -> None:
         """Answer everybody now (the daemon stops)."""

@@ -8,8 +8,8 @@ turn between two parts (`PendingRequest.pause`).
 from __future__ import annotations
 
 import heapq
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.records import Key
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import NoSession
 from shmmap.geometry import Area, distance_to_boxes
@@ -35,6 +36,8 @@ MOST_CELLS: Final = 400_000
 """Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
 
 OVERDUE_AT_ONCE: Final = 256
+KEYS_A_STEP: Final = 64
+"""Cells of requests and sessions that are over, and requests that a load was for, that one turn sees to."""
 
 Item = TypeVar("Item")
 
@@ -139,12 +142,34 @@ class PendingRequest:
 
 
 class WaitingList:
-    """Requests that wait for loads, in order of their deadlines.
+    """Requests that wait for loads, what they need, and in which order their patience ends.
 
-    Adding and removing one costs the same however many wait.
+    Adding and removing one costs the same however many wait.  What is over, and whom a load concerns, is seen
+    to in `tidy`, a bounded part at a time.
+
+    Parameters
+    ----------
+    ledger
+        Told what is needed.
+    due
+        Called with a request all of whose loads have ended.
+    dropped
+        Called with segments that a session does not have any more.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        due: Callable[[PendingRequest], None],
+        dropped: Callable[[list[Resident]], None],
+    ) -> None:
+        self._ledger = ledger
+        self._due = due
+        self._dropped = dropped
+        self._waiting: dict[Key, dict[PendingRequest, None]] = {}
+        self._settled: deque[tuple[Key, dict[PendingRequest, None]]] = deque()
+        self._over: deque[PendingRequest] = deque()
+        self._left: deque[tuple[Session, list[Resident]]] = deque()
         self._of: dict[Session, dict[PendingRequest, int]] = {}  # with the number of cells it began with
         self._heap: list[tuple[float, int, PendingRequest]] = []
         self._cells: Counter[int] = Counter()
@@ -201,7 +226,10 @@ class WaitingList:
             heapq.heapify(self._heap)
 
     def next_deadline_s(self) -> float:
-        """When the next one's patience ends; infinity when none waits."""
+        """When there is something to do: when the next one's patience ends; infinity when none waits."""
+        return 0.0 if self._settled or self._over or self._left else self._first_deadline_s()
+
+    def _first_deadline_s(self) -> float:
         while self._heap and not self._waits(self._heap[0][2]):
             heapq.heappop(self._heap)
         return self._heap[0][0] if self._heap else float("inf")
@@ -209,7 +237,7 @@ class WaitingList:
     def overdue(self, now_s: float) -> list[PendingRequest]:
         """Those whose patience has ended, a bounded number at a time."""
         found: list[PendingRequest] = []
-        while self.next_deadline_s() <= now_s and len(found) < OVERDUE_AT_ONCE:
+        while self._first_deadline_s() <= now_s and len(found) < OVERDUE_AT_ONCE:
             found.append(heapq.heappop(self._heap)[2])
         return found
 
@@ -219,3 +247,69 @@ class WaitingList:
     def of(self, session: Session) -> list[PendingRequest]:
         """Those of one session."""
         return list(self._of.get(session, ()))
+
+    # --- what they need -------------------------------------------------------------------------
+
+    def wait_for(self, wanted: PendingRequest, key: Key) -> None:
+        """A load of what a request asks for is under way."""
+        wanted.outstanding.add(key)
+        self._waiting.setdefault(key, {})[wanted] = None
+
+    def need(self, wanted: PendingRequest, key: Key) -> None:
+        """Keep what is asked for from making room until the answer is out."""
+        if key not in wanted.keys:
+            wanted.keys[key] = None
+            self._ledger.need(key)
+
+    def let_go(self, wanted: PendingRequest) -> None:
+        """A request is over: what it needed may go."""
+        if wanted.keys or wanted.outstanding:
+            self._over.append(wanted)
+            self.tidy()
+
+    def tidy(self) -> None:
+        """Tell those who wait of loads that ended, and forget what is over; a bounded part of it."""
+        for _ in range(KEYS_A_STEP):
+            if self._settled:
+                key, waiters = self._settled[0]
+                if not waiters:
+                    self._settled.popleft()
+                    continue
+                wanted, _ = waiters.popitem()
+                wanted.outstanding.discard(key)
+                if not wanted.outstanding and wanted in self:
+                    self._due(wanted)
+            elif self._over:
+                wanted = self._over[0]
+                if wanted.keys:
+                    self._ledger.need_no_more(wanted.keys.popitem()[0])
+                elif wanted.outstanding:
+                    key = wanted.outstanding.pop()
+                    left = self._waiting.get(key, {})
+                    left.pop(wanted, None)
+                    if not left:
+                        self._waiting.pop(key, None)
+                else:
+                    self._over.popleft()
+            elif self._left:
+                session, held = self._left[0]
+                if held:
+                    resident = held.pop()
+                    session.drop_segment(resident)
+                    self._dropped([resident])
+                else:
+                    self._left.popleft()
+            else:
+                break
+
+    def settled(self, key: Key) -> None:
+        """A load ended: answer the requests it was the last one for."""
+        waiters = self._waiting.pop(key, None)
+        if waiters:
+            self._settled.append((key, waiters))
+            self.tidy()
+
+    def left(self, session: Session) -> None:
+        """A session is no more: what it held may be free now."""
+        self._left.append((session, session.residents()))
+        self.tidy()

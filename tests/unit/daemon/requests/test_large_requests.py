@@ -76,7 +76,7 @@ def test_nothing_stays_of_one_whose_client_leaves_meanwhile(inner: Inner, made: 
         one.sessions.close(session)
         del work  # as the loop does once the connection has ended
         one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-        assert (one.ledger._needed, one.cells._waiting, len(one.cells)) == ({}, {}, 0)
+        assert (one.ledger._needed, one.cells._patient._waiting, len(one.cells)) == ({}, {}, 0)
     assert one.replies == []
 
 
@@ -89,7 +89,7 @@ def test_a_session_that_ends_meanwhile_is_told(inner: Inner, made: DividedMap) -
     with pytest.raises(NoSession):
         finish(work)
     one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-    assert (one.ledger._needed, one.cells._waiting) == ({}, {})
+    assert (one.ledger._needed, one.cells._patient._waiting) == ({}, {})
 
 
 @pytest.mark.parametrize("warm", [False, True])
@@ -112,7 +112,7 @@ def test_the_map_changes_meanwhile(inner: Inner, tmp_path: Path, warm: bool) -> 
         assert names(one.cells_of(count)) == (cells if answered else cells[1:])
         assert len([reply for _, reply in one.replies if reply.request == count]) == 1
     one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-    assert (one.ledger._needed, one.cells._waiting) == ({}, {})
+    assert (one.ledger._needed, one.cells._patient._waiting) == ({}, {})
 
 
 def test_many_loads_end_while_it_is_gone_through(inner: Inner, made: DividedMap) -> None:

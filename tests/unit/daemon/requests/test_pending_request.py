@@ -6,6 +6,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.requests.pending_request import (
     MOST_CELLS,
     MOST_CELLS_OF_A_PROCESS,
@@ -25,6 +26,10 @@ def waiting_request(session: Session, deadline_s: float, cells: int = 0) -> Pend
     return PendingRequest(session, 0, [(0, "points")] * cells, NOWHERE, deadline_s=deadline_s)
 
 
+def waiting_list() -> WaitingList:
+    return WaitingList(Ledger(0), lambda _request: None, lambda _residents: None)
+
+
 def sessions(count: int) -> list[Session]:
     opened = Sessions()
     return [opened.open(connections.of(), "", 0.0) for n in range(count)]
@@ -32,7 +37,7 @@ def sessions(count: int) -> list[Session]:
 
 def test_one_session_has_its_share() -> None:
     mine, other = sessions(2)
-    waiting: WaitingList = WaitingList()
+    waiting = waiting_list()
     requests = [waiting_request(mine, float(n)) for n in range(MOST_OF_A_SESSION)]
     for request in requests:
         assert waiting.has_room(request)
@@ -46,7 +51,7 @@ def test_one_session_has_its_share() -> None:
 
 def test_cells_that_wait_are_limited() -> None:
     """However large the requests are, a process has its share of them, and all together a most."""
-    waiting: WaitingList = WaitingList()
+    waiting = waiting_list()
     whole, added = MOST_CELLS_OF_A_PROCESS // 2, []
     for owner in sessions(MOST_CELLS // MOST_CELLS_OF_A_PROCESS):
         for _ in range(2):
@@ -64,7 +69,7 @@ def test_cells_that_wait_are_limited() -> None:
 
 
 def test_many_that_are_overdue_are_taken_little_by_little() -> None:
-    waiting: WaitingList = WaitingList()
+    waiting = waiting_list()
     for owner in sessions(2 * OVERDUE_AT_ONCE // MOST_OF_A_SESSION):
         for number in range(MOST_OF_A_SESSION):
             waiting.add(waiting_request(owner, float(number)))
@@ -78,7 +83,7 @@ def test_many_that_are_overdue_are_taken_little_by_little() -> None:
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 50), st.booleans())))
 def test_against_a_plain_list(steps: list[tuple[int, int, bool]]) -> None:
     owners = sessions(3)
-    waiting: WaitingList = WaitingList()
+    waiting = waiting_list()
     model: list[PendingRequest] = []
     for owner, deadline, leave in steps:
         request = waiting_request(owners[owner], float(deadline))
