@@ -1,210 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A client's 99th percentile beside hostile clients, and beside unrelated processes as busy as they.
+"""What a client notices of hostile clients, of very many cells, and of everything else that once held it up.
 
     python -m tests.benchmarks.hostile_p99 [--rounds 6] [--seconds 3]
+    python -m tests.benchmarks.hostile_p99 --list
+    python -m tests.benchmarks.hostile_p99 --scene A2 --scene A6
+    python -m tests.benchmarks.hostile_p99 --all
+    python -m tests.benchmarks.hostile_p99 --worst-five --minutes 10
+    python -m tests.benchmarks.hostile_p99 --churn --minutes 10
 
-The client sends a warm differential request every 5 ms.  Beside it, in turns: nobody; three
-processes that only compute; three clients that do all they can to the daemon: one floods it with
-requests and reads no reply, one sends garbage of all sizes up to frames that are too large, one
-connects and disconnects, asks for the whole map and for statistics without end.  All of them run all
-the time and are stopped (SIGSTOP) while it is not their turn.  The limit is at most 3.
+Without options: the 99th percentile beside three hostile clients, over that beside three processes that only
+compute.  The limit is at most 3.
+
+A scene does to the daemon what somebody did to an earlier one.  Beside it another client asks for warm cells
+every 5 ms, a third asks a bare ZeroMQ echo as often, and new clients come all the time.  Limits: the client's
+longest answer took at most 50 ms more than the echo's, the daemon's own memory grew by at most 100 MiB, and
+everybody got in.  Exit code 1 if a limit does not hold.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import signal
-import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.divided_map import make_map
-from tests.support.message_pack import pack
-from tests.support.raw_client import RawClient, pack_versions
-
-PERIOD_S = 0.005
-SETTLE_S = 0.3
-MEDDLERS = 3
-
-_BUSY = """
-import sys
-block = bytearray(1 << 20)
-print("up", flush=True)
-while True:
-    for _ in range(100):
-        total = sum(range(1000))
-    block[:] = bytes(block)
-"""
-
-_PRELUDE = """
-import os, random, sys, zmq
-from tests.support.message_pack import pack
-from tests.support.raw_client import RawClient, circle
-path = sys.argv[1]
-rng = random.Random(1)
-client = RawClient(path)
-client.socket.sndtimeo = 100
-print("up", flush=True)
-
-def send(one, data):
-    try:
-        one.send(data)
-    except zmq.Again:
-        pass
-"""
-
-_HOSTILE = (
-    """
-message = pack(["area", 1, circle(0, 0, 100), ["points"], 10.0])
-while True:
-    send(client.socket, message)
-""",
-    """
-def fresh():
-    one = zmq.Context.instance().socket(zmq.DEALER)
-    one.linger = 0
-    one.sndtimeo = 100
-    one.connect("ipc://" + path)
-    return one
-one = fresh()
-while True:
-    for size in (0, 3, 40, 3000, 70_000, 1 << 20, 3 << 20):
-        for _ in range(20):
-            send(one, rng.randbytes(size))
-    send(one, bytes(8 << 20))
-    one.close()
-    one = fresh()
-""",
-    """
-while True:
-    for _ in range(20):
-        send(client.socket, pack(["stats", 1]))
-        send(client.socket, pack(["area", 1, circle(0, 0, 1e6), ["points"], None]))
-        send(client.socket, pack(["metadata", 1]))
-    while client.readable():
-        client.receive_bytes()
-    with RawClient(path, hello=False) as visitor:
-        visitor.send("hello", 1, 0, "visitor")
-""",
-)
+__all__ = ["main"]
 
 
-def start(program: str, *arguments: str) -> subprocess.Popen[bytes]:
-    """Start one meddler and stop it again, until its turn comes."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
-    process.stdout.readline()
-    process.send_signal(signal.SIGSTOP)
-    return process
-
-
-def processor_s(pids: list[int]) -> float:
-    """Seconds of processor time that processes have used."""
-    ticks = 0
-    for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
-@contextlib.contextmanager
-def running(processes: list[subprocess.Popen[bytes]]) -> Iterator[None]:
-    """Let some meddlers run."""
-    for process in processes:
-        process.send_signal(signal.SIGCONT)
-    time.sleep(SETTLE_S)
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.send_signal(signal.SIGSTOP)
-
-
-def paced(client: RawClient, request: bytes, seconds: float) -> list[float]:
-    """Milliseconds of round trips, one every period."""
-    times = []
-    next_s = time.perf_counter()
-    end_s = next_s + seconds
-    while next_s < end_s:
-        time.sleep(max(0.0, next_s - time.perf_counter()))
-        begin = time.perf_counter()
-        client.send_bytes(request)
-        client.receive_bytes()
-        times.append((time.perf_counter() - begin) * 1e3)
-        next_s += PERIOD_S
-    return times
-
-
-def main() -> None:
-    """Measure and print."""
+def main() -> int:
+    """Play what was asked for, and print what came of it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=3.0)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as directory:
-        made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
-        one = DaemonProcess(made.root, "--budget", "1G").start()
-        client = RawClient(one.endpoint)
-        everything = client.area(["box", -300.0, -300.0, 300.0, 300.0]).cells
-        held = pack_versions([handle.version for handle in everything[:60]])
-        request = pack(["differential", 1, ["box", -99.0, -99.0, 99.0, 99.0], ["points"], [], held, 10.0])
-        groups = {
-            "nobody": [],
-            "busy processes": [start(_BUSY) for _ in range(MEDDLERS)],
-            "hostile clients": [start(_PRELUDE + program, one.endpoint) for program in _HOSTILE],
-        }
-        times: dict[str, list[list[float]]] = {name: [] for name in groups}
-        used: dict[str, float] = dict.fromkeys(groups, 0.0)
-        began = dict.fromkeys(groups, 0.0)
-        try:
-            for _ in range(arguments.rounds):
-                for name, processes in groups.items():
-                    pids = [process.pid for process in processes]
-                    before_s = processor_s(pids)
-                    begin_s = time.monotonic()
-                    with running(processes):
-                        times[name].append(paced(client, request, arguments.seconds))
-                    used[name] += processor_s(pids) - before_s
-                    began[name] += time.monotonic() - begin_s
-        finally:
-            for process in [p for processes in groups.values() for p in processes]:
-                process.kill()
-                process.communicate()
-            client.close()
-            one.stop()
-            one.dispose()
-    for name, rounds in times.items():
-        p50, p99 = np.percentile(np.concatenate(rounds), [50, 99])
-        share = used[name] / began[name]
-        print(
-            f"beside {name:16} p50 {p50:7.3f} ms  p99 {p99:8.3f} ms  n={sum(map(len, rounds)):6}"
-            f"  they used {share:.2f} processors"
-        )
-    paired = [
-        np.percentile(hostile, 99) / np.percentile(busy, 99)
-        for hostile, busy in zip(times["hostile clients"], times["busy processes"], strict=True)
-    ]
-    pooled = [np.percentile(np.concatenate(times[n]), 99) for n in ("hostile clients", "busy processes")]
-    print(
-        f"p99 beside hostile clients / beside busy processes: {np.median(paired):.2f} (median of paired"
-        f" rounds), {pooled[0] / pooled[1]:.2f} (all rounds together); load {os.getloadavg()[0]:.1f}"
-    )
+    parser.add_argument("--list", action="store_true", help="list the scenes")
+    parser.add_argument("--scene", action="append", default=[], metavar="ROW", help="play a scene")
+    parser.add_argument("--all", action="store_true", help="play all of them, one after the other")
+    parser.add_argument("--worst-five", action="store_true", help="play the worst five at once")
+    parser.add_argument("--churn", action="store_true", help="very many cells, clients, evictions, a reload")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of --worst-five and --churn")
+    parser.add_argument("--scratch", type=Path, help="keep the maps that are made here, for the next time")
+    options = parser.parse_args()
+
+    # not before: every actor's process imports this module
+    from tests.benchmarks.hostile.play import every_scene, play
+
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # daemons and actors end with this process
+    scenes = every_scene(options.minutes)
+    if options.list:
+        for name, one in scenes.items():
+            print(f"{name:10} {one.sentence}")
+        return 0
+    wanted = list(options.scene)
+    wanted += [name for name in scenes if options.all and name[0] in "AB"]
+    wanted += ["worst-five"] * options.worst_five + ["churn"] * options.churn
+    for name in wanted:
+        if name not in scenes:
+            parser.error(f"there is no scene {name}; --list shows those there are")
+    if wanted:
+        with tempfile.TemporaryDirectory(prefix="shmmap-scenes-") as scratch:
+            return play([scenes[name] for name in wanted], options.scratch or Path(scratch))
+    from tests.benchmarks.hostile.mixed import beside_hostile_and_busy
+
+    beside_hostile_and_busy(options.rounds, options.seconds)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's threads would take part in every scene
+    sys.exit(main())

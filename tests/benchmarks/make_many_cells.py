@@ -19,21 +19,21 @@ CELL_METRES = 20
 # ext4 allows 65 000 names for one file
 _LINKS = 60_000
 
-_PCD = b"""VERSION 0.7
+_PCD = """VERSION 0.7
 FIELDS x y z intensity
 SIZE 4 4 4 4
 TYPE F F F F
 COUNT 1 1 1 1
-WIDTH 1
+WIDTH {points}
 HEIGHT 1
 VIEWPOINT 0 0 0 1 0 0 0
-POINTS 1
+POINTS {points}
 DATA binary
 """
 
 
-def make_many_cells(out: Path, side: int) -> None:
-    """Write ``side`` x ``side`` cells and their metadata into the new directory ``out``."""
+def make_many_cells(out: Path, side: int, points: int = 1) -> None:
+    """Write ``side`` x ``side`` cells of so many points and their metadata into the new directory ``out``."""
     cells = out / "pointcloud_map.pcd"
     cells.mkdir(parents=True)
     lines = [f"x_resolution: {CELL_METRES}\n", f"y_resolution: {CELL_METRES}\n"]
@@ -44,7 +44,7 @@ def make_many_cells(out: Path, side: int) -> None:
         for number, (x, y) in enumerate(itertools.product(span, span)):
             name = f"city_{x}_{y}.pcd"
             if number % _LINKS == 0:
-                (cells / name).write_bytes(_PCD + bytes(16))
+                (cells / name).write_bytes(_PCD.format(points=points).encode() + bytes(16 * points))
                 first = name
             else:
                 os.link(first, name, src_dir_fd=fd, dst_dir_fd=fd)

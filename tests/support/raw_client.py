@@ -151,12 +151,16 @@ class RawClient:
         self.socket.send(pack([tag, self._request, *elements]))
         return self._request
 
-    def wait_for(self, request: int, timeout: float | None = None) -> list[Any]:
-        """Return the reply to a request; `DaemonError` if it is an error."""
+    def wait_for_any(self, request: int, timeout: float | None = None) -> list[Any]:
+        """Return the reply to a request, also if it is an error."""
         while True:
             reply = self.receive(timeout)
             if reply[1] == request:
-                break
+                return reply
+
+    def wait_for(self, request: int, timeout: float | None = None) -> list[Any]:
+        """Return the reply to a request; `DaemonError` if it is an error."""
+        reply = self.wait_for_any(request, timeout)
         if reply[0] == "error":
             raise DaemonError(*reply[2:5])
         return reply

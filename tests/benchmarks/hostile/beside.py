@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a third process sees while something happens to the daemon, and what that costs the daemon."""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+import numpy as np
+
+from tests.benchmarks.hostile.actors import Actor
+from tests.benchmarks.hostile.bystanders import asks_the_daemon, asks_the_echo, echoes, newcomers
+from tests.benchmarks.hostile.report import Report
+from tests.support.daemon_process import DaemonProcess
+from tests.support.raw_client import RawClient, circle
+
+__all__ = ["PROBED_M", "Beside"]
+
+OVER_ECHO_MS: Final = 50.0
+OVER_IDLE_MIB: Final = 100.0
+PROBED_M: Final = 30.0
+"""Around the map's origin; an operator pins what lies there, so that it is warm whatever happens."""
+SAMPLE_S: Final = 0.02
+
+
+@dataclass(frozen=True)
+class Look:
+    """One look at the thread of the serving loop: seconds it has run so far, and waited for a processor."""
+
+    now_s: float
+    ran_s: float
+    waited_s: float
+
+    @staticmethod
+    def at(pid: int) -> Look:
+        """Look now."""
+        ran, waited, _ = Path(f"/proc/{pid}/task/{pid}/schedstat").read_text().split()
+        return Look(time.perf_counter(), int(ran) / 1e9, int(waited) / 1e9)
+
+
+class Beside:
+    """Watches from its beginning to the end of its ``with`` block; then judges what it saw.
+
+    Parameters
+    ----------
+    newcomers_too
+        Whether new clients come all the time, and must get in.
+    """
+
+    def __init__(self, told: Report, one: DaemonProcess, *, newcomers_too: bool = True) -> None:
+        self._told = told
+        self._one = one
+        self._newcomers_too = newcomers_too
+        self._stack = ExitStack()
+        self._ended = threading.Event()
+        self._peak = 0
+
+    def __enter__(self) -> Beside:
+        one = self._one
+        warm_and_pinned(one)
+        with ExitStack() as stack:
+            self._probe = stack.enter_context(Actor(asks_the_daemon, one.endpoint, circle(0, 0, PROBED_M)))
+            sizes = self._probe.said()
+            path = f"{one.runtime_dir}/echo.sock"
+            stack.enter_context(server := Actor(echoes, path))
+            server.said()
+            self._echo = stack.enter_context(Actor(asks_the_echo, path, *sizes))
+            self._echo.said()
+            if self._newcomers_too:
+                self._newcomers = stack.enter_context(Actor(newcomers, one.endpoint, PROBED_M))
+                self._newcomers.said()
+            self._idle = self._peak = private_bytes(one.pid)
+            self._looks = [Look.at(one.pid)]
+            thread = threading.Thread(target=self._watch, daemon=True)
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(self._ended.set)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            if error is None:
+                self._judge()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(SAMPLE_S):
+            self._peak = max(self._peak, private_bytes(self._one.pid))
+            with contextlib.suppress(OSError):  # it has ended
+                self._looks.append(Look.at(self._one.pid))
+
+    def _loop_in(self, begin_s: float, end_s: float) -> str:
+        """Say what the loop did in some time, as far as the looks tell."""
+        times = [look.now_s for look in self._looks]
+        first = self._looks[max(0, bisect.bisect_right(times, begin_s) - 1)]
+        last = self._looks[min(len(times) - 1, bisect.bisect_left(times, end_s))]
+        ran, waited = last.ran_s - first.ran_s, last.waited_s - first.waited_s
+        return (
+            f"{end_s - begin_s:.3f} s, in which the loop ran for {ran:.3f} s and waited for a processor for"
+            f" {waited:.3f} s"
+        )
+
+    def _judge(self) -> None:
+        told, one = self._told, self._one
+        alive = one.process is not None and one.process.poll() is None
+        told.must("the daemon lives", alive)
+        if not alive:
+            return
+        probe, echo = self._probe.end(), self._echo.end()
+        self._ended.set()
+        told.tell(f"all of it: {self._loop_in(self._looks[0].now_s, self._looks[-1].now_s)}")
+        told.tell(f"probe {_figures(probe.times_ms)}")
+        told.tell(f"in its longest: {self._loop_in(*probe.longest_s)}")
+        told.tell(f"echo  {_figures(echo.times_ms)}")
+        longest, longest_echo = max(probe.times_ms), max(echo.times_ms)
+        told.limit("longest of the probe, over the echo's", longest - longest_echo, OVER_ECHO_MS, "ms")
+        if probe.odd:
+            told.must("every answer to the probe has its cells", False, f"{probe.odd} have not")
+        mib = 1 << 20
+        grown = (self._peak - self._idle) / mib
+        told.tell(f"daemon's private memory: idle {self._idle / mib:.1f} MiB, peak {self._peak / mib:.1f}")
+        told.limit("over idle", grown, OVER_IDLE_MIB, "MiB")
+        told.figures.update(
+            p99=f"{np.percentile(probe.times_ms, 99):.1f}", probe=f"{longest:.0f}",
+            echo=f"{longest_echo:.0f}", memory=f"{grown:+.0f}",
+        )  # fmt: skip
+        if self._newcomers_too:
+            times, failures = self._newcomers.end()
+            count = len(times) + failures.total()
+            told.must("newcomers get in", not failures, f"{len(times)} of {count}")
+            if times:
+                told.tell(f"the slowest of them took {max(times) * 1e3:.0f} ms")
+            for words, number in failures.most_common(3):
+                told.tell(f"{number} were told: {words}")
+            told.figures["newcomers"] = f"{len(times)}/{count}"
+
+
+def warm_and_pinned(one: DaemonProcess) -> None:
+    """Have what the probe asks for in memory, whatever happens."""
+    with RawClient(one.endpoint, name="operator", timeout=120.0) as operator:
+        cells = operator.area(circle(0, 0, PROBED_M)).cells
+        assert cells
+        operator.ask("pin", [cell.id for cell in cells], ["points"])
+
+
+def private_bytes(pid: int) -> int:
+    """Memory of a process that is no file's: what it allocated itself, not the map in shared memory."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:  # it has ended
+        return 0
+    found = dict(line.split(":", 1) for line in status.splitlines())
+    return sum(int(found.get(name, "0 kB").split()[0]) for name in ("RssAnon", "VmSwap")) * 1024
+
+
+def _figures(times: list[float]) -> str:
+    p50, p99 = np.percentile(times, [50, 99])
+    return f"p50 {p50:8.2f}  p99 {p99:8.2f}  longest {max(times):8.2f} ms  n={len(times)}"

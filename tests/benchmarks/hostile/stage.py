@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where scenes play: maps that are made when one needs them, and daemons that serve them."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from tests.benchmarks.hostile.report import LeftOut, Report
+from tests.benchmarks.make_many_cells import make_many_cells
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, make_map
+
+__all__ = ["SCENES", "Scene", "Stage", "scene"]
+
+
+@dataclass
+class Stage:
+    """A directory for maps; each kind is made once."""
+
+    scratch: Path
+
+    def many_cells(self, side: int, points: int = 1) -> Path:
+        """Return a map of ``side`` x ``side`` cells, their corner at the origin."""
+        path = self.scratch / f"many-{side}-{points}"
+        if not path.exists():
+            make_many_cells(path, side, points)
+        return path
+
+    def new_map(self, **size: int) -> DividedMap:
+        """Return a new map around the origin, for a scene that changes it; parameters as of `make_map`."""
+        return make_map(Path(tempfile.mkdtemp(dir=self.scratch)) / "map", **size)
+
+    @contextlib.contextmanager
+    def served(self, path: Path, *flags: str, **options: Any) -> Iterator[DaemonProcess]:
+        """Serve a map while the block runs."""
+        one = DaemonProcess(path, *flags, **options)
+        try:
+            one.start()
+            yield one
+            if one.process is not None and one.process.poll() is None:
+                one.stop()
+        finally:
+            one.dispose()
+
+    @contextlib.contextmanager
+    def tmpfs(self, size: str) -> Iterator[str]:
+        """Mount a tmpfs of its own while the block runs."""
+        with tempfile.TemporaryDirectory(dir=self.scratch) as path:
+            command = ["mount", "-t", "tmpfs", "-o", f"size={size},mode=755", "tmpfs", path]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                raise LeftOut(f"cannot mount a tmpfs: {done.stderr.strip()}")
+            try:
+                yield path
+            finally:
+                subprocess.run(["umount", path], check=True)
+
+
+Play = Callable[[Report, Stage], None]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A row of the findings, and the function that plays it."""
+
+    row: str
+    sentence: str
+    play: Play
+
+
+SCENES: Final[dict[str, Scene]] = {}
+
+
+def scene(row: str, sentence: str) -> Callable[[Play], Play]:
+    """Make a function a scene; ``sentence`` says what must not happen."""
+
+    def add(play: Play) -> Play:
+        assert row not in SCENES, row
+        SCENES[row] = Scene(row, sentence, play)
+        return play
+
+    return add
