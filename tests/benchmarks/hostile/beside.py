@@ -28,6 +28,7 @@ OVER_IDLE_MIB: Final = 100.0
 PROBED_M: Final = 30.0
 """Around the map's origin; an operator pins what lies there, so that it is warm whatever happens."""
 SAMPLE_S: Final = 0.02
+LEAST_S: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class Beside:
     ) -> None:
         with self._stack:
             if error is None:
+                time.sleep(max(0.0, self._looks[0].now_s + LEAST_S - time.perf_counter()))
                 self._judge()
 
     def _watch(self) -> None:

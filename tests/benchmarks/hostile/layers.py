@@ -19,6 +19,8 @@ from tests.support.raw_client import RawClient, circle
 SLOW_S: Final = 5.0
 SLOW_KIND: Final = """
 import time
+import numpy as np
+from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter
 
 
 def build(points, parameters):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -21,15 +22,36 @@ __all__ = ["SCENES", "Scene", "Stage", "scene"]
 
 @dataclass
 class Stage:
-    """A directory for maps; each kind is made once."""
+    """What scenes need.
+
+    Parameters
+    ----------
+    scratch
+        A directory for what is there for one run.
+    maps
+        A directory for very large maps: what is there from an earlier run is used again.
+    minutes
+        How long the long runs take.
+    lifted
+        Whether the daemons, as this process, go before unrelated work of the machine.
+    """
 
     scratch: Path
+    maps: Path
+    minutes: float = 10.0
+    lifted: bool = False
+
+    def __post_init__(self) -> None:
+        if self.lifted:
+            lift(os.getpid())
 
     def many_cells(self, side: int, points: int = 1) -> Path:
         """Return a map of ``side`` x ``side`` cells, their corner at the origin."""
-        path = self.scratch / f"many-{side}-{points}"
+        path = self.maps / f"many-{side}-{points}"
         if not path.exists():
-            make_many_cells(path, side, points)
+            partial = path.with_name(f"{path.name}.partial")
+            make_many_cells(partial, side, points)
+            partial.rename(path)
         return path
 
     def new_map(self, **size: int) -> DividedMap:
@@ -42,6 +64,8 @@ class Stage:
         one = DaemonProcess(path, *flags, **options)
         try:
             one.start()
+            if self.lifted:
+                lift(one.pid)
             yield one
             if one.process is not None and one.process.poll() is None:
                 one.stop()
@@ -60,6 +84,11 @@ class Stage:
                 yield path
             finally:
                 subprocess.run(["umount", path], check=True)
+
+
+def lift(pid: int) -> None:
+    """Let the session of a process have about ten times the processor time of another one."""
+    Path(f"/proc/{pid}/autogroup").write_text("-10")
 
 
 Play = Callable[[Report, Stage], None]
