@@ -47,7 +47,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="of --worst-five and --churn")
     parser.add_argument("--lift", action="store_true", help="go before unrelated work (root)")
     parser.add_argument(
-        "--maps", type=Path, metavar="DIR", help="keep very large maps there, for the next time"
+        "--maps", type=Path, metavar="DIR", help="keep very large maps there for the next time"
     )
     options = parser.parse_args()
 
