@@ -37,7 +37,8 @@ def _play(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, 
         last = "returned", function(Orders(pipe), *arguments)
     except Exception:
         last = "raised", traceback.format_exc()
-    pipe.send(last)
+    with contextlib.suppress(OSError):  # nobody wants to know any more
+        pipe.send(last)
 
 
 class Actor:

@@ -90,7 +90,7 @@ class Beside:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._stack:
-            if error is None:
+            if error is None or isinstance(error, RuntimeError):  # an attacker failed
                 time.sleep(max(0.0, self._looks[0].now_s + LEAST_S - time.perf_counter()))
                 self._judge()
 

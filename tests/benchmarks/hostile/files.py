@@ -106,27 +106,29 @@ def full_at_the_start(told: Report, stage: Stage) -> None:
         "its lock's name is taken": squatted(lambda instance: segment_prefix(instance) + "lock"),
     }
     for what, prepare in cases.items():
-        with stage.tmpfs("1m") as tmpfs:
+        with stage.tmpfs("64m") as tmpfs:
             one = DaemonProcess(made.root, shm_dir=tmpfs)
             try:
                 obstacle = prepare(one)
                 code = exit_code(one)
                 last = [line for line in one.log.splitlines() if line.strip()][-2:]
-                told.must(f"{what}: exit code {code} is not {EX_CONFIG}:", code != EX_CONFIG)
+                told.must(f"{what}: exit code {code} is not final", code != EX_CONFIG)
                 if code:
                     told.tell(f"it said: {' | '.join(last)[:300]}")
                 shutil.rmtree(obstacle) if obstacle.is_dir() else obstacle.unlink()
                 told.must("once that is over it starts", exit_code(one) == 0)
             finally:
                 one.dispose()
-    with stage.tmpfs("8m") as tmpfs:
+    with stage.tmpfs("64m") as tmpfs:
         one = DaemonProcess(made.root, shm_dir=tmpfs)
         try:
             path = Path(tmpfs + segment_prefix(one.instance) + "lock")
             with path.open("w") as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
                 code = exit_code(one)
-                told.must(f"somebody's flock in the shm directory: exit code {code} is 0:", code == 0)
+                told.must(
+                    "beside somebody's flock in the shm directory it starts", code == 0, f"exit code {code}"
+                )
                 if code:
                     told.tell(f"it said: {one.log.splitlines()[-1][:300]}")
         finally:

@@ -50,6 +50,7 @@ def several_windows(told: Report, stage: Stage) -> None:
 
 def leases(orders: Orders, paths: list[str]) -> int:
     """Take and give back a lease of each file again and again, as the daemon does to see who uses it."""
+    signal.signal(signal.SIGIO, signal.SIG_IGN)  # somebody opens what is leased
     count = 0
     while orders.go_on():
         for path in paths:

@@ -34,7 +34,7 @@ def idles_with_routes(orders: Orders, endpoint: str, count: int, span_m: float) 
         session = RawClient(endpoint, name="idles", timeout=120.0)
         x, y = (rng.uniform(0.0, span_m) for _ in range(2))
         route = [[x + 300.0 * math.cos(n), y + 300.0 * math.sin(n)] for n in range(ROUTE_VERTICES)]
-        session.area(circle(x, y, 1.0), wait=None, intent=[x, y, 0.0, 0.0, None, route])
+        session.area(circle(-1e6, 0.0, 1.0), wait=None, intent=[x, y, 0.0, 0.0, None, route])  # no cells
         sessions.append(session)
     orders.say(count)
     while orders.go_on(60.0):
@@ -56,7 +56,7 @@ def routes(told: Report, stage: Stage) -> None:
         alone = 0.0
         for count in (0, 40, 300):
             idlers = stack.enter_context(Actor(idles_with_routes, one.endpoint, count, span_m))
-            idlers.said()
+            idlers.said(900.0)
             with Actor(walks_cold, one.endpoint, 12.0, (0.0, span_m), (cold_m, span_m)) as walker:
                 came, took_s = walker.said(900.0)
             rate = came / took_s
