@@ -18,6 +18,7 @@ import numpy as np
 from tests.benchmarks.hostile.actors import Actor
 from tests.benchmarks.hostile.bystanders import asks_the_daemon, asks_the_echo, echoes, newcomers
 from tests.benchmarks.hostile.report import Report
+from tests.benchmarks.hostile.turns import Turns
 from tests.support.daemon_process import DaemonProcess
 from tests.support.raw_client import RawClient, circle
 
@@ -53,6 +54,11 @@ class Beside:
     ----------
     newcomers_too
         Whether new clients come all the time, and must get in.
+
+    Attributes
+    ----------
+    turns : Turns
+        Those of the daemon's loop since the block began.
     """
 
     def __init__(self, told: Report, one: DaemonProcess, *, newcomers_too: bool = True) -> None:
@@ -78,6 +84,7 @@ class Beside:
                 self._newcomers = stack.enter_context(Actor(newcomers, one.endpoint, PROBED_M))
                 self._newcomers.said()
             self._idle = self._peak = private_bytes(one.pid)
+            self.turns = Turns(one)
             self._looks = [Look.at(one.pid)]
             thread = threading.Thread(target=self._watch, daemon=True)
             thread.start()
@@ -120,6 +127,7 @@ class Beside:
         probe, echo = self._probe.end(), self._echo.end()
         self._ended.set()
         told.tell(f"all of it: {self._loop_in(self._looks[0].now_s, self._looks[-1].now_s)}")
+        told.tell(f"turns of the loop, processor time: {self.turns.said()}")
         told.tell(f"probe {_figures(probe.times_ms)}")
         told.tell(f"in its longest: {self._loop_in(*probe.longest_s)}")
         told.tell(f"echo  {_figures(echo.times_ms)}")

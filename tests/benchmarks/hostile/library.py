@@ -177,6 +177,9 @@ def interrupts(told: Report, stage: Stage) -> None:
         told.must("closing ends", not found["close hangs"])
 
 
+HANDLERS: Final = 5
+
+
 def asks_in_a_handler(orders: Orders, endpoint: str) -> dict[str, Any]:
     """A signal handler makes a request while one of the same client is under way."""
     found: dict[str, Any] = {"handled": 0, "longest_s": 0.0, "said": Counter[str]()}
@@ -195,7 +198,7 @@ def asks_in_a_handler(orders: Orders, endpoint: str) -> dict[str, Any]:
         found["longest_s"] = max(found["longest_s"], time.monotonic() - begin_s)
 
     signal.signal(signal.SIGALRM, handle)
-    for _ in range(20):
+    for _ in range(HANDLERS):
         inside.clear()
         signal.setitimer(signal.ITIMER_REAL, 0.0005)
         while not inside.is_set():
@@ -205,7 +208,7 @@ def asks_in_a_handler(orders: Orders, endpoint: str) -> dict[str, Any]:
 
 @scene("B2", "A request from within a signal handler is told at once what is wrong")
 def requests_in_handlers(told: Report, stage: Stage) -> None:
-    """20 signal handlers that make a request in the middle of another one."""
+    """Five signal handlers that make a request in the middle of another one."""
     with stage.served(stage.new_map().root) as one, Actor(asks_in_a_handler, one.endpoint) as actor:
         found = actor.said()
         told.tell(f"{found['handled']} handlers: {dict(found['said'])}")

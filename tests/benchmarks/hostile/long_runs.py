@@ -60,6 +60,8 @@ PROCESSES: Final = 8
 STEP_S: Final = 2.0
 SPEED_M_S: Final = 2.5
 WINDOW_M: Final = 60.0
+TURN_P999_MS: Final = 2.0
+LONGEST_TURN_MS: Final = 10.0
 
 
 def drives(orders: Orders, endpoint: str, vehicles: int, span_m: float, seed: int) -> int:
@@ -104,7 +106,7 @@ def churn(told: Report, stage: Stage) -> None:
         begin_s = time.monotonic()
         with Actor(fills, one.endpoint, side, segments) as filler:
             told.tell(f"{filler.said(1800.0)} cells were loaded in {time.monotonic() - begin_s:.0f} s")
-        stack.enter_context(Beside(told, one))
+        beside = stack.enter_context(Beside(told, one))
         share = VEHICLES // PROCESSES
         drivers = [
             stack.enter_context(Actor(drives, one.endpoint, share, side * 20.0, seed))
@@ -124,8 +126,9 @@ def churn(told: Report, stage: Stage) -> None:
         for name in ("requests", "loads_finished", "evictions", "reloads"):
             told.tell(f"{name}: {after[name] - before[name]}")
         told.tell(f"{VEHICLES} vehicles asked {asked} times; {len(one.segments())} segments at the end")
-        turns = {name: value for name, value in after.items() if "turn" in name}
-        told.tell(f"turns of the loop: {turns or 'this daemon does not tell'}")
+        p999, longest = beside.turns.quantile_and_longest_ms(0.999)
+        told.limit("99.9 % of the loop's turns take", p999, TURN_P999_MS, "ms")
+        told.limit("the longest takes", longest, LONGEST_TURN_MS, "ms")
 
 
 def counters_of(one: DaemonProcess) -> dict[str, int]:
