@@ -64,6 +64,25 @@ def test_without_data_it_says_how_to_make_some(name: str) -> None:
     assert "hint: python -m tests.benchmarks.make_data" in done.stderr
 
 
+def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--list"],
+        cwd=ROOT, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    rows = [f"A{number}" for number in range(1, 23)] + ["B1", "B2", "B3"]
+    assert [line.split()[0] for line in done.stdout.splitlines()] == [*rows, "churn", "worst-five"]
+
+
+def test_a_scene_that_is_over_no_limit_ends_well() -> None:
+    """One of the quick ones, which time cannot fail: it shows that scenes can be played."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--scene", "A18"],
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.splitlines()[-2].split() == ["A18", "-", "-", "-", "-", "-", "OK"]
+
+
 def test_the_page_marks_those_that_need_data() -> None:
     assert sorted(re.findall(r"^\| `(\w+)` \(street\) \|", PAGE.text, re.MULTILINE)) == NEED_DATA
 

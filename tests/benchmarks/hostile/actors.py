@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any, Final
+
+from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["Actor", "Orders"]
 
@@ -32,7 +35,16 @@ class Orders:
         return not self._pipe.poll(pause_s)
 
 
-def _play(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+def _play(
+    parent: int,
+    is_bystander: bool,
+    pipe: Connection,
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+) -> None:
+    die_with(parent)
+    if not is_bystander:
+        os.setsid()  # the scheduler shares processors between sessions: it is nobody's that is measured
     try:
         last = "returned", function(Orders(pipe), *arguments)
     except Exception:
@@ -42,12 +54,20 @@ def _play(pipe: Connection, function: Callable[..., Any], arguments: tuple[Any, 
 
 
 class Actor:
-    """A process that runs ``function(orders, *arguments)``; killed where its ``with`` block ends."""
+    """A process that runs ``function(orders, *arguments)``; killed where its ``with`` block ends.
 
-    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
+    Parameters
+    ----------
+    is_bystander
+        It belongs to those that measure; else it is in a session of its own.
+    """
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any, is_bystander: bool = False) -> None:
         self.name = function.__name__
         self._pipe, theirs = _SPAWN.Pipe()
-        self._process = _SPAWN.Process(target=_play, args=(theirs, function, arguments), daemon=True)
+        self._process = _SPAWN.Process(
+            target=_play, args=(os.getpid(), is_bystander, theirs, function, arguments), daemon=True
+        )
         self._process.start()
         theirs.close()
 

@@ -9,6 +9,7 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -72,16 +73,19 @@ class Beside:
     def __enter__(self) -> Beside:
         one = self._one
         warm_and_pinned(one)
+        bystander = partial(Actor, is_bystander=True)
         with ExitStack() as stack:
-            self._probe = stack.enter_context(Actor(asks_the_daemon, one.endpoint, circle(0, 0, PROBED_M)))
+            self._probe = stack.enter_context(
+                bystander(asks_the_daemon, one.endpoint, circle(0, 0, PROBED_M))
+            )
             sizes = self._probe.said()
             path = f"{one.runtime_dir}/echo.sock"
-            stack.enter_context(server := Actor(echoes, path))
+            stack.enter_context(server := bystander(echoes, path))
             server.said()
-            self._echo = stack.enter_context(Actor(asks_the_echo, path, *sizes))
+            self._echo = stack.enter_context(bystander(asks_the_echo, path, *sizes))
             self._echo.said()
             if self._newcomers_too:
-                self._newcomers = stack.enter_context(Actor(newcomers, one.endpoint, PROBED_M))
+                self._newcomers = stack.enter_context(bystander(newcomers, one.endpoint, PROBED_M))
                 self._newcomers.said()
             self._idle = self._peak = private_bytes(one.pid)
             self.turns = Turns(one)

@@ -193,8 +193,9 @@ def dropped_clients(told: Report, stage: Stage) -> None:
                     told.tell(f"one was told: {failures[0]}")
                 told.limit("descriptors of the daemon", descriptors(one.pid), DESCRIPTORS - 1)
                 time.sleep(1.0)
-                placed = sum(row[10] is not None for row in operator.ask("stats")[5])
-                told.limit("of them have a place in the daemon's mind", placed, 0)
+                rows = operator.ask("stats")[5]
+                placed = sum(row[10] is not None for row in rows if row[4].startswith("silent"))
+                told.limit("of them the daemon still heeds the places of", placed, 0)
             time.sleep(REST_S)
             with Actor(walks_cold, one.endpoint, 8.0, span_m, span_m) as walker:
                 after, took_s = walker.said()

@@ -87,8 +87,8 @@ class Stage:
 
 
 def lift(pid: int) -> None:
-    """Let the session of a process have about ten times the processor time of another one."""
-    Path(f"/proc/{pid}/autogroup").write_text("-10")
+    """Let the session of a process have its processor time before others."""
+    Path(f"/proc/{pid}/autogroup").write_text("-19")
 
 
 Play = Callable[[Report, Stage], None]
