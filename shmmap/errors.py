@@ -18,6 +18,7 @@
     │   └── NoAnswer           no reply before the deadline; also a `TimeoutError`
     ├── ProtocolMismatch       client and daemon speak different versions         exit 76
     ├── InstanceBusy           another daemon owns this instance                  exit 75
+    ├── CannotStart            what hinders the daemon's start can pass           exit 71
     ├── NoSession              the daemon does not know this session: say hello   exit 1
     ├── NotPermitted           the daemon refuses this to this user               exit 1
     ├── Busy                   too many requests of this process wait already     exit 75
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BadRequest",
     "Busy",
+    "CannotStart",
     "CannotWrite",
     "CellError",
     "ConfigError",
@@ -144,14 +146,9 @@ class MapDataError(ShmmapError):
     exit_code = 65
 
     def __init__(
-        self,
-        message: str,
-        *,
-        path: str = "",
-        offset: int | None = None,
-        cause: str = "bad_data",
+        self, message: str, *, path: str = "", offset: int | None = None, cause: str = "bad_data",
         hint: str = "",
-    ) -> None:
+    ) -> None:  # fmt: skip
         place = f" (at byte {offset})" if offset is not None else ""
         super().__init__(f"{path}: {message}{place}" if path else message + place, hint=hint)
         self.path = path
@@ -224,6 +221,13 @@ class InstanceBusy(ShmmapError):
     exit_code = 75
 
 
+class CannotStart(ShmmapError):
+    """The daemon cannot start now, but perhaps later: something is full, not there yet, or in the way."""
+
+    code = "cannot_start"
+    exit_code = 71  # EX_OSERR of sysexits.h
+
+
 class NoSession(ShmmapError):
     """The daemon does not know the connection's session (it was restarted): say hello again."""
 
@@ -280,14 +284,9 @@ class CellError(ShmmapError):
     exit_code = 1
 
     def __init__(
-        self,
-        message: str,
-        *,
-        cell_id: str = "",
-        layer: str = "",
-        holders: Sequence[Holder] = (),
+        self, message: str, *, cell_id: str = "", layer: str = "", holders: Sequence[Holder] = (),
         hint: str = "",
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(message, hint=hint)
         self.cell_id = cell_id
         self.layer = layer

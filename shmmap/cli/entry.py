@@ -2,8 +2,8 @@
 """Where the programs ``shmmap`` and ``shmmapd`` start, and what becomes of their errors.
 
 Exit codes: 0 done, 1 negative answer, 2 wrong usage, 65 bad data, 66 no map there, 69 no daemon
-answers, 70 internal error, 73 an output cannot be written, 75 instance taken, 76 protocol mismatch,
-78 bad configuration, 130 interrupted, 141 the reader of our output went away.
+answers, 70 internal error, 71 the daemon cannot start now, 73 an output cannot be written, 75 instance
+taken, 76 protocol mismatch, 78 bad configuration, 130 interrupted, 141 the reader of our output went away.
 """
 
 from __future__ import annotations

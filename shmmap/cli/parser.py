@@ -54,6 +54,7 @@ Exit codes, of every verb:
   66   no such map or file
   69   no daemon answers
   70   internal error: a defect in shmmap
+  71   the daemon cannot start now: something is full, missing or in its way
   73   an output cannot be written
   75   another process runs this instance, or makes this output
   76   daemon and client speak different protocol versions

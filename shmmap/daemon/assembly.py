@@ -17,7 +17,7 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
 from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.defects import Defects
-from shmmap.daemon.host.instance_names import lock_name, lock_path, take_away
+from shmmap.daemon.host.instance_names import lock_path, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
     KEEP_SIGNAL,
@@ -270,9 +270,8 @@ class Service:
         del number, frame
         ignore_signals()  # one after the other they would pile up in here
         directory, instance = self._memory.directory, self._config.instance
-        locks = (directory.path + lock_name(instance), lock_path(self._socket_path))
         ours = [events_path(self._socket_path), *([self._socket_path] if self._activated is None else [])]
-        take_away(directory, instance, (*ours, *locks))
+        take_away(directory, instance, (*ours, lock_path(self._socket_path)))
         os._exit(0)  # the loaders die with this process
 
 

@@ -33,7 +33,7 @@ from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.instance_lock import InstanceLock
-from shmmap.daemon.host.instance_names import lock_name, lock_path, stopped_early
+from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
 from shmmap.daemon.map.catalogue_reload import Reloader
@@ -54,6 +54,7 @@ from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
+from shmmap.statistics.exclusive_name import refuse_second
 
 __all__ = ["run"]
 
@@ -69,6 +70,8 @@ def run(config: DaemonConfig) -> int:
         No map is named, or a setting cannot work on this machine.
     InstanceBusy
         Another daemon has this instance.
+    CannotStart
+        Something is full, not there yet, or in the way.
     """
     set_up_logging()
     if not config.map_path:
@@ -96,11 +99,9 @@ def run(config: DaemonConfig) -> int:
         with signals.held():
             lock = InstanceLock(lock_path(path))
             stack.callback(lock.release)
-            # a second one beside the segments: two runtime directories may share a directory of segments
-            # empty: a single byte would take a page that the budget does not know
-            shm_lock = InstanceLock(directory.path + lock_name(config.instance), says_who=False)
-            stack.callback(shm_lock.release)
-            stack.callback(ignore_signals)  # without the locks no name is ours to take away
+            # two runtime directories may share a directory of segments
+            refuse_second(directory, config.instance)
+            stack.callback(ignore_signals)  # without the lock no name is ours to take away
             step("daemon.lock")
             stack.push(partial(stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()

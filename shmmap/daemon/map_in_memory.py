@@ -24,9 +24,9 @@ from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart, ConfigError
 from shmmap.origin.catalogue import Catalogue
-from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
@@ -42,7 +42,11 @@ class MapInMemory:
     Raises
     ------
     ConfigError
-        The budget cannot work on this machine, or nothing can be written to the directory.
+        The budget cannot work on this machine, or a limit lets nothing be written to the directory.
+    CannotStart
+        The directory is full, or something is in the way of a name.
+    InstanceBusy
+        Another daemon has these names.
     """
 
     def __init__(
@@ -72,11 +76,11 @@ class MapInMemory:
         try:
             self.statistics = StatisticsWriter(directory, config.instance, self.identity, mode=mode, gid=gid)
         except OSError as error:
-            raise ConfigError(
-                f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}",
-                key="shm_dir",
-                hint="make room, and lift limits on the size of files (ulimit -f, LimitFSIZE=)",
-            ) from error
+            said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
+            if is_full(error):
+                raise CannotStart(said, hint="free some, or enlarge it") from error
+            hint = "lift limits on the size of files (ulimit -f, LimitFSIZE=)"
+            raise ConfigError(said, key="shm_dir", hint=hint) from error
         self.statistics.set("pin_source", list(PinSource).index(pins.source))
         self.statistics.set("last_reload_unix_ns", time.time_ns())
         self.statistics.set("map_problems", len(catalogue.problems))

@@ -11,7 +11,7 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.groups import group_id
 from shmmap.daemon.pins.probe import PinSource, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 
@@ -40,8 +40,8 @@ def make_runtime_dir(path: Path, gid: int) -> None:
         if gid >= 0:
             os.chown(path, -1, gid)
     except OSError as error:
-        raise ConfigError(
-            f"runtime directory {path}: {error.strerror}", key="runtime_dir", hint="give --runtime-dir DIR"
+        raise CannotStart(
+            f"runtime directory {path}: {error.strerror}", hint="make it, or give another --runtime-dir"
         ) from error
 
 

@@ -10,7 +10,7 @@ from typing import Final
 from shmmap.daemon.pins.probe import probe_pins
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Patient
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["check_descriptors", "check_pins"]
@@ -24,7 +24,7 @@ def check_pins(patient: Patient) -> Finding:
     name = "leases"
     try:
         directory = ShmDirectory(patient.shm_dir)
-    except ConfigError as error:
+    except CannotStart as error:
         if patient.alive:
             return ok(name, "tried by the daemon when it started: see `shmmap status`")
         return fail(name, error.message, error.hint)

@@ -12,7 +12,7 @@ import errno
 import os
 from collections.abc import Iterator
 
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 from shmmap.failpoints import step
 from shmmap.segment.publish_block import PublishBlock, pack_publish_block
 
@@ -31,7 +31,7 @@ class ShmDirectory:
 
     Raises
     ------
-    ConfigError
+    CannotStart
         If it is missing, not writable, or its file system has no unnamed temporary files
         (``O_TMPFILE``; every tmpfs has them).
     """
@@ -41,19 +41,17 @@ class ShmDirectory:
         try:
             self._fd = os.open(self.path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
-            raise ConfigError(
-                f"shared-memory directory {self.path}: {error.strerror}",
-                key="shm_dir",
-                hint="name a directory on a tmpfs",
+            raise CannotStart(
+                f"shared-memory directory {self.path}: {error.strerror}", hint="name a directory on a tmpfs"
             ) from error
         try:
             os.close(self.create())
         except OSError as error:
             os.close(self._fd)
-            raise ConfigError(
+            hint = "free some, or enlarge it" if is_full(error) else "name a writable directory on a tmpfs"
+            raise CannotStart(
                 f"shared-memory directory {self.path}: cannot create a file there: {error.strerror}",
-                key="shm_dir",
-                hint="name a writable directory on a tmpfs",
+                hint=hint,
             ) from error
 
     def close(self) -> None:

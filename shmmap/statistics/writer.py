@@ -10,7 +10,6 @@ statistics serve the operator, the daemon serves without them.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import struct
 import time
@@ -18,13 +17,13 @@ from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 from typing import Final
 
-from shmmap.errors import ConfigError
 from shmmap.logfmt import log
-from shmmap.segment.directory import ShmDirectory, is_full, measured_bytes
+from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
 from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, TURN_KINDS
+from shmmap.statistics.exclusive_name import hold, take_name
 from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
@@ -58,8 +57,7 @@ class StatisticsWriter:
     Parameters
     ----------
     directory, instance
-        Where the segment goes; a leftover of a dead predecessor is replaced atomically.  The
-        caller holds the instance lock.
+        Where the segment goes, in place of what a dead predecessor left.
     identity
         Who writes.
     mode, gid
@@ -77,8 +75,8 @@ class StatisticsWriter:
     ------
     OSError
         If the directory is full.
-    ConfigError
-        If somebody else has the segment's name.
+    InstanceBusy, CannotStart
+        If another daemon has the segment's name, or there is something that cannot be removed.
     """
 
     def __init__(
@@ -125,28 +123,11 @@ class StatisticsWriter:
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
             os.fchmod(self._fd, mode)
-            self._publish()
+            hold(self._fd)
+            take_name(directory, instance, self._fd)
         except BaseException:
             os.close(self._fd)
             raise
-
-    def _publish(self) -> None:
-        """Give the finished segment its name in one step, over a predecessor's."""
-        interim = self.name + ".next"
-        try:
-            self._directory.unlink(interim)
-            self._directory.link(self._fd, interim)
-            self._directory.rename(interim, self.name)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                self._directory.unlink(interim)
-            if is_full(error):
-                raise
-            raise ConfigError(
-                f"the statistics cannot be {self._directory.path}{self.name}: {error.strerror}",
-                key="instance",
-                hint="remove what somebody else put there (or at .next), or choose another --instance",
-            ) from error
 
     def set(self, name: str, value: int) -> None:
         """Set a gauge."""

@@ -208,8 +208,8 @@ def test_8_a_second_daemon_and_what_a_killed_one_leaves(bystanders: Bystanders) 
     assert one.run_to_end() == 75
     bystanders.check()
     one.kill()
-    assert Path(one.endpoint).is_socket()  # stale, and so are the locks
-    assert any(name.endswith(".lock") for name in os.listdir(one.shm_dir))
+    assert Path(one.endpoint).is_socket()  # stale, and so is the lock
+    assert any(name.endswith(".lock") for name in os.listdir(one.runtime_dir))
     one.start()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import configparser
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,7 +13,15 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.errors import BadRequest, ConfigError, InstanceBusy, MapMissing
+from shmmap.errors import (
+    BadRequest,
+    CannotStart,
+    ConfigError,
+    InstanceBusy,
+    InternalError,
+    MapDataError,
+    MapMissing,
+)
 from tests.support.daemon_process import ROOT
 
 UNITS = ROOT / "systemd"
@@ -104,11 +113,61 @@ def test_the_socket_is_where_clients_look(monkeypatch: pytest.MonkeyPatch) -> No
     assert DaemonConfig().socket().endswith(own)
 
 
-@pytest.mark.parametrize("path", [*(UNITS / "system").glob("*.service"), *(UNITS / "user").glob("*.service")])
+SERVICES = [*(UNITS / "system").glob("*.service"), *(UNITS / "user").glob("*.service")]
+
+
+@pytest.mark.parametrize("path", SERVICES)
 def test_what_cannot_get_better_is_not_started_again(path: Path) -> None:
-    codes = {error.exit_code for error in (BadRequest, MapMissing, InstanceBusy, ConfigError)}
+    codes = {error.exit_code for error in (BadRequest, InstanceBusy, ConfigError)}
     prevented = parsed(path)["Service"]["RestartPreventExitStatus"]
-    assert set(map(int, prevented.split())) == codes == {2, 66, 75, 78}
+    assert set(map(int, prevented.split())) == codes == {2, 75, 78}
+    assert not codes & {error.exit_code for error in (CannotStart, MapMissing, MapDataError, InternalError)}
+
+
+@pytest.mark.parametrize("path", SERVICES)
+def test_what_can_get_better_is_tried_for_ever_after_a_growing_pause(path: Path, tmp_path: Path) -> None:
+    """On every version of systemd: by a line of the unit, which is run here."""
+    unit = parsed(path)
+    assert (unit["Unit"]["StartLimitIntervalSec"], unit["Service"]["Restart"]) == ("0", "on-failure")
+    prefix, shell, option, script = shlex.split(unit["Service"]["ExecStopPost"].replace("/bin", " /bin", 1))
+    assert (prefix.lstrip("-"), shell, option) == ("" if path.parent.name == "user" else "+", "/bin/sh", "-c")
+    for name, text in (("systemctl", "echo $RESTARTS; echo $* >>asked"), ("sleep", "echo $1 >>slept")):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+
+    def pause(result: str, code: str, restarts: int) -> str:
+        (tmp_path / "slept").write_text("")
+        subprocess.run(
+            [shell, option, script.replace("$$", "$").replace("%n", "one.service")],
+            env={
+                "PATH": f"{tmp_path}:/usr/bin:/bin",
+                "SERVICE_RESULT": result,
+                "EXIT_CODE": code,
+                "RESTARTS": str(restarts),
+            },
+            cwd=tmp_path,
+            check=True,
+        )
+        return (tmp_path / "slept").read_text()
+
+    assert pause("success", "exited", 7) == ""
+    assert [pause("exit-code", "exited", n) for n in (0, 1, 2, 9, 10, 11, 999)] == [
+        f"{seconds}\n" for seconds in (0, 2, 4, 18, 20, 20, 20)
+    ]
+    assert [pause("watchdog", "killed", n) for n in (0, 1, 999)] == ["0\n", "2\n", "2\n"]
+    user = "--user " if path.parent.name == "user" else ""
+    assert set((tmp_path / "asked").read_text().splitlines()) == {
+        f"{user}show --value -p NRestarts one.service"
+    }
+    stop_s = int(unit["Service"]["TimeoutStopSec"])
+    assert stop_s > 20, "else systemd would cut the pause short"
+
+
+@pytest.mark.parametrize("path", [*(UNITS / "system").glob("*.socket"), *(UNITS / "user").glob("*.socket")])
+def test_a_waiting_client_does_not_start_for_ever_what_stays_down(path: Path) -> None:
+    """Pauses between starts that may help make at most five starts in this time."""
+    socket = parsed(path)["Socket"]
+    assert (socket["TriggerLimitIntervalSec"], socket["TriggerLimitBurst"]) == ("10s", "5")
 
 
 def test_every_file_says_its_licence() -> None:

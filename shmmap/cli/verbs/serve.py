@@ -21,7 +21,8 @@ Clients find the daemon by --instance, or by --endpoint; with that alone, the in
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
 its next start (a restart sends it first, then SIGTERM as usual; in a container: --stop-signal USR1);
 SIGHUP reads the map again.
-Exit code: 0 after a signal, 65 bad map, 66 no map there, 75 the instance runs already, 78 bad setting."""
+Exit code: 0 after a signal, 65 bad map, 66 no map there, 71 something is full, missing or in the way, 75 the
+instance runs already, 78 bad setting."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["choose_budget"]
@@ -46,19 +46,27 @@ def choose_budget(
     Raises
     ------
     ConfigError
-        The explicit budget is larger than what is free, the kernel would kill for it, or it is too small
+        The explicit budget is larger than the file system, the kernel would kill for it, or it is too small
         for anything.
+    CannotStart
+        Too little is free.
     """
     size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
     group_room = limit_bytes - min(limit_bytes // 2, RESERVE_BYTES) if limit_bytes is not None else LARGEST
     room = min(free - min(size // 20, RESERVE_BYTES), group_room)
     if asked_bytes:
-        if asked_bytes > free:
+        if asked_bytes > size:
             raise ConfigError(
                 f"a budget of {asked_bytes >> 20:,} MiB does not fit {directory.path}, which has"
-                f" {free >> 20:,} MiB free",
+                f" {size >> 20:,} MiB",
                 key="budget",
                 hint="lower --budget, or enlarge the tmpfs (docker: --shm-size)",
+            )
+        if asked_bytes > free:
+            raise CannotStart(
+                f"a budget of {asked_bytes >> 20:,} MiB does not fit {directory.path}, which has"
+                f" {free >> 20:,} MiB free",
+                hint="free some, lower --budget, or enlarge the tmpfs (docker: --shm-size)",
             )
         if limit_bytes is not None and asked_bytes > group_room:
             raise ConfigError(
@@ -75,9 +83,8 @@ def choose_budget(
         return asked_bytes
     budget = min((_available_bytes() + ours_bytes) // 4, DEFAULT_CEILING_BYTES, room)
     if budget < SMALLEST_BYTES:
-        raise ConfigError(
+        raise CannotStart(
             f"{directory.path} has only {free} bytes free",
-            key="shm_dir",
             hint="free some, enlarge the tmpfs (docker: --shm-size), or name another --shm-dir",
         )
     return budget

@@ -7,10 +7,14 @@ import contextlib
 import fcntl
 import os
 from pathlib import Path
+from typing import Final
 
-from shmmap.errors import ConfigError, InstanceBusy
+from shmmap.errors import InstanceBusy
+from shmmap.segment.taken_name import name_taken
 
 __all__ = ["InstanceLock"]
+
+_OTHERWISE: Final = "choose another --instance or --runtime-dir"
 
 
 class InstanceLock:
@@ -18,24 +22,27 @@ class InstanceLock:
 
     Parameters
     ----------
-    says_who
-        Write the process id into the file, for the message to whoever comes second.
+    path
+        It says the process id, for the message to whoever comes second.
 
     Raises
     ------
     InstanceBusy
         Somebody holds it; the message names the process.
-    ConfigError
-        The file cannot be made.
+    CannotStart
+        The file cannot be made, or is another user's.
     """
 
-    def __init__(self, path: str, *, says_who: bool = True) -> None:
+    def __init__(self, path: str) -> None:
         self.path = path
         while True:
             try:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             except OSError as error:
-                raise ConfigError(f"lock file {path}: {error.strerror}", key="runtime_dir") from error
+                raise name_taken("the lock file", path, error, otherwise=_OTHERWISE) from error
+            if os.fstat(fd).st_uid not in (os.geteuid(), 0):  # who made it could hold it for ever
+                os.close(fd)
+                raise name_taken("the lock file", path, None, otherwise=_OTHERWISE)
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -51,8 +58,7 @@ class InstanceLock:
             os.close(fd)  # its owner removed it just before we got the lock: try the new file
         self._fd = fd
         os.ftruncate(fd, 0)
-        if says_who:
-            os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
         """Remove the file and let the next daemon in.

@@ -9,14 +9,10 @@ from collections.abc import Iterable
 
 from shmmap.daemon.host.signals import StartSignals
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.names import segment_prefix
+from shmmap.segment.names import segment_prefix, statistics_name
+from shmmap.statistics.exclusive_name import has_writer
 
-__all__ = ["lock_name", "lock_path", "stopped_early", "take_away"]
-
-
-def lock_name(instance: str) -> str:
-    """Return the name of the lock that says whose the instance's names are."""
-    return segment_prefix(instance) + "lock"
+__all__ = ["lock_path", "stopped_early", "take_away"]
 
 
 def lock_path(socket_path: str) -> str:
@@ -25,8 +21,8 @@ def lock_path(socket_path: str) -> str:
 
 
 def take_away(directory: ShmDirectory, instance: str, more: Iterable[str] = ()) -> None:
-    """Remove the instance's names, then the files ``more``; all but its lock, which goes last."""
-    names = [name for name in directory.names(segment_prefix(instance)) if name != lock_name(instance)]
+    """Remove the instance's names, then the files ``more``."""
+    names = directory.names(segment_prefix(instance))
     for path in (*(directory.path + name for name in names), *more):
         with contextlib.suppress(OSError):
             os.unlink(path)
@@ -39,6 +35,9 @@ def stopped_early(
     kind: type[BaseException] | None,
     *_: object,
 ) -> None:
-    """A stop empties, even one that came before there was anything but what an earlier life left."""
-    if kind is SystemExit and not signals.keep:
+    """A stop empties, even one that came before there was anything but what an earlier life left.
+
+    Unless a daemon with another runtime directory has begun to serve from these names meanwhile.
+    """
+    if kind is SystemExit and not signals.keep and not has_writer(directory, statistics_name(instance)):
         take_away(directory, instance)

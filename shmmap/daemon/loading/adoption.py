@@ -45,9 +45,8 @@ class Adoption:
         """Look at every name once."""
         counts = dict.fromkeys(("taken_over", "still_in_use", "dropped"), 0)
         instance = self.cache.instance
-        not_segments = (statistics_name(instance), segment_prefix(instance) + "lock")
         for name in self.cache.directory.names(segment_prefix(instance)):
-            if not name.startswith(not_segments):
+            if name != statistics_name(instance):
                 counts[self._take(name, now_s)] += 1
         step("daemon.adopted")
         if any(counts.values()):

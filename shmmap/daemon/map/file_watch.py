@@ -15,7 +15,7 @@ from typing import Final
 
 from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
 from shmmap.daemon.host.mounts import file_system_of
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 from shmmap.logfmt import log
 
 __all__ = ["FileWatch", "directories_of"]
@@ -56,7 +56,7 @@ class FileWatch:
 
     Raises
     ------
-    ConfigError
+    CannotStart
         The kernel lets this user watch nothing more.
     """
 
@@ -131,6 +131,6 @@ class FileWatch:
         self._inotify.close()
 
 
-def _refusal(error: OSError) -> ConfigError:
+def _refusal(error: OSError) -> CannotStart:
     limits = "raise fs.inotify.max_user_watches and max_user_instances, or leave out --watch"
-    return ConfigError(f"cannot watch the map: {error.strerror}", key="watch", hint=limits)
+    return CannotStart(f"cannot watch the map: {error.strerror}", hint=limits)

@@ -8,7 +8,7 @@ import os
 import socket
 import stat
 
-from shmmap.errors import ConfigError
+from shmmap.segment.taken_name import name_taken
 
 __all__ = ["listen_at", "remove_socket"]
 
@@ -23,7 +23,7 @@ def listen_at(path: str, gid: int) -> socket.socket:
 
     Raises
     ------
-    ConfigError
+    CannotStart
         One cannot listen there, or there is something else than a socket.
     """
     remove_socket(path)
@@ -38,11 +38,7 @@ def listen_at(path: str, gid: int) -> socket.socket:
         listening.listen(socket.SOMAXCONN)
     except OSError as error:
         listening.close()
-        there = os.path.lexists(path) and not _is_socket(path)
-        why = "there is something that is no socket" if there else error.strerror or str(error)
-        raise ConfigError(
-            f"cannot listen at {path}: {why}", key="endpoint", hint="choose another --endpoint"
-        ) from error
+        raise name_taken("the socket", path, error, otherwise="choose another --endpoint") from error
     finally:
         os.umask(mask)
     return listening

@@ -27,6 +27,7 @@ EXIT_CODES = {
     "NoAnswer": 69,
     "ProtocolMismatch": 76,
     "InstanceBusy": 75,
+    "CannotStart": 71,
     "OverBudget": 1,
     "UnknownCell": 1,
     "InternalError": 70,

@@ -299,7 +299,6 @@ def test_leftovers(ward: Ward) -> None:
     assert lifetime.check_leftovers(ward.patient()).fact == "none"
     ward.file("/dev/shm/shmmap.default.0123456789abcdef", "x" * 5000)
     ward.file("/dev/shm/shmmap.default.statistics", "x")
-    ward.file("/dev/shm/shmmap.default.lock", "x")
     found = lifetime.check_leftovers(ward.patient())
     assert (found.state, "default: 1 segment, 8.0 KiB" in found.fact) == ("warn", True)
     assert lifetime.check_leftovers(ward.patient(told())).state == "ok"

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pwd
 import resource
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
@@ -130,10 +130,10 @@ def test_what_cannot_be_written_is_written_as_soon_as_it_can(
     assert "File too large" in caplog.text
 
 
-def test_a_leftover_is_replaced_and_never_taken_away(shm: ShmDirectory, identity: DaemonIdentity) -> None:
+def test_a_successor_s_are_never_taken_away(shm: ShmDirectory, identity: DaemonIdentity) -> None:
     old = StatisticsWriter(shm, "unit", identity)
     old.add("requests", 1)
-    Path(shm.path, "shmmap.unit.statistics.next").touch()  # a predecessor that died in between
+    os.unlink(f"{shm.path}/shmmap.unit.statistics")  # else there could be none
     new = StatisticsWriter(shm, "unit", replace(identity, epoch=2))
     old.beat()
     seen = read_statistics("unit", shm.path)
@@ -167,11 +167,17 @@ def test_too_long_an_identity_is_refused(shm: ShmDirectory, identity: DaemonIden
     assert os.listdir(shm.path) == []
 
 
-@pytest.mark.parametrize("name", ["/shmmap.unit.statistics", "/shmmap.unit.statistics.next"])
-def test_a_name_that_somebody_else_has(shm: ShmDirectory, identity: DaemonIdentity, name: str) -> None:
+def test_a_name_that_somebody_else_has(shm: ShmDirectory, identity: DaemonIdentity) -> None:
     """A directory stands for a stranger's file: it cannot be replaced either."""
-    os.mkdir(shm.path + name)
-    with pytest.raises(ConfigError, match="Is a directory"):
+    path = f"{shm.path}/shmmap.unit.statistics"
+    os.mkdir(path)
+    with pytest.raises(CannotStart) as failure:
         StatisticsWriter(shm, "unit", identity)
-    assert [f"/{left}" for left in os.listdir(shm.path)] == [name]
-    os.rmdir(shm.path + name)
+    user = pwd.getpwuid(os.geteuid()).pw_name
+    assert failure.value.message == (
+        f"the statistics cannot be {path}: there is a directory of user {user} (uid {os.geteuid()})"
+        " (Is a directory)"
+    )
+    assert f"`sudo rm -r {path}`" in failure.value.hint
+    assert os.listdir(shm.path) == ["shmmap.unit.statistics"]
+    os.rmdir(path)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.host.instance_lock import InstanceLock
-from shmmap.errors import ConfigError, InstanceBusy
+from shmmap.errors import CannotStart, InstanceBusy
 
 HOLDER = """
 import sys
@@ -111,7 +112,23 @@ def test_where_no_file_can_be(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("precious")
     (tmp_path / "link.lock").symlink_to(tmp_path / "elsewhere")
     for path in (tmp_path / "missing" / "a.lock", tmp_path / "link.lock", tmp_path):
-        with pytest.raises(ConfigError) as failure:
+        with pytest.raises(CannotStart, match=f"the lock file cannot be {path}: "):
             InstanceLock(str(path))
-        assert failure.value.key == "runtime_dir"
     assert (tmp_path / "elsewhere").read_text() == "precious"
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("held", [False, True])
+def test_another_user_s_file_is_no_daemon(tmp_path: Path, held: bool) -> None:
+    """Where everybody may make files somebody may have made it, and locked it."""
+    path = tmp_path / "a.lock"
+    path.write_text("1\n")
+    os.chown(path, 12345, -1)
+    with path.open() as file:
+        if held:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(CannotStart) as failure:
+            InstanceLock(str(path))
+    assert failure.value.message == f"the lock file cannot be {path}: there is a file of uid 12345"
+    assert failure.value.hint.startswith(f"see whose it is and remove it: `sudo rm {path}`; or ")
+    assert path.read_text() == "1\n"

@@ -12,7 +12,7 @@ import pytest
 
 from shmmap.daemon.host import inotify
 from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch, directories_of
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 
 
 @pytest.fixture
@@ -149,9 +149,7 @@ def test_a_full_queue_counts_as_a_change(watch: FileWatch, monkeypatch: pytest.M
     assert watch.due(2.0)
 
 
-def test_a_limit_of_the_kernel_is_a_matter_of_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_limit_of_the_kernel_is_told_with_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ctypes.get_errno", lambda: errno.ENOSPC)
 
     class Full:
@@ -165,6 +163,6 @@ def test_a_limit_of_the_kernel_is_a_matter_of_configuration(
             return -1
 
     monkeypatch.setattr(inotify, "_libc", Full())
-    with pytest.raises(ConfigError, match="No space left") as raised:
+    with pytest.raises(CannotStart, match="No space left") as raised:
         FileWatch([str(tmp_path)])
     assert "max_user_watches" in raised.value.hint

@@ -9,22 +9,22 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.transport.socket_file import listen_at, remove_socket
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart
 
 
 def test_a_file_in_the_socket_s_place_stays(tmp_path: Path) -> None:
     place = tmp_path / "map.yaml"
     place.write_text("precious")
-    with pytest.raises(ConfigError, match="no socket"):
+    with pytest.raises(CannotStart, match=f"cannot be {place}: there is a file of "):
         listen_at(str(place), -1)
     remove_socket(str(place))
     assert place.read_text() == "precious"
 
 
 def test_where_nothing_can_be_made(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="No such file"):
+    with pytest.raises(CannotStart, match="No such file"):
         listen_at(str(tmp_path / "missing" / "a.sock"), -1)
-    with pytest.raises(ConfigError, match="too long"):
+    with pytest.raises(CannotStart, match="too long"):
         listen_at("/" + "a" * 200, -1)
 
 

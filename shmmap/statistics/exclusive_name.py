@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One daemon for an instance's names, whatever its runtime directory: who writes the statistics has them.
+
+The writer holds an open-file-description lock on its segment while it lives.  It is a write lock, which
+nobody gets who may only read the file, so a client can neither hold the name nor keep a daemon from it.
+Who comes second asks for write locks alone, on files that its own user or root made.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import stat
+import struct
+from typing import Final
+
+from shmmap.errors import CannotStart, InstanceBusy, ShmmapError
+from shmmap.segment.directory import ShmDirectory, is_full
+from shmmap.segment.names import new_segment_name, statistics_name
+from shmmap.segment.taken_name import name_taken
+from shmmap.statistics.reader import read_statistics
+
+__all__ = ["has_writer", "hold", "refuse_second", "take_name"]
+
+_FLOCK: Final = struct.Struct("@hhqqi4x")  # struct flock of 64-bit Linux: type, whence, start, len, pid
+_OFD_GETLK: Final = 36
+_OFD_SETLK: Final = 37
+_ATTEMPTS: Final = 16
+
+
+def hold(fd: int) -> None:
+    """Mark a segment that has no name yet as the one of this process, until its descriptor is closed."""
+    fcntl.fcntl(fd, _OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0))
+
+
+def has_writer(directory: ShmDirectory, name: str) -> bool:
+    """Whether a process writes the statistics ``name``; a file of somebody else does not count."""
+    try:
+        with directory.opened(name) as fd:
+            status = os.fstat(fd)
+            if not stat.S_ISREG(status.st_mode) or status.st_uid not in (os.geteuid(), 0):
+                return False
+            asked = _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 1, 0)  # which a read lock does not hinder
+            return bool(_FLOCK.unpack(fcntl.fcntl(fd, _OFD_GETLK, asked))[0] == fcntl.F_WRLCK)
+    except OSError:
+        return False
+
+
+def refuse_second(directory: ShmDirectory, instance: str) -> None:
+    """Raise `InstanceBusy` if a daemon has the names of ``instance`` in this directory."""
+    if has_writer(directory, statistics_name(instance)):
+        raise _busy(directory, instance)
+
+
+def take_name(directory: ShmDirectory, instance: str, fd: int) -> None:
+    """Give the finished segment its name, in place of one that a dead daemon left.
+
+    Of several that try at the same time one gets it.
+
+    Raises
+    ------
+    InstanceBusy
+        Another daemon has it.
+    CannotStart
+        Something is there that cannot be removed.
+    OSError
+        The directory is full.
+    """
+    name = statistics_name(instance)
+    for _ in range(_ATTEMPTS):
+        refuse_second(directory, instance)
+        try:
+            directory.link(fd, name)
+            return
+        except FileExistsError:
+            pass
+        except OSError as error:
+            if is_full(error):
+                raise
+            raise _taken(directory, name, error) from error
+        aside = new_segment_name(instance)
+        try:
+            if stat.S_ISDIR(os.lstat(directory.path + name).st_mode):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            directory.rename(name, aside)  # what is unlinked by its name may be a newer one
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise _taken(directory, name, error) from error
+        if has_writer(directory, aside):  # it came since we asked: the name is its
+            os.rename(directory.path + aside, directory.path + name)
+            raise _busy(directory, instance)
+        directory.unlink(aside)
+    raise _taken(directory, name, None)
+
+
+def _taken(directory: ShmDirectory, name: str, error: OSError | None) -> CannotStart:
+    return name_taken(
+        "the statistics", directory.path + name, error, otherwise="choose another --instance or --shm-dir"
+    )
+
+
+def _busy(directory: ShmDirectory, instance: str) -> InstanceBusy:
+    try:
+        who = read_statistics(instance, directory.path).identity
+    except (ShmmapError, OSError):
+        who = None
+    told = f" (pid {who.pid}, listening at {who.endpoint})" if who is not None else ""
+    return InstanceBusy(
+        f"another daemon{told} has instance {instance} in {directory.path}",
+        hint="stop it, or choose another --instance or --shm-dir",
+    )
