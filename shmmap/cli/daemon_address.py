@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
 
-_DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108
-
 
 def _setting(args: argparse.Namespace, name: str) -> str:
     flag: str | None = getattr(args, name)
@@ -54,7 +52,9 @@ def _endpoint_setting(args: argparse.Namespace) -> str:
 
 def shm_dir(args: argparse.Namespace) -> str:
     """Return the directory the instance's segments are in."""
-    return _setting(args, "shm_dir") or _DEFAULT_SHM_DIR
+    from shmmap.segment.names import usual_directory
+
+    return _setting(args, "shm_dir") or usual_directory(instance(args))
 
 
 def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:

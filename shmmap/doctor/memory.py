@@ -12,6 +12,7 @@ from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.quantities import format_bytes
+from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
 __all__ = ["check_cache", "check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory"]
 
@@ -147,20 +148,31 @@ def check_memory_limit(patient: Patient) -> Finding:
 
 
 def check_huge_pages(patient: Patient) -> Finding:
-    """Are segments on huge pages?"""
-    name = "huge pages"
-    mount = _mount_of(patient.machine, patient.shm_dir)
-    huge = next((option for option in mount.options if option.startswith("huge=")), "")
-    switch = patient.machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled")
-    chosen = re.search(r"\[(\w+)\]", switch)
-    forced = chosen[1] if chosen else ""
-    if forced == "deny":
-        return ok(name, "off: the kernel denies them for shared memory")
-    if huge not in ("", "huge=never") or forced == "force":
-        return ok(name, f"on: {mount.point} has {huge or 'shmem_enabled=force'}")
-    return ok(
-        name,
-        f"off for {mount.point}",
-        "cells well above 2 MiB load and read faster with them: see"
-        " `shmmap unit print drop-ins/huge-pages.conf`",
-    )
+    """Are segments on huge pages, and does that pay on this kernel?"""
+    name, machine = "huge pages", patient.machine
+    mount = _mount_of(machine, patient.shm_dir)
+    chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
+    switch = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled"))
+    release = machine.text("/proc/sys/kernel/osrelease")
+    linux = f"Linux {kernel_version(release)}"
+    better = f"mount -o remount,huge=within_size {mount.point}"
+    if switch is None or switch[1] == "deny":
+        return ok(name, "off: the kernel has none for shared memory")
+    if switch[1] == "force":
+        return ok(name, "on: the kernel forces them on all shared memory (shmem_enabled)")
+    if chosen == "huge=always":
+        return warn(name, f"{mount.point} has {chosen}, with which some loads take longer", better)
+    if chosen == "huge=advise":
+        return ok(name, f"off: {mount.point} has {chosen}, and what is written is never advised", better)
+    if chosen == "huge=within_size" and of_all_sizes(release):
+        return ok(name, f"on: {mount.point} has {chosen}; {linux} has them for cells of all sizes")
+    if chosen == "huge=within_size":
+        return ok(name, f"on: {mount.point} has {chosen}; {linux} has them for cells well above 2 MiB alone")
+    if of_all_sizes(release):
+        return ok(
+            name,
+            f"off for {mount.point}",
+            f"on {linux} cells load in 0.6 of the time with them: `sudo shmmap unit install --huge-pages`, or"
+            f" `{better}`",
+        )
+    return ok(name, f"off for {mount.point}; {linux} would have them for cells well above 2 MiB alone")

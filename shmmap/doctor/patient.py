@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pwd
 from dataclasses import dataclass, field
@@ -11,6 +12,8 @@ from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.errors import ShmmapError
+from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import Snapshot, read_statistics
 
 __all__ = ["Machine", "Patient", "examine"]
@@ -122,6 +125,8 @@ _LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
 def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Patient:
     """Look at the machine and at what the instance's daemon tells."""
+    if config.shm_dir == DEFAULT_SHM_DIR:
+        config = dataclasses.replace(config, shm_dir=usual_directory(config.instance))
     try:
         seen, unreadable = read_statistics(config.instance, config.shm_dir), ""
     except ShmmapError as error:

@@ -16,6 +16,7 @@ from typing import Final
 from shmmap.errors import ConfigError
 
 __all__ = [
+    "HUGE_PAGES_DIR",
     "another_name",
     "check_instance",
     "is_retired",
@@ -23,7 +24,11 @@ __all__ = [
     "retired_name",
     "segment_prefix",
     "statistics_name",
+    "usual_directory",
 ]
+
+HUGE_PAGES_DIR: Final = "/run/shmmap_huge"
+"""Where ``shmmap unit install --huge-pages`` mounts a tmpfs."""
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _RETIRED: Final = ".zombie"
@@ -48,6 +53,14 @@ def segment_prefix(instance: str) -> str:
 def statistics_name(instance: str) -> str:
     """Return the name of the instance's statistics segment."""
     return f"/shmmap.{instance}.statistics"
+
+
+def usual_directory(instance: str, places: tuple[str, str] = ("/dev/shm", HUGE_PAGES_DIR)) -> str:  # noqa: S108
+    """Return where the instance's names are, for those who were not told: /dev/shm, or on huge pages."""
+    plain, huge = places
+    if os.path.exists(plain + statistics_name(instance)) or not os.path.ismount(huge):
+        return plain
+    return huge
 
 
 def new_segment_name(instance: str) -> str:

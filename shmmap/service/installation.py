@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from shmmap.errors import CannotWrite, MapMissing
+from shmmap.service.huge_pages import DROP_IN, MOUNT
 from shmmap.service.program import check_readable, daemon_command, hidden_directories, is_hidden, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
 
@@ -84,7 +85,7 @@ def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFi
     return [PlannedFile(path, f"{_GENERATED}# {why}\n[Service]\n{lines}")]
 
 
-def plan_system(map_path: str = "", root: str = "/") -> list[PlannedFile]:
+def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False) -> list[PlannedFile]:
     """Return what a service for the whole machine needs.
 
     Parameters
@@ -93,6 +94,8 @@ def plan_system(map_path: str = "", root: str = "/") -> list[PlannedFile]:
         The map of the plain service; empty: what the example says.
     root
         Where the machine's file system begins: another directory than ``/`` for a package or an image.
+    huge_pages
+        Keep the segments on a tmpfs of their own, with huge pages; kept where an earlier installation did.
 
     Raises
     ------
@@ -117,6 +120,12 @@ def plan_system(map_path: str = "", root: str = "/") -> list[PlannedFile]:
         shown = [map_path] if is_hidden(map_path) else []
         why = "The map lies where ProtectHome= or PrivateTmp= would hide it."
         planned += _drop_in(units / "shmmapd.service.d" / "20-map.conf", shown, why)
+    mount = units / Path(MOUNT).name
+    if huge_pages or mount.exists():
+        planned.append(PlannedFile(mount, shipped_text(MOUNT)))
+        for service in ("shmmapd.service", "shmmapd@.service"):
+            path = units / f"{service}.d" / "30-huge-pages.conf"
+            planned.append(PlannedFile(path, _GENERATED + shipped_text(DROP_IN)))
     for name in ("sysusers.d/shmmap.conf", "tmpfiles.d/shmmap.conf"):
         planned.append(PlannedFile(etc / name, shipped_text(name)))
     return [*planned, PlannedFile(etc / "shmmap" / "shmmap.toml", configuration(map_path), keep=True)]

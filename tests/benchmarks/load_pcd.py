@@ -5,9 +5,13 @@ Ours is everything a load is: the header's checks, column split, finite check, b
 file, checksum of every column, and a finished segment in shared memory; the peers only fill their own
 memory.  Rounds are interleaved, and ratios are medians over rounds of the times within one round.
 
-    python -m tests.benchmarks.load_pcd [--repeats 9]
+    python -m tests.benchmarks.load_pcd [--repeats 9] [--huge DIR]
 
 Where SHMMAP_TEST_DATA names a street, its map is loaded; else a cloud of the same kind is generated.
+DIR is a tmpfs with ``huge=within_size``: cells are loaded there, too, and compared with /dev/shm.  As root:
+
+    unshare -m sh -c 'mount -t tmpfs -o huge=within_size tmpfs /mnt &&
+        python -m tests.benchmarks.load_pcd --huge /mnt'
 """
 
 from __future__ import annotations
@@ -33,6 +37,7 @@ from shmmap.layers.points import build_points
 from tests.benchmarks.street_data import street
 
 SHM = "/dev/shm"
+HUGE = "shmmap, huge pages"
 CELL_M = 20.0
 ENCODINGS = ("binary", "binary_compressed")
 Round = Callable[[list[str]], float]
@@ -79,14 +84,14 @@ def timed(load: Callable[[str], object]) -> Round:
     return run
 
 
-def kept(load: Callable[[str, int], object]) -> Round:
+def kept(load: Callable[[str, int], object], directory: str = SHM) -> Round:
     """Return a round of loads into shared memory that all stay there, as the cells of a map do."""
 
     def run(paths: list[str]) -> float:
         files: list[int] = []
 
         def one(path: str) -> None:
-            files.append(os.open(SHM, os.O_TMPFILE | os.O_RDWR))
+            files.append(os.open(directory, os.O_TMPFILE | os.O_RDWR))
             load(path, files[-1])
 
         took = timed(one)(paths)
@@ -201,6 +206,7 @@ def peers(folder: Path) -> tuple[dict[str, Round], Pcl | None]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--repeats", type=int, default=7, help="interleaved rounds (default 7)")
+    parser.add_argument("--huge", metavar="DIR", help="a tmpfs with huge pages")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="load_pcd."))
     pcl = None
@@ -213,6 +219,8 @@ def main() -> int:
                 rounds["pread + pwrite"] = kept(copy)
             else:
                 rounds["bare lzf.decompress"] = bare_lzf
+            if options.huge:
+                rounds[HUGE] = kept(ours, options.huge)
             rounds |= others
             times: dict[str, list[float]] = {name: [] for name in rounds}
             for turn in range(options.repeats + 1):
@@ -236,8 +244,23 @@ def report(encoding: str, paths: list[str], times: dict[str, list[float]]) -> No
         ratios = [mine / other for mine, other in zip(times["shmmap"], values, strict=True)]
         ratio = float(np.median(ratios))
         limit = limits.get(name, 1.0)
-        verdict = "" if name == "shmmap" else f"   limit {limit:.2f}: {'met' if ratio <= limit else 'MISSED'}"
+        verdict = (
+            ""
+            if name in ("shmmap", HUGE)
+            else f"   limit {limit:.2f}: {'met' if ratio <= limit else 'MISSED'}"
+        )
         print(f"  {name:22s} {np.median(values) * 1e3:8.1f} ms   shmmap takes {ratio:5.2f} of it{verdict}")
+    if HUGE in times:
+        compare_huge(times)
+
+
+def compare_huge(times: dict[str, list[float]]) -> None:
+    """Loads on huge pages against 4 KiB pages; compressed ones, which mostly compute, against the least."""
+    other, limit = ("bare lzf.decompress", 1.5) if "bare lzf.decompress" in times else ("shmmap", 0.6)
+    ratio = float(np.median(np.divide(times[HUGE], times[other])))
+    print(
+        f"  {HUGE} takes {ratio:5.2f} of {other}   limit {limit:.2f}: {'met' if ratio <= limit else 'MISSED'}"
+    )
 
 
 if __name__ == "__main__":

@@ -390,30 +390,35 @@ def test_the_doctor_tells_each_user_what_is_wrong(fresh: BootedSystemd) -> None:
 
 
 def test_segments_on_huge_pages(fresh: BootedSystemd) -> None:
-    """As the operator's guide says it, with the files that come with the package."""
-    print_file = [sys.executable, "-m", "shmmap.cli", "unit", "print"]
-    mount = fresh.run(*print_file, "system/run-shmmap_huge.mount").stdout
-    drop_in = fresh.run(*print_file, "drop-ins/huge-pages.conf").stdout
-    fresh.shell(f"""
-        cat >/run/systemd/system/run-shmmap_huge.mount <<'END'
-{mount}END
-        mkdir -p /run/systemd/system/shmmapd.service.d
-        cat >/run/systemd/system/shmmapd.service.d/huge-pages.conf <<'END'
-{drop_in}END
-        systemctl daemon-reload
-    """)
+    """As `unit install --huge-pages` says it; a later install without it keeps them."""
+    done = shmmap(fresh, "unit", "install", "--map", MAP, "--huge-pages")
+    if "no huge pages" in done.stderr:
+        pytest.skip("this kernel has no huge pages for tmpfs")
     try:
-        if fresh.run("systemctl", "start", "run-shmmap_huge.mount", check=False).returncode:
-            pytest.skip("this kernel has no huge pages for tmpfs")
+        assert done.returncode == 0, done.stderr
+        assert "new" in next(line for line in done.stdout.splitlines() if "run-shmmap_huge.mount" in line)
         fresh.run("systemctl", "start", "shmmapd")
         with Client(fresh, "alice") as alice:
             assert len(alice.ask()) == 12
-        assert (len(segments(fresh)), len(segments(fresh, at="/run/shmmap_huge"))) == (0, 12)
+            names = segments(fresh, at="/run/shmmap_huge")
+            assert (len(segments(fresh)), len(names)) == (0, 12)
         assert fresh.run("ls", "/run/shmmap_huge", user="mallory", check=False).returncode != 0
+        options = fresh.shell("grep ' /run/shmmap_huge ' /proc/mounts").split()[3].split(",")
+        assert {"huge=within_size", "mode=750", "nosuid", "nodev", "noexec"} <= set(options)
+        # who asks nobody finds it, too
+        assert "/run/shmmap_huge" in shmmap(fresh, "status", user="alice").stdout
+        told = json.loads(shmmap(fresh, "doctor", "--json", user="alice").stdout)
+        (about,) = [one for one in told["findings"] if one["name"] == "huge pages"]
+        assert about["fact"].startswith("on: /run/shmmap_huge has huge=within_size")
+        again = shmmap(fresh, "unit", "install").stdout.splitlines()
+        kept = [line.split()[1] for line in again if line.startswith("same ")]
+        assert "/etc/systemd/system/run-shmmap_huge.mount" in kept
+        assert "/etc/systemd/system/shmmapd@.service.d/30-huge-pages.conf" in kept
     finally:
         fresh.shell("""
             systemctl stop shmmapd run-shmmap_huge.mount
-            rm /run/systemd/system/run-shmmap_huge.mount
+            rm /etc/systemd/system/run-shmmap_huge.mount /etc/systemd/system/*/30-huge-pages.conf
+            rmdir /run/shmmap_huge
         """)
 
 

@@ -154,21 +154,39 @@ def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (found.state, "--shm-size" in found.advice, "--ipc=host" in found.advice) == ("warn", True, True)
 
 
+NEW, OLD = "6.14.0-rc1-x", "6.13.12"
+
+
 @pytest.mark.parametrize(
-    ("options", "switch", "fact"),
+    ("options", "switch", "release", "state", "fact", "advice"),
     [
-        ("rw,huge=within_size", "always within_size advise [never] deny force", "on:"),
-        ("rw,huge=never", "always within_size advise [never] deny force", "off for"),
-        ("rw", "", "off for"),
-        ("rw", "always within_size advise never deny [force]", "on:"),
-        ("rw,huge=always", "always within_size advise never [deny] force", "off: the kernel"),
+        ("rw,huge=within_size", "never", NEW, "ok", "on: /dev/shm has huge=within_size; Linux 6.14", ""),
+        ("rw,huge=within_size", "never", OLD, "ok", "on: /dev/shm has huge=within_size; Linux 6.13", ""),
+        ("rw,huge=within_size", "never", "7.0.1", "ok", "on: /dev/shm has huge=within_size; Linux 7.0", ""),
+        ("rw", "never", NEW, "ok", "off for /dev/shm", "unit install --huge-pages"),
+        ("rw,huge=never", "never", NEW, "ok", "off for /dev/shm", "remount,huge=within_size /dev/shm"),
+        ("rw", "never", OLD, "ok", "off for /dev/shm; Linux 6.13", ""),
+        ("rw", "never", "", "ok", "off for /dev/shm", ""),
+        ("rw,huge=advise", "never", NEW, "ok", "off: /dev/shm has huge=advise", "remount"),
+        ("rw,huge=always", "never", NEW, "warn", "/dev/shm has huge=always", "remount"),
+        ("rw", "force", OLD, "ok", "on: the kernel forces", ""),
+        ("rw,huge=within_size", "deny", NEW, "ok", "off: the kernel has none", ""),
+        ("rw", "", NEW, "ok", "off: the kernel has none", ""),
     ],
 )
-def test_huge_pages(ward: Ward, options: str, switch: str, fact: str) -> None:
+def test_huge_pages(
+    ward: Ward, options: str, switch: str, release: str, state: str, fact: str, advice: str
+) -> None:
     ward.file("/proc/self/mounts", f"tmpfs /dev/shm tmpfs {options} 0 0\n")
-    ward.file("/sys/kernel/mm/transparent_hugepage/shmem_enabled", switch)
+    ward.file("/proc/sys/kernel/osrelease", release + "\n")
+    choices = "always within_size advise never deny force ".replace(f"{switch} ", f"[{switch}] ")
+    if switch:
+        ward.file("/sys/kernel/mm/transparent_hugepage/shmem_enabled", choices)
     found = memory.check_huge_pages(ward.patient())
-    assert (found.state, found.fact.startswith(fact)) == ("ok", True)
+    assert (found.state, found.fact.startswith(fact)) == (state, True), found
+    assert (advice in found.advice) if advice else not found.advice, found
+    if "within_size;" in found.fact:
+        assert ("for cells of all sizes" in found.fact) == (release != OLD)
 
 
 # --- kernel ---

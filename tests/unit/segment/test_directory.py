@@ -18,6 +18,7 @@ from shmmap.segment.names import (
     retired_name,
     segment_prefix,
     statistics_name,
+    usual_directory,
 )
 from tests.unit.segment.conftest import Publish
 
@@ -104,3 +105,17 @@ def test_unusable_instance_names(name: str) -> None:
 @pytest.mark.parametrize("name", ["default", "A-1_b", "x" * 64])
 def test_usable_instance_names(name: str) -> None:
     assert check_instance(name) == name
+
+
+def test_where_names_are_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On huge pages where such a file system is mounted, unless the instance is in /dev/shm."""
+    plain, huge = tmp_path / "plain", tmp_path / "huge"
+    places = str(plain), str(huge)
+    plain.mkdir()
+    huge.mkdir()
+    assert usual_directory("unit", places) == str(plain)
+    monkeypatch.setattr("os.path.ismount", lambda path: path == str(huge))
+    assert usual_directory("unit", places) == str(huge)
+    (plain / "shmmap.unit.statistics").touch()
+    assert usual_directory("unit", places) == str(plain)
+    assert usual_directory("another", places) == str(huge)

@@ -12,7 +12,9 @@ import pytest
 
 from shmmap.cli.entry import main
 from shmmap.errors import BadRequest, ConfigError, MapMissing
+from shmmap.segment.names import HUGE_PAGES_DIR
 from shmmap.service import installation, program
+from shmmap.service.huge_pages import check_possible
 from shmmap.service.installation import PlannedFile, configuration, plan_system, plan_user, unit_text, write
 from shmmap.service.program import daemon_command, hidden_directories, outermost, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
@@ -72,6 +74,36 @@ def test_a_map_and_what_would_hide_it(tmp_path: Path, monkeypatch: pytest.Monkey
         assert config == {"map_path": str(the_map), "group": "shmmap"}
     with pytest.raises(MapMissing, match="no-map"):
         plan_system(str(tmp_path / "no-map"), str(tmp_path))
+
+
+def test_huge_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert not any("huge" in one.path.name for one in plan_system(root=str(tmp_path)))
+    assert main(["unit", "install", "--root", str(tmp_path), "--huge-pages"]) == 0
+    units = tmp_path / "etc/systemd/system"
+    mount = (units / "run-shmmap_huge.mount").read_text()
+    assert f"\nWhere={HUGE_PAGES_DIR}\n" in mount
+    assert "\nOptions=huge=within_size,size=50%%," in mount
+    for service in ("shmmapd.service", "shmmapd@.service"):
+        drop_in = (units / f"{service}.d" / "30-huge-pages.conf").read_text()
+        for line in ("RequiresMountsFor=", "ReadWritePaths=", "Environment=SHMMAP_SHM_DIR="):
+            assert f"\n{line}{HUGE_PAGES_DIR}\n" in drop_in
+    assert sum("huge" in one.path.name for one in plan_system(root=str(tmp_path))) == 3, (
+        "an upgrade keeps them"
+    )
+    assert "systemctl stop" not in capsys.readouterr().out
+    assert main(["unit", "install", "--user", "--huge-pages", "--dry-run"]) == 2
+    assert "mount -o remount,huge=within_size /dev/shm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("switch", ["always within_size advise never [deny] force", ""])
+def test_huge_pages_that_the_kernel_lacks(tmp_path: Path, switch: str) -> None:
+    path = tmp_path / "shmem_enabled"
+    if switch:
+        path.write_text(switch)
+    with pytest.raises(ConfigError, match="no huge pages"):
+        check_possible(user=False, switch=str(path))
+    path.write_text("always within_size advise [never] deny force")
+    check_possible(user=False, switch=str(path))
 
 
 def test_a_user_s_service(tmp_path: Path) -> None:
