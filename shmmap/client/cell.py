@@ -35,7 +35,8 @@ class Cell:
         The id without what the ids of all cells of the map begin with, as a rule the file's name
         (``"120_40.pcd"``): for people to read, and good wherever an id is asked for.
     version : int
-        64-bit hash of the id and the source's stamp; another one after any rewrite of the file.
+        Names the bytes: a 64-bit hash of the id, the box and the source's state, and for computed layers of
+        how and from what they are computed.
     layer : str
         ``"points"`` is the source itself.
     box : tuple of float

@@ -201,7 +201,7 @@ class Client(OperatorRequests):
         """
         specs = several(layers)
         message = messages.area_to_message(area)
-        mine = HeldCells(held, specs, by_name=by_name)
+        mine = HeldCells(held, by_name=by_name)
         return self._session.ask_cells(
             lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, intent),
             wait,

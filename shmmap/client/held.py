@@ -20,8 +20,8 @@ Held: TypeAlias = Cell | HeldCell | str | tuple[str, int]
 class HeldCells:
     """Held cells in wire form.
 
-    Cells held in every layer asked for travel as 8 bytes of version each (``packed``), unless the
-    daemon may not know what a version means any more (``by_name``); others by name.
+    Attached cells travel as 8 bytes of version each (``packed``), unless the daemon may not know what a
+    version means any more (``by_name``); others by name.
 
     Attributes
     ----------
@@ -31,39 +31,37 @@ class HeldCells:
         The rest.
     """
 
-    def __init__(self, held: Iterable[Held], layers: Sequence[str], *, by_name: bool = False) -> None:
-        self._order: dict[str, int | None] = {}
-        cells: dict[tuple[str, int], list[str]] = {}
+    def __init__(self, held: Iterable[Held], *, by_name: bool = False) -> None:
+        self._packed: dict[str, list[int]] = {}
+        self._order: dict[str, None] = {}
         named: list[HeldCell] = []
         for one in held:
             if isinstance(one, Cell):
-                cells.setdefault((one.id, one.version), []).append(one.layer)
-                self._order.setdefault(one.id, one.version)
+                self._order[one.id] = None
+                if by_name:
+                    named.append(HeldCell(one.id, one.version, (one.layer,)))
+                else:
+                    self._packed.setdefault(one.id, []).append(one.version)
                 continue
             if isinstance(one, str):
                 one = HeldCell(one)
             elif isinstance(one, tuple):
                 one = HeldCell(one[0], one[1])
-            self._order.setdefault(one.id, one.version)
+            self._order[one.id] = None
             named.append(one)
-        versions: list[int] = []
-        wanted = set(layers)
-        for (cell_id, version), held_layers in cells.items():
-            if not by_name and wanted.issubset(held_layers):
-                versions.append(version)
-            else:
-                named.append(HeldCell(cell_id, version, tuple(dict.fromkeys(held_layers))))
+        versions = [version for some in self._packed.values() for version in some]
         self.packed = np.array(versions, "<u8").tobytes() if versions else b""
         self.named = tuple(named)
 
     def removed(self, ids: Sequence[str], packed: bytes) -> tuple[str, ...]:
-        """Ids to drop, in the order they were given, from a reply's two lists."""
+        """Ids to drop, in the order they were given, from a reply's two lists.
+
+        Of a cell that is held in several layers, all have to go: where the daemon does not know one
+        version any more, that layer comes again, and the others stay.
+        """
         if not packed:
             return tuple(ids)
-        gone_versions = set(np.frombuffer(packed, "<u8").tolist())
+        gone = set(np.frombuffer(packed, "<u8").tolist())
         gone_ids = set(ids)
-        return tuple(
-            cell_id
-            for cell_id, version in self._order.items()
-            if cell_id in gone_ids or version in gone_versions
-        )
+        gone_ids.update(cell_id for cell_id, versions in self._packed.items() if gone.issuperset(versions))
+        return tuple(cell_id for cell_id in self._order if cell_id in gone_ids)

@@ -29,7 +29,7 @@ class CellInfo(NamedTuple):
     """One cell of the map; loaded or not.
 
     ``box`` is (min_x, min_y, max_x, max_y), metres, map frame; ``z_bounds`` is None until the cell
-    was first loaded; ``source_bytes`` is the size of its file.
+    was first loaded; ``source_bytes`` is the size of its file, ``version`` that of its ``points``.
     """
 
     id: str

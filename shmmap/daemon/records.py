@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import Stamp
 
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired"]
 
@@ -68,7 +68,8 @@ class Load:
 
     ``adopted`` is a segment of an earlier life that only has to be checked, ``unless`` the state of a file
     that could not be loaded: in that state it is not tried again.  ``wanted`` says that somebody asked for
-    it, ``sources`` what the catalogue knew of its file and its neighbours' when a worker was given the job.
+    it, ``sources`` and ``version`` what the catalogue knew of its file and its neighbours', and which version
+    that makes, when a worker was given the job.
     """
 
     key: Key
@@ -80,9 +81,10 @@ class Load:
     reserved: int = 0
     started_s: float = 0.0
     adopted: Resident | None = None
-    unless: SourceStamp | None = None
+    unless: Stamp | None = None
     wanted: bool = True
-    sources: tuple[SourceStamp, ...] = ()
+    sources: tuple[Stamp, ...] = ()
+    version: int = 0
 
 
 @dataclass(slots=True)
@@ -95,6 +97,6 @@ class Failure:
 
     code: str
     message: str
-    stamp: SourceStamp | None
+    stamp: Stamp | None
     retry_at_s: float
     delay_s: float

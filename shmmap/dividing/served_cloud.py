@@ -34,7 +34,6 @@ from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.map_origin import MapOrigin
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.origin.single_pcd import is_served_whole
-from shmmap.origin.stamp import Stamp
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
@@ -117,9 +116,10 @@ class DividedCloud:
             The cloud is not there, cannot be read, or does not fit in the cache.
         """
         try:
-            stamp = Stamp.of(os.stat(self.path))
+            status = os.stat(self.path)
         except OSError as error:
             raise MapMissing(f"cannot read {self.path}: {error.strerror}") from error
+        stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
         name = xxh3_64_hexdigest(json.dumps([_RECIPE, *stamp]).encode())
         out = os.path.join(self._directory, name)
         link = os.path.join(self._directory, LINK_NAME)

@@ -5,29 +5,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import xxhash
 
 from shmmap.layers.build import build_spec
 from shmmap.layers.contract import Box
+from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource, read_halo, read_source
 from shmmap.layers.spec import LayerSpec
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.table_writer import SegmentOrigin, write_table
+from shmmap.segment.version import cell_version, layer_version
 
-__all__ = ["CellJob", "Derived", "combined_digest", "derive"]
+__all__ = ["CellJob", "Derived", "Neighbour", "combined_digest", "derive"]
+
+
+class Neighbour(NamedTuple):
+    """A cell that a layer of another one looks into; its file's path is its id, ``box`` in metres."""
+
+    path: str
+    box: Box
 
 
 @dataclass(frozen=True, slots=True)
 class CellJob:
-    """Which cell: id, source file, box (metres), frame, and its neighbours' files for a layer with a halo."""
+    """Which cell: id, source file, box (metres), frame, and for a layer with a halo the cells around it."""
 
     cell_id: str
     path: str
     box: Box
     frame_id: str = "map"
-    neighbours: tuple[str, ...] = ()
+    neighbours: tuple[Neighbour, ...] = ()
+
+    def version(self, spec: LayerSpec, source: SourceStamp, around: Sequence[SourceStamp]) -> int:
+        """Version of a layer of the cell for these states of its file and of its neighbours'."""
+        cell = cell_version(self.cell_id, source.token, self.box)
+        if spec.kind.name == LAYER:
+            return cell
+        near = [
+            cell_version(one.path, stamp.token, one.box)
+            for one, stamp in zip(self.neighbours, around, strict=True)
+        ]
+        return layer_version(cell, str(spec), spec.builder_version, near)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +99,9 @@ def derive(
     points = source.points
     around: tuple[tuple[SourceStamp, bytes], ...] = ()
     if job.neighbours:
-        points.halo, around = read_halo(job.neighbours, job.box, spec.halo_m, points.xyz.dtype)
+        points.halo, around = read_halo(
+            [near.path for near in job.neighbours], job.box, spec.halo_m, points.xyz.dtype
+        )
     table = build_spec(spec, points)
     header = write_table(
         fd,

@@ -3,12 +3,12 @@
 
 An entry is the bytes of a segment, its publish block empty.  It has two names, both hard links to one
 file: one for the *content* it was computed from (digest of the source, layer, builder version, box),
-one for the *state* of the files it was found for (cell, stamps).  Loading asks by state and reads no
+one for the *version* that the layer of the cell has.  Loading asks by version and reads no
 source; where a map was copied or touched, `LayerCache.recognise` finds the entry by content and gives
-it its new state.  ::
+it its new version.  ::
 
     DIRECTORY/layers/content/ab/<digest><hash>.layer
-    DIRECTORY/layers/state/cd/<hash>.layer
+    DIRECTORY/layers/version/cd/<version>.layer
 
 Entries appear whole, by renaming; nothing is synced, since every column is compared with its checksum
 when it is loaded, and an entry that does not match is removed and built anew.  Entries that others could
@@ -66,8 +66,8 @@ class LayerCache:
         self.stored_bytes = 0
         self.writable = True
 
-    def _state_path(self, name: str) -> str:
-        return os.path.join(self.directory, "state", name[:2], f"{name}.layer")
+    def _version_path(self, name: str) -> str:
+        return os.path.join(self.directory, "version", name[:2], f"{name}.layer")
 
     def _content_path(self, name: str) -> str:
         return os.path.join(self.directory, "content", name[:2], f"{name}.layer")
@@ -75,11 +75,11 @@ class LayerCache:
     # --- looking --------------------------------------------------------------------------------
 
     def has(self, key: CacheKey) -> bool:
-        """Whether there is an entry for this state, whole by its header and size."""
+        """Whether there is an entry for this version, whole by its header and size."""
         return self.size_of(key) > 0
 
     def size_of(self, key: CacheKey) -> int:
-        """Bytes of the entry for this state; 0 where there is none."""
+        """Bytes of the entry for this version; 0 where there is none."""
         opened = self._open(key)
         if opened is None:
             return 0
@@ -87,7 +87,7 @@ class LayerCache:
         return opened[1].total_bytes
 
     def _open(self, key: CacheKey) -> tuple[int, SegmentHeader] | None:
-        path = self._state_path(key.state_name())
+        path = self._version_path(key.version_name())
         try:
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
         except OSError:
@@ -134,7 +134,7 @@ class LayerCache:
         entry, found = opened
         try:
             header = msgspec.structs.replace(
-                found, cell_id=key.cell_id, frame_id=key.frame_id, source=key.stamp
+                found, cell_id=key.job.cell_id, frame_id=key.job.frame_id, source=key.source
             )
             needed = header_size(len(header.columns), header.cell_id, header.layer, header.frame_id)
             if needed != found.header_bytes:
@@ -143,7 +143,7 @@ class LayerCache:
                 reserve(header.total_bytes)
             os.ftruncate(fd, header.total_bytes)
             if not _copy_columns(entry, fd, header):
-                self._remove(self._state_path(key.state_name()))
+                self._remove(self._version_path(key.version_name()))
                 self._remove(self._content_path(key.content_name(header.source_digest)))
                 os.ftruncate(fd, 0)
                 return None
@@ -153,9 +153,9 @@ class LayerCache:
             os.close(entry)
 
     def recognise(self, key: CacheKey, digest: bytes) -> bool:
-        """Give an entry computed from the same content, if there is one, the name of this state."""
+        """Give an entry computed from the same content, if there is one, the name of this version."""
         with contextlib.suppress(OSError):
-            self._link(self._content_path(key.content_name(digest)), self._state_path(key.state_name()))
+            self._link(self._content_path(key.content_name(digest)), self._version_path(key.version_name()))
         return self.has(key)
 
     @property
@@ -205,13 +205,13 @@ class LayerCache:
                 os.fchmod(interim_fd, 0o644)
             finally:
                 os.close(interim_fd)
-            state = self._state_path(key.state_name())
+            version = self._version_path(key.version_name())
             content = self._content_path(key.content_name(header.source_digest))
-            with contextlib.suppress(OSError):  # a file system without hard links: found by state alone
+            with contextlib.suppress(OSError):  # a file system without hard links: found by version alone
                 self._remove(content)
                 self._link(interim, content)
-            os.makedirs(os.path.dirname(state), mode=0o755, exist_ok=True)
-            os.rename(interim, state)
+            os.makedirs(os.path.dirname(version), mode=0o755, exist_ok=True)
+            os.rename(interim, version)
         except BaseException:
             with contextlib.suppress(OSError):
                 os.unlink(interim)
@@ -265,7 +265,7 @@ class LayerCache:
 def _is_of(header: SegmentHeader, key: CacheKey) -> bool:
     """Whether an entry is what its name says; a cell's id may differ: a copied map's entries are used."""
     same_layer = header.layer == str(key.spec) and header.builder_version == key.spec.builder_version
-    return same_layer and header.box == key.box
+    return same_layer and header.box == key.job.box
 
 
 def _read_header(fd: int, available: int) -> SegmentHeader:

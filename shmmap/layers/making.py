@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from shmmap.layers.cache_key import CacheKey, neighbour_states
+from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.derive import CellJob, derive
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER, build_points
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import CellSource, state_of
 from shmmap.layers.spec import LayerSpec
 from shmmap.logfmt import log
-from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.layout import NO_SOURCE, SegmentHeader, SourceStamp
 
 __all__ = ["Made", "cache_key", "make_layer"]
 
@@ -26,6 +25,8 @@ class Made:
 
     Attributes
     ----------
+    version
+        Of the layer, for the states of the files that it was made from.
     neighbours
         States of the neighbours' files that it stands for.
     cached
@@ -33,6 +34,7 @@ class Made:
     """
 
     header: SegmentHeader
+    version: int
     neighbours: tuple[SourceStamp, ...] = ()
     warnings: tuple[str, ...] = ()
     cached: bool = False
@@ -40,11 +42,10 @@ class Made:
 
 def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
     """Key of a layer for the files as they are now; None where the cell's own cannot be looked at."""
-    try:
-        stamp = SourceStamp.of(os.stat(job.path))
-    except OSError:
+    source = state_of(job.path)
+    if source is NO_SOURCE:
         return None
-    return CacheKey(spec, job.cell_id, job.box, job.frame_id, stamp, neighbour_states(job.neighbours))
+    return CacheKey(spec, job, source, tuple(state_of(near.path) for near in job.neighbours))
 
 
 def make_layer(
@@ -81,7 +82,7 @@ def make_layer(
     if cache is not None and key is not None:
         header = cache.load(key, fd, reserve=reserve)
         if header is not None:
-            return Made(header, tuple(stamp for _, stamp in key.neighbours), cached=True)
+            return Made(header, key.version, key.neighbours, cached=True)
     if spec.kind.name == LAYER:
         warnings: list[str] = []
         header = build_points(
@@ -93,13 +94,13 @@ def make_layer(
             reserve=reserve,
             warn=warnings.append,
         )
-        made = Made(header, warnings=tuple(warnings))
+        made = Made(header, job.version(spec, header.source, ()), warnings=tuple(warnings))
     else:
         derived = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
-        made = Made(derived.header, derived.neighbours, derived.warnings)
+        version = job.version(spec, derived.header.source, derived.neighbours)
+        made = Made(derived.header, version, derived.neighbours, derived.warnings)
     if keep and cache is not None and key is not None:
-        states = tuple(zip(job.neighbours, made.neighbours, strict=True))
-        _keep(cache, replace(key, stamp=made.header.source, neighbours=states), made.header, fd)
+        _keep(cache, CacheKey(spec, job, made.header.source, made.neighbours), made.header, fd)
     return made
 
 

@@ -18,7 +18,7 @@ from shmmap.layers.contract import Box, PointTable
 from shmmap.segment.layout import NO_SOURCE, SourceStamp
 from shmmap.segment.verify import read_header
 
-__all__ = ["CellSource", "read_halo", "read_segment", "read_source"]
+__all__ = ["CellSource", "read_halo", "read_segment", "read_source", "state_of"]
 
 
 @dataclass(slots=True)
@@ -122,7 +122,7 @@ def read_halo(
     found: list[NDArray[Any]] = [np.empty((0, 3), dtype)]
     seen: list[tuple[SourceStamp, bytes]] = []
     for path in paths:
-        before = _stamp(path)  # afterwards it may be that of a file that nobody has read
+        before = state_of(path)  # afterwards it may be that of a file that nobody has read
         try:
             source = read_source(path, box, ("xyz",))
         except MapDataError:
@@ -138,7 +138,8 @@ def read_halo(
     return np.concatenate(found), tuple(seen)
 
 
-def _stamp(path: str) -> SourceStamp:
+def state_of(path: str) -> SourceStamp:
+    """Return the state of a file as it is now; zeros where it cannot be looked at."""
     try:
         return SourceStamp.of(os.stat(path))
     except OSError:

@@ -1,30 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Versions of computed layers: the cell's own, and for a layer with a halo its neighbours' as well."""
+"""Versions of the layers of a map's cells, and which cells a layer looks into.
+
+A layer with a halo has its neighbours in its version.  Finding them takes some 40 us, so those versions are
+remembered until one of the cells changes, and whoever needs many asks first how many are `unknown`.
+"""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from xxhash import xxh3_64_intdigest
 
+from shmmap.errors import BadRequest
 from shmmap.geometry import Area, Box
+from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
+from shmmap.segment.version import layer_version
 
 __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 
 MAX_NEIGHBOURS: Final = 64
 """Most files that a layer with a halo reads beside its own."""
 MOST_REMEMBERED: Final = 1 << 18
-"""Versions, about 200 bytes each; whoever asks for ever new layers must not fill the daemon's memory."""
+"""Versions, about 100 bytes each; whoever asks for ever new layers must not fill the daemon's memory."""
+
+
+_SLACK_M: Final = 1e-3
+"""Cells are looked for a little farther than a halo reaches, and then compared as `neighbours` does it."""
 
 
 class Cells(Protocol):
     """What is asked of a map's catalogue: its cells by index."""
+
+    def __len__(self) -> int:
+        """How many cells there are."""
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Box around all cells, metres, map frame; None where there are none."""
+
+    @property
+    def mean_size(self) -> tuple[float, float]:
+        """Mean extent of the cells along x and y, metres."""
+
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame."""
 
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
@@ -36,10 +60,17 @@ class Cells(Protocol):
         """Cells whose box touches ``area``, ascending."""
 
 
+class _Kind(NamedTuple):
+    """What a layer's versions depend on beside cells."""
+
+    builder_version: int
+    halo_m: float
+
+
 @lru_cache(maxsize=4096)
-def _halo_m(layer: str) -> float:
-    """How far beyond a cell a layer looks, metres."""
-    return layer_spec(layer).halo_m
+def _kind(layer: str) -> _Kind:
+    spec = layer_spec(layer)
+    return _Kind(spec.builder_version, spec.halo_m)
 
 
 class LayerVersions:
@@ -53,35 +84,109 @@ class LayerVersions:
 
     def __init__(self, catalogue: Callable[[], Cells]) -> None:
         self._catalogue = catalogue
-        self._versions: dict[tuple[int, str], int] = {}
+        self._known: dict[str, dict[int, int]] = {}  # by layer with a halo, by cell
+        self._count = 0
 
     def version(self, index: int, layer: str) -> int:
-        """Current version of one layer of a cell.
-
-        It is the cell's own (`shmmap.origin.stamp.cell_version`) unless the layer has a halo: then
-        the XXH3-64 of it and of the neighbours' versions in id order, as u64.
-        """
-        if not _halo_m(layer):
-            return self._catalogue().version(index)
-        version = self._versions.get((index, layer))
+        """Current version of one layer of a cell, see `shmmap.segment.version`."""
+        cell = self._catalogue().version
+        if layer == LAYER:
+            return cell(index)
+        kind = _kind(layer)
+        if not kind.halo_m:
+            return layer_version(cell(index), layer, kind.builder_version)
+        known = self._known.get(layer)
+        version = known.get(index) if known is not None else None
         if version is None:
-            own = self._catalogue().version
-            cells = [index, *self.neighbours(index, layer)]
-            version = xxh3_64_intdigest(struct.pack(f"<{len(cells)}Q", *map(own, cells)))
-            if len(self._versions) >= MOST_REMEMBERED:
-                self._versions.clear()
-            self._versions[index, layer] = version
+            around = self.neighbours(index, layer)
+            version = layer_version(cell(index), layer, kind.builder_version, list(map(cell, around)))
+            self._remember(index, layer, version)
         return version
 
+    def unknown(self, indices: Iterable[int], layers: Iterable[str]) -> Iterator[tuple[int, str]]:
+        """Cells and layers whose `version` would take long now: neighbours have to be found."""
+        for layer in layers:
+            if _kind(layer).halo_m:
+                known = self._known.get(layer, {})
+                yield from ((index, layer) for index in indices if index not in known)
+
     def neighbours(self, index: int, layer: str) -> list[int]:
-        """Catalogue indices of the cells that a layer of this one looks into, ascending."""
-        halo = _halo_m(layer)
-        if not halo:
-            return []
+        """Catalogue indices of the cells that a layer of this one looks into, ascending.
+
+        Of more than `MAX_NEIGHBOURS` the first ones, one more than that: such a layer cannot be made.
+        """
+        halo_m = _kind(layer).halo_m
+        return self._around(index, halo_m)[: MAX_NEIGHBOURS + 1].tolist() if halo_m else []
+
+    def _around(self, index: int, halo_m: float) -> NDArray[np.intp]:
         min_x, min_y, max_x, max_y = self._catalogue().box(index)
-        area = Box(min_x - halo, min_y - halo, max_x + halo, max_y + halo)
-        return [found for found in self._catalogue().query(area).tolist() if found != index]
+        found = self._catalogue().query(Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m))
+        return np.delete(found, found == index)
+
+    def check_reach(self, layer: str) -> None:
+        """Refuse a layer that would look into too many cells of this map.
+
+        Judged by the mean cell, had the map cells everywhere within its bounds.  A single cell with too
+        many others around it passes here, and cannot be loaded.
+
+        Raises
+        ------
+        BadRequest
+            They would be more than `MAX_NEIGHBOURS`.
+        """
+        halo_m = _kind(layer).halo_m
+        if not halo_m:
+            return
+        cells = self._catalogue()
+        bounds = cells.bounds
+        if bounds is None:
+            return
+        around = float(len(cells))
+        for low, high, mean in zip(bounds[:2], bounds[2:], cells.mean_size, strict=True):
+            if high > low:
+                around *= min(1.0, 2 * (mean + halo_m) / (high - low))
+        if around > MAX_NEIGHBOURS + 1:
+            raise BadRequest(
+                f"{layer} would look into about {around:.0f} cells around each one of this map;"
+                f" {MAX_NEIGHBOURS} is the most",
+                hint="use a smaller radius, or larger cells",
+            )
+
+    # --- changes --------------------------------------------------------------------------------
+
+    def dependents(self, index: int, layers: Iterable[str]) -> Iterator[tuple[str, list[int]]]:
+        """For each of these layers, the cells whose version has this one's in it, itself first."""
+        halos = [(layer, _kind(layer).halo_m) for layer in layers]
+        widest_m = max((halo_m for _, halo_m in halos), default=0.0)
+        around = self._around(index, widest_m + _SLACK_M) if widest_m else np.zeros(0, np.intp)
+        boxes, (min_x, min_y, max_x, max_y) = self._catalogue().boxes[around], self._catalogue().box(index)
+        for layer, halo_m in halos:
+            near = around[:0]
+            if halo_m:
+                looks = (boxes[:, 0] - halo_m <= max_x) & (boxes[:, 2] + halo_m >= min_x)
+                near = around[looks & (boxes[:, 1] - halo_m <= max_y) & (boxes[:, 3] + halo_m >= min_y)]
+            yield layer, [index, *near.tolist()]
+
+    def _remember(self, index: int, layer: str, version: int) -> None:
+        if self._count >= MOST_REMEMBERED:
+            oldest, known = next(iter(self._known.items()))
+            known.popitem()
+            self._count -= 1
+            if not known:
+                del self._known[oldest]
+        self._known.setdefault(layer, {})[index] = version
+        self._count += 1
+
+    def cell_changed(self, index: int) -> None:
+        """A cell has another version: so have the layers that look into it."""
+        for layer, cells in self.dependents(index, list(self._known)):
+            known = self._known[layer]
+            for cell in cells:
+                self._count -= known.pop(cell, None) is not None
+            if not known:
+                del self._known[layer]
 
     def forget(self) -> None:
-        """A stamp or the catalogue has changed."""
-        self._versions.clear()
+        """Indices mean other cells from now on."""
+        self._known.clear()
+        self._count = 0

@@ -16,7 +16,8 @@ from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.cell_names import CellNames
 from shmmap.origin.spatial_index import SpatialIndex
-from shmmap.origin.stamp import Stamp, cell_version
+from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import Stamp, cell_version
 
 __all__ = ["Catalogue", "CatalogueChange", "compare"]
 
@@ -73,7 +74,7 @@ class Catalogue:
             )
         self._index = SpatialIndex(boxes)
         self._stamps = stamps
-        self._versions: dict[int, int] = {}
+        self._versions = np.zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
         self._fixed_digest = 0
         self._map_version: int | None = None
@@ -82,7 +83,7 @@ class Catalogue:
     @classmethod
     def from_cells(
         cls,
-        cells: Iterable[tuple[str, tuple[float, float, float, float], Stamp]],
+        cells: Iterable[tuple[str, tuple[float, float, float, float], SourceStamp]],
         problems: Sequence[str] = (),
     ) -> Catalogue:
         """Build from (id, box, stamp) of each cell, in any order; ids are absolute paths."""
@@ -125,6 +126,14 @@ class Catalogue:
         max_x, max_y = self.boxes[:, 2:].max(axis=0).tolist()
         return min_x, min_y, max_x, max_y
 
+    @cached_property
+    def mean_size(self) -> tuple[float, float]:
+        """Mean extent of the cells along x and y, metres."""
+        if not len(self):
+            return 0.0, 0.0
+        x, y = (self.boxes[:, 2:] - self.boxes[:, :2]).mean(axis=0).tolist()
+        return x, y
+
     @property
     def stamps(self) -> NDArray[np.int64]:
         """(N, 3) int64, size in bytes, mtime_ns, ctime_ns; written by `set_stamp` only."""
@@ -133,7 +142,7 @@ class Catalogue:
     @property
     def nbytes(self) -> int:
         """Memory of the tables (names, boxes, stamps, index), without lazily built lookups."""
-        return int(self.names.nbytes + self._stamps.nbytes) + self._index.nbytes
+        return int(self.names.nbytes + self._stamps.nbytes + self._versions.nbytes) + self._index.nbytes
 
     def id(self, index: int) -> str:
         """Id of a cell: the absolute path of its file."""
@@ -166,22 +175,27 @@ class Catalogue:
 
     def stamp(self, index: int) -> Stamp:
         """Stamp of a cell's file as last known."""
-        return Stamp(*self._stamps[index].tolist())
+        return bytes(self._stamps[index].astype("<i8", copy=False).tobytes())
+
+    def source_bytes(self, index: int) -> int:
+        """Size of a cell's file as last known."""
+        return int(self._stamps[index, 0])
 
     def set_stamp(self, index: int, stamp: Stamp) -> None:
         """Correct a cell's stamp in place; its version and the map version follow.  Cheap at any size."""
-        self._stamps[index] = stamp
-        self._versions.pop(index, None)
+        self._stamps[index] = np.frombuffer(stamp, "<i8")
+        self._versions[index] = 0
         if self._block_digests is not None:
             block = index // _BLOCK_CELLS
             self._block_digests[block] = self._digest_block(block)
         self._map_version = None
 
     def version(self, index: int) -> int:
-        """64-bit version of a cell, see `shmmap.origin.stamp.cell_version`."""
-        version = self._versions.get(index)
-        if version is None:
-            version = self._versions[index] = cell_version(self.id(index), self.stamp(index))
+        """64-bit version of a cell, see `shmmap.segment.version.cell_version`."""
+        version = int(self._versions[index])
+        if not version:
+            version = cell_version(self.id(index), self.stamp(index), self.box(index))
+            self._versions[index] = version
         return version
 
     @property
@@ -231,7 +245,7 @@ class CatalogueChange:
     changed: tuple[str, ...]
     """In both with different stamps: another version."""
     moved: tuple[str, ...]
-    """In both with different boxes (the metadata was edited); the version may be the same."""
+    """In both with different boxes (the metadata was edited): another version, too."""
 
     def __bool__(self) -> bool:
         return bool(self.added or self.removed or self.changed or self.moved)

@@ -11,7 +11,7 @@ from shmmap.errors import MapDataError, MapMissing
 from shmmap.formats.degrees import degrees_warning
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.stamp import Stamp
+from shmmap.segment.layout import SourceStamp
 
 __all__ = ["MAX_SINGLE_PCD_BYTES", "is_served_whole", "load_single_pcd"]
 
@@ -59,7 +59,7 @@ def load_single_pcd(path: str) -> Catalogue:
         raise MapDataError("no finite point, so the map has no extent", path=path, cause="no_points")
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
     problems = [f"{path}: {warning}"] if (warning := degrees_warning(lower, upper)) else []
-    return Catalogue.from_cells([(path, box, Stamp.of(status))], problems=problems)
+    return Catalogue.from_cells([(path, box, SourceStamp.of(status))], problems=problems)
 
 
 def _refuse_large(path: str, what: str, size: int, limit: int) -> None:

@@ -19,6 +19,7 @@ from typing import Final, Protocol
 import msgspec
 
 from shmmap.errors import InternalError
+from shmmap.layers.derive import Neighbour
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.spec import canonical_layers
 from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
@@ -225,14 +226,14 @@ def prepare_map(
     def tasks() -> Iterator[work.CellWork]:
         for index in range(len(catalogue)):
             cell_id = catalogue.id(index)
-            around: dict[str, tuple[str, ...]] = {}
+            around: dict[str, tuple[Neighbour, ...]] = {}
             for name in names:
                 near = versions.neighbours(index, name)
                 if len(near) > MAX_NEIGHBOURS:
                     message = f"{name} looks into more than {MAX_NEIGHBOURS} cells around one"
                     crowded.append(Failure(cell_id, name, message))
                 else:
-                    around[name] = tuple(map(catalogue.path, near))
+                    around[name] = tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in near)
             yield work.CellWork(
                 index,
                 cell_id,

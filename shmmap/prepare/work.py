@@ -7,11 +7,13 @@ from typing import Final, TypeAlias
 
 import msgspec
 
+from shmmap.layers.derive import Neighbour
+
 __all__ = ["CellDone", "CellWork", "FromWorker", "LayerDone", "Ready", "decode_done", "decode_work", "encode"]
 
 
 class CellWork(msgspec.Struct, array_like=True, tag="cell"):
-    """Prepare these layers of a cell; ``around`` are, for each layer, the neighbours' files it looks into.
+    """Prepare these layers of a cell; ``around`` are, for each layer, the cells it looks into.
 
     ``recognise``: the cache may hold them under other states of the same files.
     """
@@ -22,7 +24,7 @@ class CellWork(msgspec.Struct, array_like=True, tag="cell"):
     box: tuple[float, float, float, float]
     frame_id: str
     layers: tuple[str, ...]
-    around: tuple[tuple[str, ...], ...]
+    around: tuple[tuple[Neighbour, ...], ...]
     recognise: bool
 
 

@@ -88,8 +88,7 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: _Source) ->
         fd = os.memfd_create("layer", os.MFD_CLOEXEC)
         try:
             made = make_layer(spec, job, fd, source=lambda: source.points(spec))
-            states = tuple(zip(job.neighbours, made.neighbours, strict=True))
-            key = CacheKey(spec, job.cell_id, job.box, job.frame_id, made.header.source, states)
+            key = CacheKey(spec, job, made.header.source, made.neighbours)
             if not cache.store(key, made.header, fd):
                 return work.LayerDone(name, "failed", 0, f"{cache.directory}: there is no room for it")
             return work.LayerDone(name, "built", made.header.total_bytes)
@@ -108,10 +107,11 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: _Source) ->
 
 def _content(job: CellJob, known: dict[str, bytes]) -> bytes:
     """Digest of the files that a layer is computed from, each read once; zeros where one cannot be."""
-    for path in (job.path, *job.neighbours):
+    around = [near.path for near in job.neighbours]
+    for path in (job.path, *around):
         if path not in known:
             known[path] = _digest(path)
-    return combined_digest(known[job.path], [known[path] for path in job.neighbours])
+    return combined_digest(known[job.path], [known[path] for path in around])
 
 
 def _digest(path: str) -> bytes:

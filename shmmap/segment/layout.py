@@ -37,13 +37,14 @@ __all__ = [
     "plan_columns",
 ]
 
-LAYOUT_VERSION: Final = (1, 1)
+LAYOUT_VERSION: Final = (1, 2)
 PAGE_BYTES: Final = 4096
 ALIGNMENT_BYTES: Final = 64
 COLUMNS_OFFSET: Final = 512
 TAIL_BYTES: Final = 72  # header CRC, padding, publish block
 MAX_DIMENSIONS: Final = 4
 COLUMN: Final = struct.Struct("<40s8s16sII4QQQQ")
+_TOKEN: Final = struct.Struct("<3q")
 
 
 class SourceStamp(NamedTuple):
@@ -61,6 +62,11 @@ class SourceStamp(NamedTuple):
     def of(cls, status: os.stat_result) -> SourceStamp:
         """Stamp of a file from its `os.stat` or `os.fstat` result."""
         return cls(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+
+    @property
+    def token(self) -> bytes:
+        """The same as bytes, which is all that versions and the daemon know of it."""
+        return _TOKEN.pack(*self)
 
 
 NO_SOURCE: Final = SourceStamp(0, 0, 0)

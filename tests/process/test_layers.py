@@ -77,7 +77,7 @@ def test_resident_segments_are_the_layers_asked_for(
     for handle in both.cells:
         name = handle.id.rsplit("/", 1)[1]
         assert_is(client, handle, divided_map, build_layer(handle.layer, cloud(divided_map, name)))
-    assert len({handle.version for handle in both.cells}) == 4  # one for each cell, not for each layer
+    assert len({handle.version for handle in both.cells}) == 16  # each layer has its own
 
 
 def test_a_layer_made_of_points_in_memory_is_the_same(

@@ -51,8 +51,10 @@ class Truth:
         """Take note of a file's present state."""
         path = self.made.pcd_dir / name
         status = path.stat()
-        stamp = struct.pack("<qqq", status.st_size, status.st_mtime_ns, status.st_ctime_ns)
-        version = xxh3_64_intdigest(os.fsencode(path) + b"\0" + stamp)
+        cell_id, box = os.fsencode(path), self.made.box(name)
+        stamp = struct.pack("<I3q", 24, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+        named = struct.pack("<I", len(cell_id)) + cell_id + stamp + struct.pack("<4d", *box)
+        version = xxh3_64_intdigest(named)
         points = self.made.points(name)
         xyz = np.stack([points[axis] for axis in "xyz"], axis=1)
         self.checksums[str(path), version] = zlib.crc32(np.ascontiguousarray(xyz).data)

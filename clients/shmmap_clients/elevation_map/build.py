@@ -176,7 +176,7 @@ def _build(
     for number in range(state.done, len(order)):
         if number + 1 < len(order):  # the daemon loads it while we compute
             client.selected((listing[order[number + 1]].id,), rule.layer, wait=None)
-        cell = _load(client, listing[order[number]], rule.layer, wait_s, failed)
+        cell = _load(client, listing[order[number]], rule.layer, wait_s, failed, listing.map_version)
         rows = None
         if cell is not None:
             rows = columns_of(cell, rule)
@@ -203,8 +203,10 @@ def _build(
     )
 
 
-def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError]) -> Cell | None:
-    """The cell at the version that was listed; None if it cannot be loaded, which is remembered."""
+def _load(
+    client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError], map_version: int
+) -> Cell | None:
+    """The cell in the state of the map that was listed; None if it cannot be loaded, which is remembered."""
     answer = client.selected((info.id,), layer, wait=wait_s)
     if answer.failed:
         failed += answer.failed
@@ -213,7 +215,6 @@ def _load(client: Client, info: CellInfo, layer: str, wait_s: float, failed: lis
         raise LoadTimeout(
             f"{info.id} ({layer}): not loaded within {wait_s:g} s", cell_id=info.id, layer=layer
         )
-    cell = answer.cells[0]
-    if cell.version != info.version:
+    if answer.map_version != map_version:
         raise MapChanged("the map changed while its elevation was being made", hint="begin again")
-    return cell
+    return answer.cells[0]

@@ -62,8 +62,6 @@ class CellCache:
         The cells that are in memory at their current version.
     heights : dict
         Catalogue indices to lowest and highest z, metres, of cells that were loaded since they changed.
-    index_of_version : dict
-        Versions handed out (current and earlier ones) to catalogue indices.
     """
 
     def __init__(
@@ -91,7 +89,6 @@ class CellCache:
         self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
         self.events = CellEvents(event_log, statistics, self.wire_id, PressureEvents(event_log, self._memory))
         self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
-        self.index_of_version: dict[int, int] = {}
         self.used: set[Resident] = set()
         self.statistics = statistics
         self.instance = instance
@@ -127,7 +124,8 @@ class CellCache:
         resident = self.warm.get(index, layer)
         if resident is None and self.ledger.retired:
             key = Key(self.catalogue.id(index), layer)
-            resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
+            if self.reclaimer.may_revive(key):
+                resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
             if resident is not None:
                 self.enter(resident, index)
                 self.tell(self.events.revived, resident)
@@ -147,7 +145,7 @@ class CellCache:
         a computed layer, of which this is a guess.
         """
         share = 1.0 if layer == LAYER else layer_spec(layer).kind.bytes_ratio
-        size = int(self.catalogue.stamp(index).size * share) + _HEADER_ALLOWANCE_BYTES
+        size = int(self.catalogue.source_bytes(index) * share) + _HEADER_ALLOWANCE_BYTES
         return -(-size // _PAGE_BYTES) * _PAGE_BYTES
 
     def is_current(self, resident: Resident) -> bool:
@@ -164,7 +162,7 @@ class CellCache:
     def publish(self, fd: int, header_bytes: int, resident: Resident, index: int, now_s: float) -> int:
         """Name a finished segment and hand it out from now on; returns the version it supersedes, 0 for none.
 
-        ``resident`` describes it; its name, version and bytes are known once it is published.
+        ``resident`` describes it; its name and bytes are known once it is published.
 
         Raises
         ------
@@ -172,7 +170,6 @@ class CellCache:
             It cannot be published, for lack of memory, say.
         """
         resident.name = new_segment_name(self.instance)
-        resident.version = self.layers.version(index, resident.key.layer)
         block = PublishBlock(self.epoch, resident.version)
         resident.nbytes = self.directory.publish(
             fd, resident.name, block=block, header_bytes=header_bytes, mode=self.mode, gid=self.gid
@@ -212,7 +209,7 @@ class CellCache:
 
         One that is not checked yet only shows: who holds its version need not be sent it again.
         """
-        self.index_of_version[resident.version] = index
+        self.warm.note_version(resident, index)
         current = True
         if resident.checked:
             segment = resident.name.removeprefix(self.segment_prefix)
@@ -229,11 +226,10 @@ class CellCache:
         self._indices.clear()
         self.warm.clear()
         self.heights.clear()
-        self.index_of_version.clear()
         for retired in self.ledger.retired.values():
             index = self.index_of(retired.resident.key.cell_id)
             if index is not None:
-                self.index_of_version[retired.resident.version] = index
+                self.warm.note_version(retired.resident, index)
 
     # --- telling --------------------------------------------------------------------------------
 
@@ -260,15 +256,16 @@ class CellCache:
         The same goes for its neighbours in layers that look into it.
         """
         self.heights.pop(index, None)
-        self.layers.forget()
-        for layer in list(self.warm.layers):
-            for cell in (index, *self.layers.neighbours(index, layer)):
+        self.layers.cell_changed(index)
+        for layer, cells in self.layers.dependents(index, list(self.warm.layers)):
+            for cell in cells:
                 self.warm.leave(cell, layer)
 
     def _on_retired(self, resident: Resident, why: str) -> None:
         """Nobody finds it any more; its bytes still show."""
         self.tell(self.events.retired, resident, why)
         self.used.discard(resident)
+        self.warm.note_retired(resident)
         index = self.index_of(resident.key.cell_id)
         if index is not None and self.warm.get(index, resident.key.layer) is resident:
             self.warm.leave(index, resident.key.layer)

@@ -9,7 +9,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import Stamp
 
 __all__ = ["MapSwitch"]
 
@@ -41,9 +41,7 @@ class MapSwitch:
                 removed.pop(cell, None)
         return changed, list(removed)
 
-    def catch_up(
-        self, cells: Sequence[int], reads: Sequence[SourceStamp], known: Sequence[SourceStamp]
-    ) -> bool:
+    def catch_up(self, cells: Sequence[int], reads: Sequence[Stamp], known: Sequence[Stamp]) -> bool:
         """Take over the states of files that a loader has read; False if the map may have newer ones.
 
         Parameters
@@ -63,7 +61,7 @@ class MapSwitch:
                 self.learn(index, read)
         return True
 
-    def learn(self, index: int, stamp: SourceStamp) -> None:
+    def learn(self, index: int, stamp: Stamp) -> None:
         """A loader found that a cell's file is in this state."""
         cache = self._cache
         if cache.catalogue.stamp(index) == stamp:

@@ -134,6 +134,10 @@ class Reclaimer:
         self.ledger.add_retired(resident).probe_after_s = now_s + TICK_S
         self.pins.keep(retired_name(resident.name))
 
+    def may_revive(self, key: Key) -> bool:
+        """Whether a segment is retired that could be handed out again, if its version is the current one."""
+        return key in self._by_key
+
     def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
         """Put a retired but still existing segment of exactly this version back into service."""
         retired = self._by_key.get(key)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass, field
+from typing import Final, cast
 
 import msgspec
 import numpy as np
@@ -16,28 +18,53 @@ from shmmap.protocol.messages import Handle
 __all__ = ["WarmIndex"]
 
 
+TABLES_BYTES: Final = 64 << 20
+"""A table takes 8 bytes for every cell of the map, as far as they are in memory; so much for all of them."""
+LEAST_TABLES: Final = 4
+RETIRED_REMEMBERED: Final = 1 << 16
+"""Versions out of service; who holds an older one is told to drop it, as if the daemon had been restarted."""
+
+
 @dataclass(eq=False, slots=True)
 class WarmIndex:
     """The same twice: to be looked up one by one, and a whole area at once.
+
+    The latter takes a table as long as the map, which only the layers with the most segments have.
 
     Attributes
     ----------
     layers : dict
         Per layer, catalogue index to resident segment.
-    versions : dict
-        Per layer, (cells,) uint64: the version, 0 where the cell is not in memory.
+    tables : dict
+        Per layer that has one, (cells,) uint64: the version, 0 where the cell is not in memory.
+    of_version : dict
+        Versions handed out, current and earlier ones, to catalogue index and layer.
     """
 
     layers: dict[str, dict[int, Resident]] = field(default_factory=dict)
-    versions: dict[str, NDArray[np.uint64]] = field(default_factory=dict)
+    tables: dict[str, NDArray[np.uint64]] = field(default_factory=dict)
+    of_version: dict[int, tuple[int, str]] = field(default_factory=dict)
+    _retired: OrderedDict[int, None] = field(default_factory=OrderedDict)
+    _count: int = 0
 
     def __len__(self) -> int:
-        return sum(map(len, self.layers.values()))
+        return self._count
 
     def get(self, index: int, layer: str) -> Resident | None:
         """The segment of a cell, if it is warm."""
         found = self.layers.get(layer)
         return found.get(index) if found is not None else None
+
+    def versions(self, layer: str, cells: NDArray[np.intp]) -> list[int] | None:
+        """Versions of cells, by catalogue index: 0 where one is not in memory; None if none is."""
+        table = self.tables.get(layer)
+        if table is not None:
+            return cast("list[int]", table[cells].tolist())
+        found = self.layers.get(layer)
+        if found is None:
+            return None
+        residents = map(found.get, cells.tolist())
+        return [resident.version if resident is not None else 0 for resident in residents]
 
     def encode(self, resident: Resident, wire_id: str, segment: str) -> None:
         """Encode a segment's handle once, fresh and stale, to be used in every reply.
@@ -57,22 +84,58 @@ class WarmIndex:
     def enter(self, resident: Resident, index: int, cells: int) -> None:
         """A segment has the current version of its cell, one of so many ``cells`` of the map."""
         layer = resident.key.layer
-        self.layers.setdefault(layer, {})[index] = resident
-        versions = self.versions.get(layer)
-        if versions is None:
-            versions = self.versions[layer] = np.zeros(cells, np.uint64)
-        versions[index] = resident.version
+        found = self.layers.setdefault(layer, {})
+        self._count += index not in found
+        found[index] = resident
+        table = self.tables.get(layer)
+        if table is not None:
+            table[index] = resident.version
+        else:
+            self._make_table(layer, cells)
+
+    def _make_table(self, layer: str, cells: int) -> None:
+        """Make a layer's table if there is room, or a layer with a quarter of its segments has one."""
+        found = self.layers[layer]
+        if len(found).bit_count() != 1:
+            return  # it is tried again when they have doubled
+        if len(self.tables) >= max(LEAST_TABLES, TABLES_BYTES // (8 * cells)):
+            smallest = min(self.tables, key=lambda other: len(self.layers[other]))
+            if 4 * len(self.layers[smallest]) > len(found):
+                return
+            del self.tables[smallest]
+        table = self.tables[layer] = np.zeros(cells, np.uint64)
+        for index, resident in found.items():
+            table[index] = resident.version
+
+    def note_version(self, resident: Resident, index: int) -> None:
+        """What a segment's version is of."""
+        self.of_version[resident.version] = index, resident.key.layer
+        self._retired.pop(resident.version, None)
+
+    def note_retired(self, resident: Resident) -> None:
+        """A segment is out of service; what its version is of is forgotten some day."""
+        self._retired[resident.version] = None
+        if len(self._retired) > RETIRED_REMEMBERED:
+            oldest, _ = self._retired.popitem(last=False)
+            self.of_version.pop(oldest, None)
 
     def leave(self, index: int, layer: str) -> None:
         """The cell has another version now, or its segment is retired."""
         found = self.layers.get(layer)
         if found is None or found.pop(index, None) is None:
             return
-        self.versions[layer][index] = 0
-        if not found:  # whoever asks for ever new layers must not fill the daemon's memory
-            del self.layers[layer], self.versions[layer]
+        self._count -= 1
+        table = self.tables.get(layer)
+        if table is not None:
+            table[index] = 0
+        if not found:
+            del self.layers[layer]
+            self.tables.pop(layer, None)
 
     def clear(self) -> None:
         """Indices mean other cells from now on."""
         self.layers.clear()
-        self.versions.clear()
+        self.tables.clear()
+        self.of_version.clear()
+        self._retired.clear()
+        self._count = 0

@@ -111,11 +111,10 @@ class Adoption:
             return "its cell is not in the map"
         if resident.key in cache.ledger.by_key:
             return "there is another one"
-        known = cache.layers.version(index, header.layer), catalogue.stamp(index)
-        if (resident.version, header.source) != known:
-            return "its source has changed"
-        if header.box != catalogue.box(index) or header.frame_id != catalogue.frame_id:
-            return "its cell has moved"
+        if resident.version != cache.layers.version(index, header.layer):
+            return "its cell, or one around it, has changed"
+        if header.frame_id != catalogue.frame_id:
+            return "it is in another frame"
         if cache.ledger.shortage(status.st_blocks * 512) > 0:
             return "it does not fit in the budget"
         return ""

@@ -16,7 +16,7 @@ from typing import Final
 
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import Stamp
 
 __all__ = ["BACKGROUND", "LoadQueue", "Loads"]
 
@@ -208,7 +208,7 @@ class Loads:
             if failure is not None:
                 self._remember(load.key, failure)
 
-    def failure(self, key: Key, code: str, message: str, stamp: SourceStamp | None, now_s: float) -> Failure:
+    def failure(self, key: Key, code: str, message: str, stamp: Stamp | None, now_s: float) -> Failure:
         """Describe why a load failed; the back-off doubles when it failed the same way before."""
         old = self.failures.get(key)
         if code in SPACE_CODES:

@@ -12,7 +12,7 @@ from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_pool import RESTART, Worker, WorkerPool
 from shmmap.daemon.records import Load
 from shmmap.logfmt import log
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import Stamp
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["LostWorkers"]
@@ -38,7 +38,7 @@ class LostWorkers:
     loads: Loads
     room: Room
     statistics: StatisticsWriter
-    fail: Callable[[Load, str, str, SourceStamp | None, float], None]
+    fail: Callable[[Load, str, str, Stamp | None, float], None]
 
     def ended(self, worker: Worker, now_s: float) -> None:
         """A worker's process ended."""

@@ -24,11 +24,11 @@ from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Failed, 
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
+from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
-from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.logfmt import log
 from shmmap.segment.directory import is_full
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
@@ -146,12 +146,14 @@ class Scheduler:
                 return None
             load.estimate = self._cache.estimate(index, load.key.layer)
         layer = load.key.layer
-        around = cache.layers.neighbours(index, layer)[: MAX_NEIGHBOURS + 1]
+        around = cache.layers.neighbours(index, layer)
         load.sources = tuple(map(catalogue.stamp, (index, *around)))
+        load.version = cache.layers.version(index, layer)
         points = cache.warm.get(index, LAYER) if layer != LAYER else None
         return Job(
             number, load.key.cell_id, catalogue.path(index), layer, catalogue.box(index), catalogue.frame_id,
-            load.estimate, points.name if points is not None else "", tuple(map(catalogue.path, around)),
+            load.estimate, points.name if points is not None else "",
+            tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in around),
         )  # fmt: skip
 
     def hear_of_closes(self, now_s: float) -> None:
@@ -225,16 +227,22 @@ class Scheduler:
             self._statistics.add("loads_failed")
             self._end(load)
             return
-        cells = (index, *cache.layers.neighbours(index, key.layer))
-        reads = (done.stamp, *done.neighbours)
-        if tuple(map(cache.catalogue.stamp, cells)) != reads and not self._map_switch.catch_up(
-            cells, reads, load.sources
-        ):
-            self.loads.requeue(load)
-            return
+        if done.version != cache.layers.version(index, key.layer):
+            # its file, or one around it, changed while it was made; or the map did
+            reads = (done.stamp, *done.neighbours)
+            if reads == load.sources and done.version != load.version:
+                message = f"the loader builds {key.layer} otherwise than the daemon knows: restart it"
+                self._fail(load, "load_failed", message, None, now_s)
+                return
+            cells = (index, *cache.layers.neighbours(index, key.layer))
+            self._map_switch.catch_up(cells, reads, load.sources)
+            if done.version != cache.layers.version(index, key.layer):
+                self.loads.requeue(load)
+                return
         resident = Resident(
-            name="", key=key, version=0, nbytes=0, points=done.points, box=cache.catalogue.box(index),
-            z_min=done.z_min, z_max=done.z_max, last_use_s=now_s, load_ns=done.load_ns,
+            name="", key=key, version=done.version, nbytes=0, points=done.points,
+            box=cache.catalogue.box(index), z_min=done.z_min, z_max=done.z_max, last_use_s=now_s,
+            load_ns=done.load_ns,
         )  # fmt: skip
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
@@ -285,7 +293,7 @@ class Scheduler:
         else:
             self._end(load)
 
-    def _fail(self, load: Load, code: str, message: str, stamp: SourceStamp | None, now_s: float) -> None:
+    def _fail(self, load: Load, code: str, message: str, stamp: Stamp | None, now_s: float) -> None:
         """The load ended without a segment; the back-off doubles when it failed the same way before."""
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)

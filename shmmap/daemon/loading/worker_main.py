@@ -106,8 +106,9 @@ class _Worker:
                 header = made.header
                 done = worker_messages.Done(
                     job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
-                    header.z_max, header.source, time.monotonic_ns() - started_ns,
-                    tuple(warning[:500] for warning in made.warnings[:20]), made.neighbours, made.cached,
+                    header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
+                    tuple(warning[:500] for warning in made.warnings[:20]),
+                    tuple(stamp.token for stamp in made.neighbours), made.cached,
                 )  # fmt: skip
                 step("worker.pass")
                 self._send(worker_messages.Segment(), fd)
@@ -161,7 +162,7 @@ class _Worker:
     def _check(self, job: worker_messages.Check) -> None:
         wrong, stamp = "", None
         try:
-            stamp = SourceStamp.of(os.stat(job.path))
+            stamp = SourceStamp.of(os.stat(job.path)).token
             if stamp != job.stamp:
                 wrong = "its source has changed"
             elif job.segment:
@@ -176,7 +177,7 @@ class _Worker:
     def _fail(self, job: worker_messages.Job, code: str, message: str) -> None:
         stamp = None
         with contextlib.suppress(OSError):
-            stamp = SourceStamp.of(os.stat(job.path))
+            stamp = SourceStamp.of(os.stat(job.path)).token
         self._send(worker_messages.Failed(job.number, code, message[:4000], stamp))
 
 

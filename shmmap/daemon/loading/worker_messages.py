@@ -12,7 +12,8 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from shmmap.segment.layout import SourceStamp
+from shmmap.layers.derive import Neighbour
+from shmmap.segment.version import Stamp
 
 __all__ = [
     "Check",
@@ -36,7 +37,7 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
     """Load one layer of one cell; ``granted`` bytes are reserved for it.
 
     ``points`` names the cell's ``points`` segment where that is in memory: a computed layer need not
-    read the file then.  ``neighbours`` are the files around the cell, for a layer with a halo.
+    read the file then.  ``neighbours`` are the cells around it, for a layer with a halo.
     """
 
     number: int
@@ -47,7 +48,7 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
     frame_id: str
     granted: int
     points: str = ""
-    neighbours: tuple[str, ...] = ()
+    neighbours: tuple[Neighbour, ...] = ()
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
@@ -56,7 +57,7 @@ class Check(msgspec.Struct, array_like=True, tag="check"):
     number: int
     path: str
     segment: str
-    stamp: SourceStamp
+    stamp: Stamp
 
 
 class Decision(msgspec.Struct, array_like=True, tag="decision"):
@@ -89,8 +90,9 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     """The segment sent just before is finished, and the worker has closed its own descriptor of it.
 
     That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
-    ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the source's points; ``neighbours`` are
-    the stamps of the job's, as they were read; ``cached``: it came out of the disk cache.
+    ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
+    source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
+    the disk cache.
     """
 
     number: int
@@ -99,10 +101,11 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     dropped: int
     z_min: float
     z_max: float
-    stamp: SourceStamp
+    version: int
+    stamp: Stamp
     load_ns: int
     warnings: tuple[str, ...] = ()
-    neighbours: tuple[SourceStamp, ...] = ()
+    neighbours: tuple[Stamp, ...] = ()
     cached: bool = False
 
 
@@ -114,7 +117,7 @@ class Checked(msgspec.Struct, array_like=True, tag="checked"):
 
     number: int
     wrong: str = ""
-    stamp: SourceStamp | None = None
+    stamp: Stamp | None = None
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
@@ -123,7 +126,7 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
     number: int
     code: str
     message: str
-    stamp: SourceStamp | None = None
+    stamp: Stamp | None = None
 
 
 ToWorker: TypeAlias = Job | Check | Decision

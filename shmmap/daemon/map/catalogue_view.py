@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.geometry import Area
-from shmmap.origin.stamp import Stamp
+from shmmap.segment.version import Stamp
 
 __all__ = ["CatalogueView"]
 
@@ -41,6 +41,10 @@ class CatalogueView(Protocol):
         """Box around all cells, metres, map frame; None where there are none."""
 
     @property
+    def mean_size(self) -> tuple[float, float]:
+        """Mean extent of the cells along x and y, metres."""
+
+    @property
     def boxes(self) -> NDArray[np.float64]:
         """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame."""
 
@@ -64,3 +68,6 @@ class CatalogueView(Protocol):
 
     def stamp(self, index: int) -> Stamp:
         """Stamp of a cell's source as last known."""
+
+    def source_bytes(self, index: int) -> int:
+        """Size of a cell's source as last known."""

@@ -108,7 +108,7 @@ class CellReplies:
         resident = cache.ledger.by_key.get(key)
         resident = resident if resident is None or resident.checked else None
         current = resident is not None and resident.version == cache.layers.version(index, layer)
-        if resident is not None and refusal is None and (current or key.cell_id not in wanted.held_old):
+        if resident is not None and refusal is None and (current or key not in wanted.held_old):
             answer.handles.append(resident.handle if current else resident.stale_handle)
             answer.residents.append(resident)
         if refusal is not None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a client lacks, and what it should drop: the set arithmetic of a differential request.
 
-Versions do the work: one names a cell *and* its state, so that a client that holds exactly the
+Versions do the work: one names a layer of a cell *and* its state, so that a client that holds exactly the
 current versions of an area lacks nothing.  `warm_difference` is the way of nearly every request of
 a moving vehicle and is kept short; `difference` covers everything.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Resident
+from shmmap.daemon.records import Key, Resident
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
@@ -40,10 +40,9 @@ def warm_difference(
 
     ``found`` are the catalogue indices of the area's cells, ascending.
     """
-    known = cache.warm.versions.get(layer)
-    if known is None:
+    versions = cache.warm.versions(layer, found)
+    if versions is None:
         return None
-    versions = known[found].tolist()
     packed = unpack_versions(message.packed)
     named = message.held
     current, held = set(versions), set(packed)
@@ -54,15 +53,16 @@ def warm_difference(
         held.update(cast("list[int]", given))
     if 0 in current:
         return None  # 0 stands for "not in memory"
-    warm, index_of = cache.warm.layers[layer], cache.index_of_version
-    missing = [index_of[version] for version in current - held]
+    warm, of_version = cache.warm.layers[layer], cache.warm.of_version
+    missing = [of_version[version][0] for version in current - held]
     missing.sort()
     removed: tuple[str, ...] = ()
     removed_packed = b""
     gone = held - current
     if gone:
         # an old version of a cell inside the area is replaced, not removed
-        replaced = [v for v in gone if (i := index_of.get(v)) in warm and warm[i].version in current]
+        known = ((version, of_version.get(version, (-1, ""))[0]) for version in gone)
+        replaced = [v for v, index in known if index in warm and warm[index].version in current]
         gone.difference_update(replaced)
         if named:
             removed = _removed_names(cache, named, gone, current, layer)
@@ -95,13 +95,13 @@ class Difference:
     removed, removed_packed
         What to drop, as the reply says it.
     old
-        Ids of cells in the area that the client holds in an older version.
+        Layers of cells in the area that the client holds in an older version.
     """
 
     cells: list[tuple[int, str]] = field(default_factory=list)
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
-    old: set[str] = field(default_factory=set)
+    old: set[Key] = field(default_factory=set)
 
 
 def difference(
@@ -119,11 +119,13 @@ def difference(
         if index is None or index not in inside:
             removed[cell.id] = None
             continue
-        for layer in layers if cell.layers is None else canonical_layers(cell.layers):
-            if cell.version is not None and cell.version != version_of(index, layer):
-                result.old.add(id_of(index))
-                continue
-            has.setdefault(index, set()).add(layer)
+        mine = layers if cell.layers is None else canonical_layers(cell.layers)
+        if cell.version is not None:  # that of one of them; else it is an old one
+            current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
+            if not current_of:
+                result.old.update(Key(id_of(index), layer) for layer in mine)
+            mine = tuple(current_of)
+        has.setdefault(index, set()).update(mine)
     current: set[int] = set()
     for index in indices:
         for layer in layers:
@@ -133,10 +135,10 @@ def difference(
                 result.cells.append((index, layer))
     gone = packed - current
     for version in [*gone]:
-        known = cache.index_of_version.get(version)
-        if known in inside and known is not None:
+        known, layer = cache.warm.of_version.get(version, (-1, ""))
+        if known in inside:
             gone.discard(version)
-            result.old.add(id_of(known))
+            result.old.add(Key(id_of(known), layer))
     result.removed = tuple(removed)
     result.removed_packed = pack_versions(gone)
     return result

@@ -43,9 +43,6 @@ MOST_LAYERS_HELD: Final = 64
 """Different layers named as held; reading what a layer is called takes some 40 us."""
 MOST_LAYERS: Final = 16
 """Layers of one request."""
-LAYER_TABLES_BYTES: Final = 256 << 20
-"""Each layer in memory takes the daemon 8 bytes for every cell of the map; so much for all of them."""
-LEAST_LAYERS_IN_MEMORY: Final = 64
 
 
 def check_count(count: int) -> None:
@@ -104,18 +101,13 @@ def admitted_layers(cache: CellCache, specs: Sequence[str]) -> tuple[str, ...]:
     Raises
     ------
     BadRequest
-        One makes no sense, they are too many, or too many others are in memory.
+        One makes no sense, they are too many, or one looks too far.
     """
     if len(specs) > MOST_LAYERS:
         raise BadRequest(f"{len(specs)} layers in one request; {MOST_LAYERS} is the most")
     layers = canonical_layers(specs)
-    new = [layer for layer in layers if layer not in cache.warm.layers]
-    most = max(LEAST_LAYERS_IN_MEMORY, LAYER_TABLES_BYTES // (8 * max(1, len(cache.catalogue))))
-    if new and len(cache.warm.layers) >= most:
-        raise BadRequest(
-            f"{len(cache.warm.layers)} different layers are in memory already, {most} is the most",
-            hint="agree on parameters, or `shmmap evict` what nobody needs",
-        )
+    for layer in layers:
+        cache.layers.check_reach(layer)
     return layers
 
 

@@ -136,7 +136,7 @@ class MapQueries:
     def _row(self, index: int) -> messages.MetadataRow:
         catalogue = self._catalogue
         heights = self.cache.heights.get(index, (None, None))
-        wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.stamp(index).size
+        wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.source_bytes(index)
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
     def stats(
@@ -173,7 +173,7 @@ class MapQueries:
         z_min, z_max = cache.heights.get(index, (None, None))
         return messages.ShownCell(
             message.request, cell_id, catalogue.version(index), *catalogue.box(index),
-            catalogue.stamp(index).size, shown,
+            catalogue.source_bytes(index), shown,
             tuple(key.layer for key in self.loads.by_key if key.cell_id == cell_id),
             "; ".join(f"{failure.code}: {failure.message}" for failure in failures),
             z_min=z_min, z_max=z_max, pinned=self.pins.layers_of(cell_id),

@@ -68,7 +68,7 @@ class PendingRequest:
     refused
         What would exceed the session's quota, with code and message.
     held_old
-        Ids of cells that the client holds in an older version.
+        Layers of cells that the client holds in an older version.
     area
         What was asked about; None for a request by ids.
     keys, outstanding
@@ -87,7 +87,7 @@ class PendingRequest:
     removed_packed: bytes = b""
     unknown: list[tuple[str, str]] = field(default_factory=list)
     refused: dict[Key, tuple[str, str]] = field(default_factory=dict)
-    held_old: set[str] = field(default_factory=set)
+    held_old: set[Key] = field(default_factory=set)
     area: Area | None = None
     keys: dict[Key, None] = field(default_factory=dict)
     outstanding: set[Key] = field(default_factory=set)

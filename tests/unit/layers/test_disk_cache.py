@@ -16,7 +16,7 @@ from shmmap.formats.causes import refusal
 from shmmap.layers import sources
 from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob
+from shmmap.layers.derive import CellJob, Neighbour
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import Made, cache_key, make_layer
 from shmmap.layers.sources import CellSource
@@ -76,7 +76,7 @@ def test_the_same_bytes_come_back(one: Bench, layer: str) -> None:
     assert found.cached
     assert again == first
     assert repr(found.header) == repr(built.header)
-    state = Path(one.cache._state_path(one.key(layer).state_name()))
+    state = Path(one.cache._version_path(one.key(layer).version_name()))
     assert state.read_bytes() == first  # a prepared file has the segment's bytes, its publish block empty
     assert len(one.files()) == 2
 
@@ -90,7 +90,7 @@ def test_layers_and_states_are_apart(one: Bench) -> None:
         assert not one.make(layer)[0].cached
         assert one.make(layer)[0].cached
     key = one.key(LAYERS[1])
-    assert not one.cache.has(replace(key, box=(0.0, 0.0, 20.0, 21.0)))
+    assert not one.cache.has(replace(key, job=replace(key.job, box=(0.0, 0.0, 20.0, 21.0))))
     newer = replace(key.spec, kind=replace(key.spec.kind, builder_version=2))
     assert not one.cache.has(replace(key, spec=newer))
 
@@ -104,7 +104,7 @@ def test_any_damage_is_noticed_and_built_anew(one: Bench) -> None:
     inside = [at for c in columns for at in range(c.offset, c.offset + c.nbytes)]
     places = [*range(0, 288, 37), 4095 - 70, *rng.choice(inside, 20).tolist()]
     for at in places:
-        state = Path(one.cache._state_path(one.key(layer).state_name()))
+        state = Path(one.cache._version_path(one.key(layer).version_name()))
         with state.open("r+b") as file:
             file.seek(at)
             byte = file.read(1)
@@ -115,7 +115,7 @@ def test_any_damage_is_noticed_and_built_anew(one: Bench) -> None:
         assert data == true, at
         assert one.make(layer)[0].cached
     for length in (0, 100, 4096, size - 1):
-        state = Path(one.cache._state_path(one.key(layer).state_name()))
+        state = Path(one.cache._version_path(one.key(layer).version_name()))
         os.truncate(state, length)
         made, data = one.make(layer)
         # what lies after the last column is padding
@@ -126,7 +126,7 @@ def test_any_damage_is_noticed_and_built_anew(one: Bench) -> None:
 def test_what_others_could_have_written_is_not_used(one: Bench) -> None:
     layer = LAYERS[1]
     _, true = one.make(layer)
-    state = Path(one.cache._state_path(one.key(layer).state_name()))
+    state = Path(one.cache._version_path(one.key(layer).version_name()))
     os.chmod(state, 0o666)
     made, data = one.make(layer)
     assert not made.cached
@@ -145,7 +145,9 @@ def test_another_cell_s_entry_in_its_place_is_not_used(one: Bench) -> None:
     one.make(layer, there)
     key, other = one.key(layer), cache_key(parse_layer(layer), there)
     assert other is not None
-    shutil.copyfile(one.cache._state_path(other.state_name()), one.cache._state_path(key.state_name()))
+    shutil.copyfile(
+        one.cache._version_path(other.version_name()), one.cache._version_path(key.version_name())
+    )
     assert not one.cache.has(key)
     made, data = one.make(layer)
     assert not made.cached
@@ -155,7 +157,7 @@ def test_another_cell_s_entry_in_its_place_is_not_used(one: Bench) -> None:
 @pytest.mark.root
 def test_a_stranger_s_file_is_not_used(one: Bench) -> None:
     one.make(LAYERS[1])
-    os.chown(one.cache._state_path(one.key(LAYERS[1]).state_name()), 12345, -1)
+    os.chown(one.cache._version_path(one.key(LAYERS[1]).version_name()), 12345, -1)
     assert not one.cache.has(one.key(LAYERS[1]))
 
 
@@ -168,7 +170,7 @@ def test_a_copied_map_is_recognised_by_content(one: Bench) -> None:
     key = cache_key(parse_layer(LAYERS[1]), job)
     assert key is not None
     assert not one.cache.has(key)
-    assert not one.cache.recognise(replace(key, box=(0.0, 0.0, 1.0, 1.0)), digest)
+    assert not one.cache.recognise(replace(key, job=replace(key.job, box=(0.0, 0.0, 1.0, 1.0))), digest)
     assert not one.cache.recognise(key, bytes(16))
     assert one.cache.recognise(key, digest)
     made, data = one.make(LAYERS[1], job)
@@ -202,7 +204,7 @@ def test_a_neighbour_that_changes_while_it_is_read_is_built_with_later(
     near = one.directory / "near.pcd"
     write_pcd(near, random_points(np.random.default_rng(1), (20, 0), 200))
     before = SourceStamp.of(os.stat(near))
-    job = replace(one.job, neighbours=(str(near),))
+    job = replace(one.job, neighbours=(Neighbour(str(near), (20.0, 0.0, 40.0, 20.0)),))
     read_source = sources.read_source
 
     def rewritten_meanwhile(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
@@ -226,7 +228,7 @@ def test_the_least_recently_used_go_first(one: Bench) -> None:
     sizes = {}
     for number, layer in enumerate(LAYERS):
         sizes[layer] = one.make(layer)[0].header.total_bytes
-        os.utime(one.cache._state_path(one.key(layer).state_name()), (number, number))
+        os.utime(one.cache._version_path(one.key(layer).version_name()), (number, number))
     interim = Path(one.cache.directory) / ".new-killed"
     interim.write_bytes(b"half")
     os.utime(interim, (1, 1))

@@ -1,49 +1,171 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Versions of computed layers."""
+"""Versions of layers: other bytes have another one, and nothing else has."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from xxhash import xxh3_64_intdigest
 
+from shmmap.errors import BadRequest
+from shmmap.layers import registry
 from shmmap.layers import versions as layer_versions
+from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
+from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
-from tests.support.divided_map import make_map, random_points
+from shmmap.segment.layout import SourceStamp
+from shmmap.segment.version import layer_version
+from tests.support.divided_map import DividedMap, make_map, random_points
 
 NDT = "ndt(leaf=5.0,min_points=3)"
+PLAIN = ["points", NDT, "crop(z_max=1.0)", "voxel(leaf=1.0)"]
+FAR = ["normals(radius=2.0)", "denoise", "ndt(leaf=2.0,of=denoise)"]
 
 
-def test_a_layer_has_its_cell_s_version_unless_it_looks_farther(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = make_map(tmp_path / "map", columns=4, rows=4, points=5)
-    catalogue = open_map(str(made.root), cache_dir=str(tmp_path / "cache")).load()
-    versions = LayerVersions(lambda: catalogue)
-    index = catalogue.find(made.id("0_0.pcd"))
-    assert index is not None
-    for layer in ("points", NDT, "crop(z_max=1.0)"):
-        assert versions.version(index, layer) == catalogue.version(index)
-        assert versions.neighbours(index, layer) == []
-    for layer in ("normals(radius=2.0)", "denoise", "ndt(leaf=2.0,of=denoise)"):
-        around = versions.neighbours(index, layer)
-        names = {catalogue.id(i).rsplit("/", 1)[1] for i in around}
-        assert names == {f"{x}_{y}.pcd" for x in (-20, 0, 20) for y in (-20, 0, 20)} - {"0_0.pcd"}
-        packed = np.array([catalogue.version(i) for i in (index, *sorted(around))], "<u8").tobytes()
-        assert versions.version(index, layer) == xxh3_64_intdigest(packed)
-    before = {i: versions.version(i, "denoise") for i in range(len(catalogue))}
+class Map:
+    """A map of sixteen cells as a daemon knows it."""
+
+    def __init__(self, directory: Path) -> None:
+        self._cache = str(directory / "cache")
+        self.made: DividedMap = make_map(directory / "map", columns=4, rows=4, points=5)
+        self.read()
+
+    def read(self) -> LayerVersions:
+        """Read the map anew."""
+        self.catalogue: Catalogue = open_map(str(self.made.root), cache_dir=self._cache).load(fresh=True)
+        self.versions = LayerVersions(lambda: self.catalogue)
+        return self.versions
+
+    def index(self, name: str) -> int:
+        index = self.catalogue.find(self.made.id(name))
+        assert index is not None
+        return index
+
+    def all(self, layers: list[str]) -> dict[tuple[str, str], int]:
+        """Version of every layer of every cell, by name."""
+        cells = {name: self.index(name) for name in self.made.corners}
+        return {(n, layer): self.versions.version(i, layer) for n, i in cells.items() for layer in layers}
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> Map:
+    return Map(tmp_path)
+
+
+@pytest.fixture
+def kinds_as_before() -> Iterator[None]:
+    before = dict(registry._own)
+    yield
+    registry._own.update(before)
+    forget_kinds()
+
+
+def forget_kinds() -> None:
+    layer_spec.cache_clear()
+    layer_versions._kind.cache_clear()
+
+
+def others(before: dict[tuple[str, str], int], after: dict[tuple[str, str], int]) -> set[tuple[str, str]]:
+    return {key for key in before if before[key] != after[key]}
+
+
+AROUND_0_0 = {f"{x}_{y}.pcd" for x in (-20, 0, 20) for y in (-20, 0, 20)}
+
+
+def test_every_layer_has_its_own(one: Map) -> None:
+    versions = one.all([*PLAIN, *FAR])
+    assert len(set(versions.values())) == len(versions)
+    index, cell = one.index("0_0.pcd"), one.catalogue.version
+    assert versions["0_0.pcd", "points"] == cell(index)
+    assert versions["0_0.pcd", NDT] == layer_version(cell(index), NDT, 1)
+    for layer in PLAIN:
+        assert one.versions.neighbours(index, layer) == []
+    for layer in FAR:
+        around = one.versions.neighbours(index, layer)
+        assert {one.catalogue.id(i).rsplit("/", 1)[1] for i in around} == AROUND_0_0 - {"0_0.pcd"}
+        near = [cell(i) for i in sorted(around)]
+        built = layer_spec(layer).builder_version
+        assert versions["0_0.pcd", layer] == layer_version(cell(index), layer, built, near)
+
+
+def test_a_box_that_is_edited_changes_every_layer(one: Map) -> None:
+    before = one.all([*PLAIN, *FAR])
+    one.made.corners["0_0.pcd"] = (0, 1)
+    one.made.write_metadata()
+    one.read()
+    changed = others(before, one.all([*PLAIN, *FAR]))
+    assert {layer for name, layer in changed if name == "0_0.pcd"} == {*PLAIN, *FAR}
+    assert {name for name, layer in changed if layer in PLAIN} == {"0_0.pcd"}
+
+
+def test_a_file_that_changes_changes_its_layers_and_those_that_look_into_it(one: Map) -> None:
+    before = one.all([*PLAIN, *FAR])
+    one.made.write_cell("20_20.pcd", (20, 20), random_points(np.random.default_rng(3), (20, 20), 6))
+    one.read()
+    changed = others(before, one.all([*PLAIN, *FAR]))
+    near = {"0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"}
+    assert changed == {(n, far) for n in near for far in FAR} | {("20_20.pcd", plain) for plain in PLAIN}
+
+
+@pytest.mark.usefixtures("kinds_as_before")
+def test_another_builder_changes_its_own_layer_alone(one: Map) -> None:
+    layers = ["points", NDT, "voxel(leaf=1.0)", "ndt(leaf=2.0,of=voxel(leaf=1.0))", "denoise"]
+    before = one.all(layers)
+    voxel = registry._own["voxel"]
+    registry._own["voxel"] = replace(voxel, builder_version=voxel.builder_version + 1)
+    forget_kinds()
+    changed = others(before, one.all(layers))
+    assert {layer for _, layer in changed} == {"voxel(leaf=1.0)", "ndt(leaf=2.0,of=voxel(leaf=1.0))"}
+    assert len(changed) == 2 * 16
+
+
+def test_a_state_learnt_in_place_forgets_what_looks_into_it_alone(one: Map) -> None:
+    before = one.all([*PLAIN, *FAR])
+    index = one.index("20_20.pcd")
+    one.catalogue.set_stamp(index, bytes(24))
+    one.versions.cell_changed(index)
+    assert len(list(one.versions.unknown(range(16), FAR))) == 4 * len(FAR)
+    after = one.all([*PLAIN, *FAR])
+    fresh = LayerVersions(lambda: one.catalogue)
+    assert after == {key: fresh.version(one.index(key[0]), key[1]) for key in after}
+    assert {name for name, _ in others(before, after)} == {"0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"}
+
+
+def test_dependents_are_those_who_look(one: Map) -> None:
+    """Neighbours seen from the other side, whatever the reach."""
+    layers = [*PLAIN, *FAR, *(f"normals(radius={r})" for r in (20.0, 19.999999, 20.000001, 40.0, 50.0))]
+    for index in range(16):
+        for layer, cells in one.versions.dependents(index, layers):
+            looking = {i for i in range(16) if index in one.versions.neighbours(i, layer)}
+            assert set(cells) == {index} | looking, layer
+
+
+def test_what_is_unknown_is_what_takes_long(one: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert list(one.versions.unknown(range(16), PLAIN)) == []
+    assert len(list(one.versions.unknown(range(16), [*PLAIN, *FAR]))) == 16 * len(FAR)
+    one.versions.version(3, "denoise")
+    assert (3, "denoise") not in list(one.versions.unknown(range(16), ["denoise"]))
+    before = one.all(FAR)
     monkeypatch.setattr(layer_versions, "MOST_REMEMBERED", 4)
-    assert {i: versions.version(i, "denoise") for i in before} == before
-    for number in range(10):  # whoever asks for ever new layers fills no memory
-        versions.version(0, f"normals(radius={number + 1}.0)")
-    assert len(versions._versions) <= 4
-    made.write_cell("20_20.pcd", (20, 20), random_points(np.random.default_rng(3), (20, 20), 6))
-    catalogue = open_map(str(made.root), cache_dir=str(tmp_path / "cache")).load(fresh=True)
-    versions.forget()
-    changed = {
-        catalogue.id(i).rsplit("/", 1)[1] for i in before if versions.version(i, "denoise") != before[i]
-    }
-    assert changed == {"0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"}
+    for number in range(100):  # whoever asks for ever new layers fills no memory
+        one.versions.version(number % 16, f"normals(radius={number % 50 + 1}.0)")
+    assert sum(map(len, one.versions._known.values())) == one.versions._count <= 16 * len(FAR)
+    assert one.all(FAR) == before
+    one.versions.forget()
+    assert len(list(one.versions.unknown(range(16), FAR))) == 16 * len(FAR)
+
+
+def test_a_layer_that_looks_into_too_many_cells(tmp_path: Path) -> None:
+    cells = {(x, y): (x / 2, y / 2, x / 2 + 0.5, y / 2 + 0.5) for x in range(40) for y in range(40)}
+    state = SourceStamp(1, 2, 3)
+    many = Catalogue.from_cells([(f"/m/{x}_{y}.pcd", box, state) for (x, y), box in cells.items()])
+    versions = LayerVersions(lambda: many)
+    for near in ("points", NDT, "normals(radius=1.0)"):
+        versions.check_reach(near)
+    with pytest.raises(BadRequest, match="would look into about 484 cells"):
+        versions.check_reach("normals(radius=5.0)")
+    assert len(versions.neighbours(820, "normals(radius=50.0)")) == layer_versions.MAX_NEIGHBOURS + 1

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.geometry import Circle
 from shmmap.origin.catalogue import Catalogue, compare
-from shmmap.origin.stamp import Stamp
+from shmmap.segment.layout import SourceStamp
 
 Box = tuple[float, float, float, float]
-STAMP = Stamp(100, 2_000_000_001, 3_000_000_001)
+STAMP = SourceStamp(100, 2_000_000_001, 3_000_000_001)
 
 
-def catalogue(cells: dict[str, Stamp], box: Box = (0.0, 0.0, 20.0, 20.0)) -> Catalogue:
+def catalogue(cells: dict[str, SourceStamp], box: Box = (0.0, 0.0, 20.0, 20.0)) -> Catalogue:
     return Catalogue.from_cells([(cell_id, box, stamp) for cell_id, stamp in cells.items()])
 
 
@@ -102,16 +102,17 @@ def test_find_in_an_empty_catalogue() -> None:
 
 
 def test_cell_version_is_the_documented_hash() -> None:
-    cells = catalogue({"/m/ä.pcd": Stamp(5, -6, 7)})
-    expected = xxhash.xxh3_64("/m/ä.pcd".encode() + b"\0" + struct.pack("<qqq", 5, -6, 7)).intdigest()
-    assert cells.version(0) == expected
+    cells = catalogue({"/m/ä.pcd": SourceStamp(5, -6, 7)})
+    expected = struct.pack("<I", 9) + "/m/ä.pcd".encode() + struct.pack("<I3q", 24, 5, -6, 7)
+    expected += struct.pack("<4d", 0.0, 0.0, 20.0, 20.0)
+    assert cells.version(0) == xxhash.xxh3_64(expected).intdigest()
 
 
 def test_map_version_is_the_documented_hash() -> None:
     n = 4096 + 3
     names = [f"c{i:05d}.pcd" for i in range(n)]
     boxes: list[Box] = [(float(i), 0.5, i + 20.0, 20.5) for i in range(n)]
-    stamps = [Stamp(i, i + 1, i + 2) for i in range(n)]
+    stamps = [SourceStamp(i, i + 1, i + 2) for i in range(n)]
     cells = Catalogue.from_cells(
         (f"/map/{name}", box, stamp) for name, box, stamp in zip(names, boxes, stamps, strict=True)
     )
@@ -129,27 +130,33 @@ def test_versions_follow_a_corrected_stamp() -> None:
     many = {f"/m/{i:05d}.pcd": STAMP for i in range(5000)}
     cells = catalogue(many)
     before, map_before = [cells.version(i) for i in (0, 4999)], cells.map_version
-    other = Stamp(101, 5, 6)
-    cells.set_stamp(4999, other)
-    assert cells.stamp(4999) == other
+    other = SourceStamp(101, 5, 6)
+    cells.set_stamp(4999, other.token)
+    assert cells.stamp(4999) == other.token
     assert cells.version(0) == before[0]
     assert cells.version(4999) != before[1]
     assert cells.map_version == catalogue({**many, "/m/04999.pcd": other}).map_version != map_before
-    cells.set_stamp(4999, STAMP)
+    cells.set_stamp(4999, STAMP.token)
     assert [cells.version(i) for i in (0, 4999)] == before
     assert cells.map_version == map_before
 
 
-def test_every_part_of_a_stamp_and_the_id_make_the_version() -> None:
+def test_every_part_of_a_stamp_the_id_and_the_box_make_the_version() -> None:
     cells = {
-        "/m/a.pcd": Stamp(1, 2, 3),
-        "/m/b.pcd": Stamp(1, 2, 3),
-        "/m/c.pcd": Stamp(2, 2, 3),
-        "/m/d.pcd": Stamp(1, 3, 3),
-        "/m/e.pcd": Stamp(1, 2, 4),
+        "/m/a.pcd": SourceStamp(1, 2, 3),
+        "/m/b.pcd": SourceStamp(1, 2, 3),
+        "/m/c.pcd": SourceStamp(2, 2, 3),
+        "/m/d.pcd": SourceStamp(1, 3, 3),
+        "/m/e.pcd": SourceStamp(1, 2, 4),
     }
     made = catalogue(cells)
-    assert len({made.version(i) for i in range(len(made))}) == len(cells)
+    versions = {made.version(i) for i in range(len(made))}
+    assert len(versions) == len(cells)
+    for side in range(4):
+        low, high = [0.0, 0.0], [20.0, 20.0]
+        (low if side < 2 else high)[side % 2] += 1e-9
+        elsewhere = catalogue(cells, box=(*low, *high))  # type: ignore[arg-type]
+        assert versions.isdisjoint(elsewhere.version(i) for i in range(len(made)))
 
 
 @pytest.mark.parametrize(
@@ -194,13 +201,13 @@ def test_boxes_and_query_speak_of_the_same_cells() -> None:
 
 versions = st.dictionaries(
     st.sampled_from([f"/m/{folder}{name}.pcd" for folder in ("", "x/", "x/y/") for name in "abcdef"]),
-    st.builds(Stamp, st.integers(0, 2), st.just(1), st.just(2)),
+    st.builds(SourceStamp, st.integers(0, 2), st.just(1), st.just(2)),
 )
 
 
 @given(versions, versions)
 @settings(max_examples=200, deadline=None)
-def test_compare_equals_set_differences(old: dict[str, Stamp], new: dict[str, Stamp]) -> None:
+def test_compare_equals_set_differences(old: dict[str, SourceStamp], new: dict[str, SourceStamp]) -> None:
     change = compare(catalogue(old), catalogue(new))
     assert change.added == tuple(sorted(new.keys() - old.keys()))
     assert change.removed == tuple(sorted(old.keys() - new.keys()))

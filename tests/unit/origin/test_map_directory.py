@@ -14,7 +14,7 @@ from shmmap.errors import MapDataError, MapMissing
 from shmmap.geometry import Circle
 from shmmap.origin.catalogue import compare
 from shmmap.origin.map_directory import MapDirectory, open_map
-from shmmap.origin.stamp import Stamp
+from shmmap.segment.layout import SourceStamp
 from tests.support.pcd_files import write_pcd
 
 NAMES = ("t_0_0.pcd", "t_20_0.pcd", "t_-20_40.pcd")
@@ -49,7 +49,8 @@ def check(map_path: Path | str, cells: Path, **options: object) -> None:
         x, y = CORNERS[name]
         assert catalogue.box(index) == (x, y, x + 20, y + 20)
         status = (cells / name).stat()
-        assert catalogue.stamp(index) == (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+        assert catalogue.stamp(index) == SourceStamp.of(status).token
+        assert catalogue.source_bytes(index) == status.st_size
     assert catalogue.ids(catalogue.query(Circle(-10.0, 50.0, 1.0))) == [str(cells / "t_-20_40.pcd")]
 
 
@@ -297,7 +298,7 @@ def test_one_pcd_is_one_cell_with_the_bounds_of_its_points(tmp_path: Path, name:
             assert len(catalogue) == 1
             assert catalogue.id(0) == str(file)
             assert catalogue.box(0) == (-7.25, -2.0, 1.5, 9.0)
-            assert catalogue.stamp(0) == Stamp.of(file.stat())
+            assert catalogue.stamp(0) == SourceStamp.of(file.stat()).token
 
 
 def test_one_pcd_too_large_wants_dividing(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_comes_from_the_sidecar_while_nothing_changed(origin: MapDirectory) -> N
     cached.set_stamp(index, cached.stamp(0))  # arrays from the sidecar are as good as fresh ones
     fresh = origin.load(fresh=True)
     assert compare(first, fresh).changed == (str(file),)
-    assert fresh.stamp(index).size == 77
+    assert fresh.source_bytes(index) == 77
     assert_equal(fresh, origin.load())
 
 
@@ -115,7 +115,7 @@ def test_any_visible_change_is_noticed(origin: MapDirectory, change: Callable[[P
     index = catalogue.find(str(unseen))
     # the files were looked at again, so the rewrite shows as well
     assert (index is None) == (change is remove_cell)
-    assert index is None or catalogue.stamp(index).size == size
+    assert index is None or catalogue.source_bytes(index) == size
 
 
 def test_a_map_that_changed_just_now_is_not_cached(origin: MapDirectory) -> None:

@@ -10,17 +10,19 @@ import zlib
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from xxhash import xxh3_64_intdigest
 
 from shmmap.columns import ColumnSpec
 from shmmap.errors import SegmentCorrupt
 from shmmap.segment.header import pack_header, unpack_header
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp, header_size, plan_columns
 from shmmap.segment.publish_block import PublishBlock, pack_publish_block, unpack_publish_block
+from shmmap.segment.version import cell_version, layer_version
 from tests.support.segment_reader import parse
 
 # offset and bytes of everything that is not zero in the header below
 GOLDEN = {
-    0: "53484d4d415000010100010004030201",  # magic, 1.1, byte order
+    0: "53484d4d415000010100020004030201",  # magic, 1.2, byte order
     16: "00100000000000008010000000000000",  # 4096 header bytes, 4224 total
     32: "02000000000000000300000000000000",  # 2 rows of 3 points
     48: "01000000000000002c01000000000000",  # 1 dropped, source of 300 bytes
@@ -46,7 +48,7 @@ GOLDEN = {
     752: "020000000000000000ffeeddccbbaa99",  # 2 bytes, checksum
     768: "2f6d2f612e706364706f696e74736d61",  # /m/a.pcd points ma
     784: "70000000000000000000000000000000",  # p
-    4016: "0000000000000000b3aadf6d00000000",  # CRC at 4024
+    4016: "0000000000000000cb5a799200000000",  # CRC at 4024
 }
 GOLDEN_PUBLISH = "5055424c49534800 0807060504030201 1817161514131211" + "00" * 32 + "aecf54c3 00000000"
 
@@ -247,3 +249,28 @@ def test_the_lattice_s_golden_bytes() -> None:
     assert page[:216] == golden_page()[:216]
     assert page[288:4024] == golden_page()[288:4024]
     assert unpack_header(memoryview(page), 4224) == header
+
+
+def test_versions_golden_bytes() -> None:
+    """The bytes that LAYOUT.md says are hashed."""
+    stamp = SourceStamp(300, 1700000000123456789, 1700000001123456789).token
+    assert stamp.hex() == "2c0100000000000015cd853dfe9c971715972079fe9c9717"
+    hashed = (
+        "080000002f6d2f612e706364"  # /m/a.pcd
+        "18000000" + stamp.hex() +  # 24 bytes
+        "00000000000034c0000000000000000000000000000000000000000000003440"  # -20, 0, 0, 20
+    )  # fmt: skip
+    box = (-20.0, 0.0, 0.0, 20.0)
+    cell = cell_version("/m/a.pcd", stamp, box)
+    assert cell == xxh3_64_intdigest(bytes.fromhex(hashed)) == 0x0CAE10A48722668C
+    assert cell_version("/m/\udcff", b"", box) == xxh3_64_intdigest(
+        b"\4\0\0\0/m/\xff" + bytes(4) + struct.pack("<4d", *box)
+    )
+    spec = "0d0000006e6474286c6561663d322e3029"  # ndt(leaf=2.0)
+    assert layer_version(0x1122334455667788, "ndt(leaf=2.0)", 0x0103) == xxh3_64_intdigest(
+        bytes.fromhex("8877665544332211" + spec + "03010000")
+    )
+    around = "0100000000000000ffffffffffffffff"
+    assert layer_version(0x1122334455667788, "ndt(leaf=2.0)", 0x0103, [1, 2**64 - 1]) == xxh3_64_intdigest(
+        bytes.fromhex("8877665544332211" + spec + "03010000" + around)
+    )

@@ -17,6 +17,8 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.worker_pool import Worker
 from shmmap.daemon.records import Failure, Key
+from shmmap.layers.derive import CellJob, Neighbour
+from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.processes.start_child import MAX_PACKET_BYTES, channel
 from shmmap.protocol.messages import Area, CircleMessage, Selected
@@ -116,9 +118,9 @@ class Puppet:
         socket.send_fds(self.channel, [worker_messages.encode(message)], [] if fd is None else [fd])
 
     def done(self, job: worker_messages.Job) -> worker_messages.Done:
-        status = os.stat(job.path)
-        stamp = SourceStamp.of(status)
-        return worker_messages.Done(job.number, 4096, 1, 0, 0.0, 1.0, stamp, 1)
+        state = SourceStamp.of(os.stat(job.path))
+        version = CellJob(job.cell_id, job.path, job.box).version(layer_spec(job.layer), state, ())
+        return worker_messages.Done(job.number, 4096, 1, 0, 0.0, 1.0, version, state.token, 1)
 
     def segment(self) -> int:
         fd = self.one.directory.create()
@@ -231,7 +233,15 @@ def test_the_longest_job_there_is(puppet: Puppet) -> None:
     """All neighbours that a layer may look at, on the longest paths that a file system has."""
     path = "/" + "p" * 4094
     job = worker_messages.Job(
-        1, path, path, "denoise", (0.0,) * 4, "map", 1 << 20, "", (path,) * (MAX_NEIGHBOURS + 1)
+        1,
+        path,
+        path,
+        "denoise",
+        (0.0,) * 4,
+        "map",
+        1 << 20,
+        "",
+        (Neighbour(path, (0.1,) * 4),) * (MAX_NEIGHBOURS + 1),
     )
     assert puppet.one.pool.submit(job, 0.0)
     assert worker_messages.decode_to_worker(puppet.channel.recv(MAX_PACKET_BYTES)) == job

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -21,6 +22,7 @@ from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import in_use, prepare_process
 from shmmap.segment.publish_block import PublishBlock
+from shmmap.segment.version import cell_version
 from tests.support.daemon_process import wait_ended, wait_readable
 from tests.support.divided_map import random_points
 from tests.support.pcd_files import write_ascii, write_pcd
@@ -117,7 +119,8 @@ def test_a_good_file(loader: Loader, tmp_path: Path) -> None:
     assert isinstance(done, worker_messages.Done)
     status = path.stat()
     assert (done.number, done.points, done.dropped) == (5, 1000, 0)
-    assert done.stamp == (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    assert done.stamp == struct.pack("<3q", status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    assert done.version == cell_version(str(path), done.stamp, BOX)
     expected = random_points(np.random.default_rng(1000), (0, 0), 1000)
     assert (done.z_min, done.z_max) == (float(expected["z"].min()), float(expected["z"].max()))
     try:

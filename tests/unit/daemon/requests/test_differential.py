@@ -158,7 +158,7 @@ def test_any_request(
     told = unpack_versions(found.removed_packed)
     assert set(told) == gone
     assert len(told) == len(gone), "duplicates are told once"
-    assert {Path(cell).name for cell in found.old} == other
+    assert {(Path(key.cell_id).name, key.layer) for key in found.old} == {(name, "points") for name in other}
 
     warm = warm_difference(cache, message, np.array(indices, dtype=np.intp), "points")
     all_warm = not {COLD, BROKEN} & set(inside)

@@ -10,6 +10,7 @@ import pytest
 from shmmap.daemon.requests import limits
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES
 from shmmap.errors import BadRequest, Busy
+from shmmap.layers import versions as layer_versions
 from shmmap.protocol.messages import Area, Differential, HeldCell, Intent, Selected
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
@@ -65,20 +66,26 @@ def test_loads_that_one_process_waits_for(
     assert len(one.cells_of(5).cells) == 16
 
 
-def test_layers(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_layers(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     session = one.session()
     with pytest.raises(BadRequest, match="17 layers in one request"):
         one.ask(session, Area(1, EVERYWHERE, ("points",) * 17))
-    one.ask(session, Selected(2, ("0_0.pcd",), wait=30.0))
-    assert len(one.cells_of(2).cells) == 1
-    monkeypatch.setattr(limits, "LEAST_LAYERS_IN_MEMORY", 1)
-    monkeypatch.setattr(limits, "LAYER_TABLES_BYTES", 0)
-    other = Selected(3, ("0_0.pcd",), ("voxel(leaf=1.0)",))
-    with pytest.raises(BadRequest, match="1 different layers are in memory already"):
-        one.ask(session, other)
-    one.ask(session, Selected(4, ("20_0.pcd",), wait=30.0))
-    assert len(one.cells_of(4).cells) == 1
+
+
+def test_a_layer_that_would_look_into_too_many_cells(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(layer_versions, "MAX_NEIGHBOURS", 5)
+    one = inner(small_map.root)
+    for message in (
+        Area(1, EVERYWHERE, ("points", "normals(radius=10)")),
+        Differential(2, EVERYWHERE, ("normals(radius=10)",)),
+        Selected(3, ("0_0.pcd",), ("denoise(halo=10)",)),
+    ):
+        with pytest.raises(BadRequest, match="would look into about 9 cells around each one"):
+            one.ask(one.session(), message)
+    assert not one.loads.by_key
 
 
 def test_intents() -> None:
