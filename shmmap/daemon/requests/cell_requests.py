@@ -20,7 +20,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.cell_replies import Answer, CellReplies
-from shmmap.daemon.requests.differential import difference, warm_difference
+from shmmap.daemon.requests.differential import lacking, warm_difference
 from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, WaitingList, parts
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
@@ -31,6 +31,8 @@ from shmmap.protocol import messages
 __all__ = ["CellRequests", "note_area"]
 
 MAX_WAIT_S: Final = 3600.0
+MOST_AT_ONCE: Final = 4096
+"""Cells of an area that are compared with what a client holds in one turn, if all are in memory."""
 
 Result = TypeVar("Result")
 
@@ -112,7 +114,8 @@ class CellRequests:
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
         found = cache.catalogue.query(area, limits.MOST_CELLS)
-        if len(layers) == 1 and area.z is None:
+        limits.check_count(len(found) * len(layers))
+        if len(layers) == 1 and area.z is None and len(found) <= MOST_AT_ONCE:
             warm = warm_difference(cache, message, found, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
                 answer = Answer([resident.handle for resident in warm.residents], warm.residents)
@@ -120,19 +123,18 @@ class CellRequests:
                 # the bookkeeping can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
                 return self._answers.hand_out(session, answer, self._now_s())
-        limits.check_count(len(found) * len(layers))
-        lacks = difference(cache, message, cache.at_height(found.tolist(), area.z), layers)
-        wanted = PendingRequest(
-            session, message.request, lacks.cells, cache.catalogue, removed=lacks.removed,
-            removed_packed=lacks.removed_packed, held_old=lacks.old, area=area,
-        )  # fmt: skip
-        return self._serve(wanted, message.wait)
+        return self._serve_lacking(lacking(cache, session, message, area, layers), message.wait)
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these."""
         self._scheduler.let_go(residents, self._now_s())
 
     # --- loading and waiting --------------------------------------------------------------------
+
+    def _serve_lacking(
+        self, lacks: Generator[None, None, PendingRequest], wait_s: float | None
+    ) -> Iterator[None]:
+        yield from self._serve((yield from lacks), wait_s)
 
     def _serve(self, wanted: PendingRequest, wait_s: float | None) -> Iterator[None]:
         """Answer a request, or have loaded what is cold of it and let it wait."""

@@ -3,25 +3,34 @@
 
 Versions do the work: one names a layer of a cell *and* its state, so that a client that holds exactly the
 current versions of an area lacks nothing.  `warm_difference` is the way of nearly every request of
-a moving vehicle and is kept short; `difference` covers everything.
+a moving vehicle and is kept short; `difference` covers everything, a part a turn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import cast
+from functools import partial
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.requests.limits import check_count
+from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, parts
+from shmmap.daemon.transport.sessions import Session
+from shmmap.geometry import Area
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
 
-__all__ = ["Difference", "WarmDifference", "difference", "warm_difference"]
+__all__ = ["Difference", "WarmDifference", "difference", "lacking", "warm_difference"]
+
+UNKNOWN_A_STEP: Final = 16
+"""Versions of layers with a halo that are found in one turn: half a millisecond."""
 
 
 @dataclass(eq=False, slots=True)
@@ -105,40 +114,88 @@ class Difference:
 
 
 def difference(
-    cache: CellCache, message: Differential, indices: Sequence[int], layers: tuple[str, ...]
-) -> Difference:
-    """Return what the client lacks of the area's cells ``indices``, whether in memory or not."""
+    cache: CellCache,
+    message: Differential,
+    indices: Sequence[int],
+    layers: tuple[str, ...],
+    pause: Callable[[], Iterator[None]],
+) -> Generator[None, None, Difference]:
+    """Find what the client lacks of the area's cells ``indices``, whether in memory or not.
+
+    Parameters
+    ----------
+    pause
+        Lets others have a turn: called before each part but the first.
+    """
     version_of, id_of = cache.layers.version, cache.catalogue.id
+    for number, unknown in enumerate(cache.layers.unknown(indices, layers)):
+        if number and number % UNKNOWN_A_STEP == 0:
+            yield from pause()
+        version_of(*unknown)
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
     result = Difference()
     has: dict[int, set[str]] = {}
     removed: dict[str, None] = {}
-    for cell in message.held:
-        index = cache.index_of(cell.id)
-        if index is None or index not in inside:
-            removed[cell.id] = None
-            continue
-        mine = layers if cell.layers is None else canonical_layers(cell.layers)
-        if cell.version is not None:  # that of one of them; else it is an old one
-            current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
-            if not current_of:
-                result.old.update(Key(id_of(index), layer) for layer in mine)
-            mine = tuple(current_of)
-        has.setdefault(index, set()).update(mine)
+    for number, some in enumerate(parts(message.held)):
+        if number:
+            yield from pause()
+        for cell in some:
+            index = cache.index_of(cell.id)
+            if index is None or index not in inside:
+                removed[cell.id] = None
+                continue
+            named = layers if cell.layers is None else canonical_layers(cell.layers)
+            mine = [layer for layer in named if layer in layers]
+            if cell.version is not None:  # that of one of them; else it is an old one
+                current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
+                if not current_of:
+                    result.old.update(Key(id_of(index), layer) for layer in mine)
+                mine = current_of
+            has.setdefault(index, set()).update(mine)
     current: set[int] = set()
-    for index in indices:
-        for layer in layers:
-            version = version_of(index, layer)
-            current.add(version)
-            if version not in packed and layer not in has.get(index, ()):
-                result.cells.append((index, layer))
+    for number, inner in enumerate(parts(indices)):
+        if number:
+            yield from pause()
+        for index in inner:
+            for layer in layers:
+                version = version_of(index, layer)
+                current.add(version)
+                if version not in packed and layer not in has.get(index, ()):
+                    result.cells.append((index, layer))
     gone = packed - current
-    for version in [*gone]:
-        known, layer = cache.warm.of_version.get(version, (-1, ""))
-        if known in inside:
-            gone.discard(version)
-            result.old.add(Key(id_of(known), layer))
+    for number, outdated in enumerate(parts([*gone])):
+        if number:
+            yield from pause()
+        for version in outdated:
+            known, layer = cache.warm.of_version.get(version, (-1, ""))
+            if known in inside:
+                gone.discard(version)
+                result.old.add(Key(id_of(known), layer))
     result.removed = tuple(removed)
     result.removed_packed = pack_versions(gone)
     return result
+
+
+def lacking(
+    cache: CellCache, session: Session, message: Differential, area: Area, layers: tuple[str, ...]
+) -> Generator[None, None, PendingRequest]:
+    """Find what a client lacks of an area, a part a turn; anew if the map changes meanwhile.
+
+    Raises
+    ------
+    BadRequest
+        The area has too many cells.
+    NoSession
+        The session has ended meanwhile.
+    """
+    while True:
+        found = cache.catalogue.query(area)
+        check_count(len(found) * len(layers))
+        wanted = PendingRequest(session, message.request, [], cache.catalogue, area=area)
+        with contextlib.suppress(MapChanged):
+            indices = cache.at_height(found.tolist(), area.z)
+            lacks = yield from difference(cache, message, indices, layers, partial(wanted.pause, cache))
+            wanted.cells, wanted.held_old = lacks.cells, lacks.old
+            wanted.removed, wanted.removed_packed = lacks.removed, lacks.removed_packed
+            return wanted

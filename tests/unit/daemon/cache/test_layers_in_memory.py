@@ -61,7 +61,7 @@ def test_any_number_of_layers_is_in_memory(
     first, session, warm = (made.id("0_0.pcd"),), one.session(), one.cache.warm
     layers = [f"voxel(leaf={number}.0)" for number in range(1, 9)]
     for number, layer in enumerate(layers):
-        one.cells.selected(session, Selected(number + 1, first, (layer,), 30.0), one.now_s())
+        one.ask(session, Selected(number + 1, first, (layer,), 30.0))
         assert len(one.cells_of(number + 1).cells) == 1
     assert set(warm.layers) == set(layers)
     assert list(warm.tables) == layers[:2]

@@ -19,12 +19,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmmap.daemon.requests.differential import difference, warm_difference
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.requests.differential import Difference, difference, warm_difference
 from shmmap.errors import BadRequest
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Area, BoxMessage, Differential, HeldCell
 from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.unit.daemon.inner_daemon import InnerDaemon
+from tests.unit.daemon.inner_daemon import InnerDaemon, finish
 
 COLD = "20_20.pcd"
 BROKEN = "20_0.pcd"
@@ -72,6 +73,17 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     current = {name: catalogue.version(index) for index, name in enumerate(names)}
     yield Served(inner, made, names, current, before)
     inner.close()
+
+
+def find(cache: CellCache, message: Differential, indices: list[int], layers: tuple[str, ...]) -> Difference:
+    """Do all steps of finding the difference; return it."""
+    found: list[Difference] = []
+
+    def steps() -> Iterator[None]:
+        found.append((yield from difference(cache, message, indices, layers, lambda: iter((None,)))))
+
+    finish(steps())
+    return found[0]
 
 
 def oracle(
@@ -151,7 +163,7 @@ def test_any_request(
     indices = [served.names.index(name) for name in inside]
     cache = served.inner.cache
 
-    found = difference(cache, message, indices, layers)
+    found = find(cache, message, indices, layers)
     new, removed, gone, other = oracle(served, inside, held, packed, layers)
     assert [(served.names[index], layer) for index, layer in found.cells] == new
     assert list(found.removed) == removed
@@ -183,7 +195,7 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
         (("voxel(leaf=1.0)", "points"), []),
     ):
         message = Differential(1, EVERYWHERE, ("points",), (HeldCell(name, served.current[name], layers),))
-        found = difference(served.inner.cache, message, [index], ("points",))
+        found = find(served.inner.cache, message, [index], ("points",))
         assert found.cells == lacks
         assert found.removed == ()
 
@@ -192,7 +204,7 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
 def test_packed_versions_of_broken_length(served: Served, packed: bytes) -> None:
     message = Differential(1, EVERYWHERE, packed=packed)
     with pytest.raises(BadRequest):
-        difference(served.inner.cache, message, [0], ("points",))
+        find(served.inner.cache, message, [0], ("points",))
     with pytest.raises(BadRequest):
         warm_difference(served.inner.cache, message, np.array([0], dtype=np.intp), "points")
 
@@ -204,7 +216,7 @@ def test_very_many_held(served: Served) -> None:
     index = served.names.index("0_0.pcd")
     message = Differential(1, EVERYWHERE, held=tuple(rows))
     expected = [row.id for row in rows if row.id != "0_0.pcd"]
-    found = difference(served.inner.cache, message, [index], ("points",))
+    found = find(served.inner.cache, message, [index], ("points",))
     assert (found.cells, list(found.removed)) == ([], expected)
     warm = warm_difference(served.inner.cache, message, np.array([index], dtype=np.intp), "points")
     assert warm is not None

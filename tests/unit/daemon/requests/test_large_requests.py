@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.daemon.requests import limits
+from shmmap.daemon.requests.differential import UNKNOWN_A_STEP
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
-from shmmap.errors import NoSession
+from shmmap.errors import BadRequest, NoSession
 from shmmap.protocol.codec import pack_versions
-from shmmap.protocol.messages import Area, CircleMessage, Differential, Selected
+from shmmap.protocol.messages import Area, CircleMessage, Differential, HeldCell, Selected
 from tests.support.divided_map import DividedMap, make_map
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish, names
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon, finish, names
 
 SIDE = 14
 CELLS = SIDE * SIDE
@@ -125,3 +127,66 @@ def test_many_loads_end_while_it_is_gone_through(inner: Inner, made: DividedMap)
     one.run_until(lambda: one.ledger.resident_count == CELLS)
     finish(work)
     assert len(one.cells_of(1).cells) == CELLS
+
+
+FAR = ("normals(radius=30.0)", "denoise(halo=30.0)")
+
+
+def test_what_is_refused_costs_no_version(
+    inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding the neighbours of a cell takes long."""
+    monkeypatch.setattr(limits, "MOST_CELLS", 2 * CELLS - 1)
+    one = inner(str(made.root))
+    for message in (Area(1, EVERYWHERE, FAR), Differential(2, EVERYWHERE, FAR, packed=bytes(80))):
+        with pytest.raises(BadRequest, match=f"{2 * CELLS} cells in one request"):
+            one.ask(one.session(), message)
+    assert len(list(one.cache.layers.unknown(range(CELLS), FAR))) == 2 * CELLS
+    assert not one.loads.by_key
+
+
+def test_few_versions_of_layers_that_look_around_are_found_a_turn(inner: Inner, made: DividedMap) -> None:
+    """Each once, however often they are asked for; a change makes those anew that look into it, no others."""
+    one = inner(str(made.root))
+    session, versions = one.session(), one.cache.layers
+    one.pool.limit = 0
+
+    def found_a_step(message: Differential) -> list[int]:
+        counts, before = [], len(list(versions.unknown(range(CELLS), FAR)))
+        for _ in one.cells.differential(session, message):
+            now = len(list(versions.unknown(range(CELLS), FAR)))
+            counts.append(before - now)
+            before = now
+        return [count for count in counts if count]
+
+    held = pack_versions(range(1, 100))
+    found = found_a_step(Differential(1, EVERYWHERE, FAR, packed=held))
+    assert max(found) == UNKNOWN_A_STEP
+    assert sum(found) >= 2 * CELLS - UNKNOWN_A_STEP  # the rest with what follows
+    assert found_a_step(Differential(2, EVERYWHERE, FAR, packed=held)) == []
+    assert len(one.cells_of(2).pending) == 2 * CELLS
+    middle = names_of(one).index("0_0.pcd")
+    one.map_switch.learn(middle, bytes(24))
+    assert len(list(versions.unknown(range(CELLS), FAR))) == 2 * 5 * 5
+
+
+def names_of(one: InnerDaemon) -> list[str]:
+    return [one.cache.catalogue.id(index).rsplit("/", 1)[1] for index in range(CELLS)]
+
+
+def test_the_map_changes_while_differences_are_found(inner: Inner, tmp_path: Path) -> None:
+    made = make_map(tmp_path / "map", columns=SIDE, rows=SIDE, points=5)
+    one = inner(str(made.root))
+    held = tuple(HeldCell(cell.id) for cell in one.everything(999).cells)
+    gone, left = sorted(made.corners), []
+    for count in range(1, PARTS + 1):
+        work = one.cells.differential(one.session(), Differential(count, EVERYWHERE, held=held[1:]))
+        for _ in range(count):
+            next(work)
+        left.append(gone.pop(1))
+        del made.corners[left[-1]]  # every index after it is another one's now
+        made.write_metadata()
+        one.reload()
+        finish(work)
+        reply = one.cells_of(count)
+        assert ([Path(cell).name for cell in reply.removed], names(reply)) == (left, gone[:1])
