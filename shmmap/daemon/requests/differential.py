@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.limits import check_count
+from shmmap.daemon.requests.limits import MOST_CELLS, check_count
 from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, parts
 from shmmap.daemon.transport.sessions import Session
 from shmmap.geometry import Area
@@ -190,7 +190,7 @@ def lacking(
         The session has ended meanwhile.
     """
     while True:
-        found = cache.catalogue.query(area)
+        found = cache.catalogue.query(area, MOST_CELLS)
         check_count(len(found) * len(layers))
         wanted = PendingRequest(session, message.request, [], cache.catalogue, area=area)
         with contextlib.suppress(MapChanged):

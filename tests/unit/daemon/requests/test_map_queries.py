@@ -14,8 +14,8 @@ from shmmap.daemon.requests import map_queries
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.geometry import Area, Box, Circle
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.stamp import Stamp
 from shmmap.protocol.messages import Metadata, MetadataPage, area_to_message
+from shmmap.segment.layout import SourceStamp
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
 
@@ -26,7 +26,7 @@ def catalogue() -> Catalogue:
     """Cells whose ids have another order than their places."""
     places = np.random.default_rng(1).permutation(SIDE * SIDE)
     return Catalogue.from_cells(
-        (f"/m/{n:04}.pcd", (20.0 * x, 20.0 * y, 20.0 * x + 20, 20.0 * y + 20), Stamp(1, n, 1))
+        (f"/m/{n:04}.pcd", (20.0 * x, 20.0 * y, 20.0 * x + 20, 20.0 * y + 20), SourceStamp(1, n, 1))
         for n, (x, y) in enumerate(divmod(int(place), SIDE) for place in places)
     )
 
