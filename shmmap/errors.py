@@ -30,7 +30,8 @@
     │   ├── LoadFailed         its source cannot be read
     │   ├── LoadTimeout        loading took longer than its deadline
     │   ├── OverBudget         it does not fit in memory; `holders` says who uses it
-    │   └── NoSpace            the shared-memory file system is full
+    │   ├── NoSpace            the shared-memory file system is full
+    │   └── Offline            its origin cannot be reached at present           exit 75
     ├── PackageMissing         a Python package is not installed                  exit 69
     └── InternalError          a defect in shmmap: please report it               exit 70
 
@@ -67,6 +68,7 @@ __all__ = [
     "NoSocket",
     "NoSpace",
     "NotPermitted",
+    "Offline",
     "OverBudget",
     "PackageMissing",
     "ProtocolMismatch",
@@ -94,11 +96,12 @@ class ShmmapError(Exception):
 
     code: ClassVar[str] = "error"
     exit_code: ClassVar[int] = 70
+    advice: ClassVar[str] = ""  # the hint where no other is given
 
     def __init__(self, message: str, *, hint: str = "") -> None:
         super().__init__(message)
         self.message = message
-        self.hint = hint
+        self.hint = hint or self.advice
 
     def __str__(self) -> str:
         return f"{self.message} ({self.hint})" if self.hint else self.message
@@ -130,16 +133,10 @@ class NoColumn(BadRequest, KeyError):
 
 
 class MapDataError(ShmmapError):
-    """A file is not what it claims to be.
+    """A file, ``path``, is not what it claims to be.
 
-    Attributes
-    ----------
-    path
-        The file.
-    offset
-        Byte offset at which the contradiction was found, or None where it has no place.
-    cause
-        One of a small set of names, for programs: ``truncated``, ``lfs_pointer``, ``zero_filled``, ...
+    ``offset`` is the byte at which the contradiction was found, None where it has no place; ``cause`` is one
+    of a small set of names, for programs: ``truncated``, ``lfs_pointer``, ``zero_filled``, ...
     """
 
     code = "bad_map_data"
@@ -272,12 +269,8 @@ class SegmentCorrupt(SegmentError):
 class CellError(ShmmapError):
     """One cell could not be had; other cells and requests are unaffected.
 
-    Attributes
-    ----------
-    cell_id, layer
-        Which cell, and which of its layers.
-    holders
-        For `OverBudget`: who uses the memory, a `Holder` each; ``str`` of one is a line to read.
+    ``cell_id`` and ``layer`` say which cell, and which of its layers; ``holders``, for `OverBudget`, who uses
+    the memory, a `Holder` each: ``str`` of one is a line to read.
     """
 
     code = "cell_error"
@@ -323,6 +316,14 @@ class NoSpace(CellError):
     code = "no_space"
 
 
+class Offline(CellError):
+    """Where the cell comes from cannot be reached at present: a passing problem, tried again by itself."""
+
+    code = "offline"
+    exit_code = 75
+    advice = "ask again later: it is tried again when somebody asks"
+
+
 class PackageMissing(ShmmapError, ImportError):
     """A Python package that this needs is not installed; a client-only install has few of them."""
 
@@ -337,10 +338,8 @@ class InternalError(ShmmapError):
 
 
 def _tree(root: type[ShmmapError]) -> dict[str, type[ShmmapError]]:
-    found = {root.code: root}
-    for child in root.__subclasses__():
-        found.update(_tree(child))
-    return found
+    below = (_tree(child).items() for child in root.__subclasses__())
+    return {root.code: root, **dict(item for items in below for item in items)}
 
 
 def error_from_wire(code: str, message: str, hint: str = "") -> ShmmapError:

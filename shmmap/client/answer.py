@@ -103,4 +103,6 @@ class Answer:
             removed(reply.removed, reply.removed_packed) if removed is not None else (),
             reply.epoch,
             reply.map_version,
+            reply.layers,
+            reply.covered,
         )

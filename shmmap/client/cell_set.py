@@ -39,9 +39,16 @@ class CellSet(Sequence[Cell]):
         Which life of the daemon answered.
     map_version : int
         Which state of the map.
+    layers : tuple of str
+        The layers asked for, one for each, by the names that cells have them by.  Empty from a daemon older
+        than protocol 1.3.
+    covered : bool
+        Whether the daemon knows all that the map has of what was asked for.  Where it does not (a map that
+        comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may
+        exist: ask again.
     """
 
-    __slots__ = ("cells", "epoch", "failed", "map_version", "pending", "removed")
+    __slots__ = ("cells", "covered", "epoch", "failed", "layers", "map_version", "pending", "removed")
 
     def __init__(
         self,
@@ -51,6 +58,8 @@ class CellSet(Sequence[Cell]):
         removed: tuple[str, ...] = (),
         epoch: int = 0,
         map_version: int = 0,
+        layers: tuple[str, ...] = (),
+        covered: bool = True,
     ) -> None:
         self.cells = cells
         self.failed = failed
@@ -58,17 +67,20 @@ class CellSet(Sequence[Cell]):
         self.removed = removed
         self.epoch = epoch
         self.map_version = map_version
+        self.layers = layers
+        self.covered = covered
 
     def __repr__(self) -> str:
         return (
             f"<CellSet of {len(self.cells)} cells, {len(self.removed)} removed,"
-            f" {len(self.pending)} pending, {len(self.failed)} failed>"
+            f" {len(self.pending)} pending, {len(self.failed)} failed"
+            f"{'' if self.covered else ', not covered'}>"
         )
 
     @property
     def complete(self) -> bool:
         """Whether nothing that was asked for is missing."""
-        return not self.failed and not self.pending
+        return self.covered and not self.failed and not self.pending
 
     def raise_for_failures(self) -> CellSet:
         """Return the set itself, or raise the first of `failed`."""

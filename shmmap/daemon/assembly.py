@@ -28,6 +28,7 @@ from shmmap.daemon.host.signals import (
     ignore_signals,
 )
 from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.requests.cell_requests import CellRequests
@@ -48,7 +49,6 @@ from shmmap.daemon.transport.socket_file import listen_at, remove_socket
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 
@@ -240,7 +240,7 @@ class Service:
         self._manager.reloading()
         self._reloader.ask(self._reloaded)
 
-    def _reloaded(self, result: Catalogue | ShmmapError) -> None:
+    def _reloaded(self, result: CatalogueView | ShmmapError) -> None:
         if isinstance(result, ShmmapError):
             self._manager.reloaded(f"reload failed, the old map stays: {result.message}")
             return

@@ -20,12 +20,12 @@ from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
-from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
@@ -52,7 +52,7 @@ class MapInMemory:
     def __init__(
         self,
         config: DaemonConfig,
-        catalogue: Catalogue,
+        catalogue: CatalogueView,
         directory: ShmDirectory,
         pins: PinWatch,
         socket_path: str,

@@ -162,7 +162,7 @@ class PrivateMap:
             return
         self._asked = pose
         before, self.clouds = self.clouds, {}
-        for index in self._catalogue.query(Circle(pose.x, pose.y, self._radius)).tolist():
+        for index in self._catalogue.query(Circle(pose.x, pose.y, self._radius))[0].tolist():
             cell_id = self._catalogue.id(index)
             cloud = before.get(cell_id)
             if cloud is None:

@@ -56,8 +56,8 @@ class Cells(Protocol):
     def box(self, index: int) -> tuple[float, float, float, float]:
         """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
 
-    def query(self, area: Area) -> NDArray[np.intp]:
-        """Cells whose box touches ``area``, ascending."""
+    def query(self, area: Area) -> tuple[NDArray[np.intp], bool]:
+        """Cells whose box touches ``area``, ascending; whether these are all."""
 
 
 class _Kind(NamedTuple):
@@ -120,7 +120,8 @@ class LayerVersions:
 
     def _around(self, index: int, halo_m: float) -> NDArray[np.intp]:
         min_x, min_y, max_x, max_y = self._catalogue().box(index)
-        found = self._catalogue().query(Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m))
+        area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
+        found, _ = self._catalogue().query(area)
         return np.delete(found, found == index)
 
     def check_reach(self, layer: str) -> None:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from shmmap.origin.spatial_index import SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
 
-__all__ = ["Catalogue", "CatalogueChange", "compare"]
+__all__ = ["Catalogue", "CatalogueChange", "Tables", "compare"]
 
 Indices = NDArray[np.intp]
 
@@ -225,13 +226,16 @@ class Catalogue:
         cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]
         return xxh3_64_intdigest(np.ascontiguousarray(cells).data)
 
-    def query(self, area: Area, most: int | None = None) -> Indices:
-        """Cells whose box touches ``area``, ascending (which is id order).
+    complete = True
+    """All cells of the map are here, see `shmmap.daemon.map.catalogue_view.CatalogueView`."""
+
+    def query(self, area: Area, most: int | None = None) -> tuple[Indices, bool]:
+        """Cells whose box touches ``area``, ascending (which is id order), and that the map is known: True.
 
         Borders are closed.  The area's z range plays no part: heights are known only after loading.  If there
         are more than ``most``, some of them, more than ``most``, in no order.
         """
-        return self._index.query(area, most)
+        return self._index.query(area, most), True
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,10 +255,24 @@ class CatalogueChange:
         return bool(self.added or self.removed or self.changed or self.moved)
 
 
-def compare(old: Catalogue, new: Catalogue) -> CatalogueChange:
+class Tables(Protocol):
+    """What is compared of two catalogues; each as `Catalogue` has it."""
+
+    @property
+    def id_prefix(self) -> str: ...
+    @property
+    def names(self) -> NDArray[np.bytes_]: ...
+    @property
+    def boxes(self) -> NDArray[np.float64]: ...
+    @property
+    def stamps(self) -> NDArray[np.int64]: ...
+    def ids(self, indices: Indices) -> list[str]: ...
+
+
+def compare(old: Tables, new: Tables) -> CatalogueChange:
     """Find what changed from ``old`` to ``new``, without visiting every cell in Python."""
     if old.id_prefix == new.id_prefix and np.array_equal(old.names, new.names):
-        in_old = in_new = np.arange(len(new))
+        in_old = in_new = np.arange(len(new.names))
     else:
         prefix = common_directory([old.id_prefix, new.id_prefix])
         _, in_old, in_new = np.intersect1d(
@@ -263,14 +281,14 @@ def compare(old: Catalogue, new: Catalogue) -> CatalogueChange:
     differs = (old.stamps[in_old] != new.stamps[in_new]).any(axis=1)
     moved = (old.boxes[in_old] != new.boxes[in_new]).any(axis=1)
     return CatalogueChange(
-        added=tuple(new.ids(np.setdiff1d(np.arange(len(new)), in_new, assume_unique=True))),
-        removed=tuple(old.ids(np.setdiff1d(np.arange(len(old)), in_old, assume_unique=True))),
+        added=tuple(new.ids(np.setdiff1d(np.arange(len(new.names)), in_new, assume_unique=True))),
+        removed=tuple(old.ids(np.setdiff1d(np.arange(len(old.names)), in_old, assume_unique=True))),
         changed=tuple(new.ids(in_new[differs])),
         moved=tuple(new.ids(in_new[moved])),
     )
 
 
-def _names_below(prefix: str, catalogue: Catalogue) -> NDArray[np.bytes_]:
+def _names_below(prefix: str, catalogue: Tables) -> NDArray[np.bytes_]:
     between = os.fsencode(catalogue.id_prefix[len(prefix) :])
     return np.char.add(between, catalogue.names) if between else catalogue.names
 

@@ -11,7 +11,11 @@ __all__ = ["MapOrigin"]
 
 
 class MapOrigin(Protocol):
-    """Where the cells of one map come from."""
+    """Where the cells of one map come from.
+
+    A cell is read by a loader.  What cannot be reached at present raises `Offline` there: the cell is
+    ``offline`` until it is tried again.
+    """
 
     @property
     def path(self) -> str:
@@ -21,4 +25,11 @@ class MapOrigin(Protocol):
         """Find out which cells there are now.
 
         ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.
+
+        Raises
+        ------
+        MapMissing, MapDataError
+            There is no map, or none that can be served.
+        Offline
+            Where it comes from cannot be reached at present.
         """

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import msgspec
 
 from shmmap import geometry
+from shmmap.errors import BadRequest
 
 __all__ = [
     "AreaMessage",
@@ -22,7 +23,7 @@ __all__ = [
 
 
 class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
-    """True circle; z range absent when either bound is nil."""
+    """True circle; no z range where its bounds are nil."""
 
     x: float
     y: float
@@ -58,6 +59,8 @@ AreaMessage: TypeAlias = CircleMessage | SquareMessage | BoxMessage
 def area_from_message(message: AreaMessage) -> geometry.Area:
     """Return the area a message describes; `BadRequest` if it makes no sense."""
     z = None
+    if (message.z_min is None) != (message.z_max is None):
+        raise BadRequest("a z range needs both bounds", hint="give z_min and z_max, or neither")
     if message.z_min is not None and message.z_max is not None:
         z = geometry.ZRange(message.z_min, message.z_max)
     if isinstance(message, CircleMessage):

@@ -65,6 +65,8 @@ def encode_cells(
     removed_packed: bytes,
     pending: Sequence[PendingCell],
     failed: Sequence[FailedCell],
+    layers: tuple[str, ...],
+    covered: bool = True,
 ) -> bytes:
     """Return a `Cells` reply put together from handles that are encoded already."""
     count = len(handles)
@@ -75,9 +77,9 @@ def encode_cells(
     else:
         head = b"\xdd" + count.to_bytes(4, "big")
     start = encode(("cells", request, epoch, map_version))
-    end = encode((removed, removed_packed, pending, failed))
-    # one array of nine elements instead of two of four: replace their one-byte heads
-    return b"".join((b"\x99", start[1:], head, *handles, end[1:]))
+    end = encode((removed, removed_packed, pending, failed, layers, covered))
+    # one array of eleven elements instead of two: replace their one-byte heads
+    return b"".join((b"\x9b", start[1:], head, *handles, end[1:]))
 
 
 def decode_request(data: bytes | memoryview) -> Request:

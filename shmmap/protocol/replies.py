@@ -139,7 +139,9 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     """Answer to `Area`, `Differential` and `Selected`.
 
     ``removed`` repeats held ids that the client should drop, in the order it gave them;
-    ``removed_packed`` the same for packed versions, in any order.
+    ``removed_packed`` the same for packed versions, in any order.  ``layers`` are those of the request,
+    one for each that it named, in their canonical form.  ``covered`` is false where part of what was asked
+    about is not known yet; nothing lying there is removed.
     """
 
     request: int
@@ -150,6 +152,8 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     removed_packed: bytes = b""
     pending: tuple[PendingCell, ...] = ()
     failed: tuple[FailedCell, ...] = ()
+    layers: tuple[str, ...] = ()
+    covered: bool = True
 
 
 class MetadataRow(msgspec.Struct, array_like=True, frozen=True, gc=False):

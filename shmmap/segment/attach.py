@@ -10,6 +10,7 @@ long as the mapping lives.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import stat
@@ -242,7 +243,8 @@ def attach(
                 hint="ask the daemon again",
             )
         if slot is not None:
-            lock_slot(fd, slot)
+            with contextlib.suppress(OSError):  # it is as safe without; only its user is not known
+                lock_slot(fd, slot)
         step("client.lock")
         available = status.st_size
         end = offset + nbytes if nbytes else available

@@ -283,8 +283,12 @@ def _read_header(fd: int, size: int) -> Header:
         data += os.pread(fd, 65536, len(data))
         header = unpack_header(data)
         _last_header = data[: header.descriptions_end], header
-    if header.rows_offset > size or header.row_bytes < 256:
-        raise SegmentCorrupt(f"the statistics claim {header.rows_offset} bytes and more, there are {size}")
+    end = max(
+        header.identity_offset + 2 * header.identity_bytes, header.state_offset + 2 * header.state_bytes,
+        header.table_offset + TABLE.size, header.rows_offset, header.clients_offset,
+    )  # fmt: skip
+    if end > size or header.row_bytes < 256:
+        raise SegmentCorrupt(f"the statistics claim {end} bytes and more, there are {size}")
     return header
 
 
@@ -323,15 +327,21 @@ def _newest_state(fd: int, header: Header) -> State:
 
 def _rows(fd: int, header: Header, used: int) -> bytes:
     """Copy the table as of one moment if the writer lets us, else row by row (each has a checksum)."""
-    count = min(used, header.max_rows)
+    nbytes = _within(fd, header.rows_offset, min(used, header.max_rows) * header.row_bytes)
     rows = b""
     for _ in range(_TABLE_ATTEMPTS):
         before = os.pread(fd, TABLE.size, header.table_offset)
-        rows = os.pread(fd, count * header.row_bytes, header.rows_offset)
+        rows = os.pread(fd, nbytes, header.rows_offset)
         if before == os.pread(fd, TABLE.size, header.table_offset) and not TABLE.unpack(before)[0] % 2:
             break
     return rows
 
 
 def _clients(fd: int, header: Header, used: int) -> bytes:
-    return os.pread(fd, min(used, header.max_clients) * header.client_row_bytes, header.clients_offset)
+    nbytes = min(used, header.max_clients) * header.client_row_bytes
+    return os.pread(fd, _within(fd, header.clients_offset, nbytes), header.clients_offset)
+
+
+def _within(fd: int, offset: int, nbytes: int) -> int:
+    """How many of these bytes there are: pread makes room for all that it is asked for."""
+    return max(0, min(nbytes, os.fstat(fd).st_size - offset))

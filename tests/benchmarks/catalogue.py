@@ -61,7 +61,7 @@ def measure(root: Path, cache: Path, queries: int) -> None:
         for x, y in rng.uniform(0.2 * reach, 0.8 * reach, (queries, 2)).tolist():
             area = kind(x, y, RADIUS)
             start = time.perf_counter()
-            hit = catalogue.query(area)
+            hit, _ = catalogue.query(area)
             micros.append((time.perf_counter() - start) * 1e6)
             found += len(hit)
         result[f"{name}_us"] = statistics.median(micros)

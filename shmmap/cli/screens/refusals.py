@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from shmmap.errors import CellError
     from shmmap.protocol.messages import Holder
 
-__all__ = ["failure_lines", "holder_row", "holder_rows", "unknown_ids"]
+__all__ = ["NOT_COVERED", "failure_lines", "holder_row", "holder_rows", "unknown_ids"]
 
+NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
 _NAMED_CELLS: Final = 3
 
 
@@ -37,7 +38,7 @@ def holder_rows(error: CellError) -> list[dict[str, object]]:
 
 
 def failure_lines(failed: Iterable[CellError]) -> list[str]:
-    """Return one line for each cause, and below it who uses the memory."""
+    """Return one line for each cause, and below it what to do and who uses the memory."""
     causes: dict[tuple[str, str, str], list[CellError]] = {}
     for error in failed:
         # a file's message begins with its path, which the cell's id is
@@ -53,6 +54,7 @@ def failure_lines(failed: Iterable[CellError]) -> list[str]:
             more = ", ..." if len(names) > _NAMED_CELLS else ""
             shown = ", ".join(names[:_NAMED_CELLS]) + more
             lines.append(f"failed: {len(errors):,} cells ({layer}): {reason} [{code}]: {shown}")
+        lines += [f"  {errors[0].hint}"] if errors[0].hint else []
         lines += _holder_lines(errors)
     return lines
 

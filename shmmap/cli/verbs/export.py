@@ -13,7 +13,7 @@ from shmmap.cli.near_cells import near_cells_hint, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
-from shmmap.cli.screens.refusals import failure_lines, unknown_ids
+from shmmap.cli.screens.refusals import NOT_COVERED, failure_lines, unknown_ids
 from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
@@ -117,6 +117,8 @@ def _complain_of(found: CellSet, wait_s: float) -> None:
         complain("shmmap", line)
     for pending in found.pending:
         complain("shmmap", f"{pending.id}: not loaded within {wait_s:g} s")
+    if not found.covered:
+        complain("shmmap", NOT_COVERED, "ask again later")
 
 
 def _format(args: argparse.Namespace) -> str:

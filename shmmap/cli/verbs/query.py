@@ -17,7 +17,7 @@ from shmmap.cli.options import (
     layers_from,
     seconds,
 )
-from shmmap.cli.program import add_allow_empty, nothing_found
+from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import (
     Column,
     counted,
@@ -29,7 +29,7 @@ from shmmap.cli.screens.output import (
     print_table,
     rows_text,
 )
-from shmmap.cli.screens.refusals import failure_lines, holder_rows, unknown_ids
+from shmmap.cli.screens.refusals import NOT_COVERED, failure_lines, holder_rows, unknown_ids
 from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
@@ -46,10 +46,11 @@ _JSON = """\
    "removed": [id], "pending": [{"id", "layer"}],
    "failed": [{"id", "layer", "code", "message", "holders": [text],
                "holder_rows": [{"session": hex, "pid", "uid", "client", "command", "cells", "bytes"}]}]}
-Codes: unknown_cell, load_failed, load_timeout, over_budget, no_space.
+Codes: unknown_cell, load_failed, load_timeout, over_budget, no_space, offline.
 A holder maps memory of the full budget; session 0 and pid 0: a process that did not use the client library.
-Exit code: 0; 1 when a cell is pending, failed or unknown, when the area touches no cell, or when a layer is
-empty in every cell.  With --held, 0 when nothing is new."""
+Exit code: 0; 1 when a cell is pending, failed or unknown, when the daemon does not know yet all that lies in
+the area, when the area touches no cell, or when a layer is empty in every cell.
+With --held, 0 when nothing is new."""
 
 
 _COLUMNS = (
@@ -122,6 +123,8 @@ def run(args: argparse.Namespace) -> int:
         else:
             _print_text(found, welcome.id_prefix, summed=bool(found.cells) or held_given)
         if not found.complete:
+            if not found.covered:
+                complain("shmmap", NOT_COVERED, "ask again later")
             print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
         return _judge_empty(args, client, area, found)

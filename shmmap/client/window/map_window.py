@@ -191,7 +191,7 @@ class MapWindow:
         wait
             Seconds this call may take until the window is current.  None: no waiting in the background mode,
             5 s in the blocking one, which waits no longer than half a second for cells that do not fit in
-            the budget.
+            the budget, or cannot be reached or known.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class MapWindow:
         """Wait until the window answers the latest pose and nothing is being loaded.
 
         Cells that cannot be had (see `WindowUpdate.failed`) do not hold it up, except those that wait for
-        memory.
+        memory, or for an origin that cannot be reached.
 
         Returns
         -------
@@ -238,20 +238,22 @@ class MapWindow:
 
     @property
     def complete(self) -> bool:
-        """Whether the window answers the last pose, and nothing in it is missing: pending or failed.
+        """Whether the window answers the last pose, and nothing in it is pending, failed or not known yet.
 
         A pose is answered by an area that was asked for less than ``update_distance`` away from it, and
         that it lies in.  So this is false right after a jump, and as soon as a vehicle leaves behind what
         a daemon that has died answered last.
         """
         state = self._follower.state
-        return self._follower.answers(state) and not state.pending and not state.failed
+        answered = self._follower.answers(state) and state.covered
+        return answered and not state.pending and not state.failed
 
     def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
         """Whether all that the map has within a circle is in the window, in all its layers.
 
         False where the circle reaches beyond what was last answered, where it touches a cell that has
-        failed, and while any cell of the window is being loaded, of which no older version is attached.
+        failed, while any cell of the window is being loaded, of which no older version is attached, and while
+        the daemon does not know all that the map has in the window.
 
         Parameters
         ----------

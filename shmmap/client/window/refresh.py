@@ -133,6 +133,7 @@ class WindowRefresher:
                 area=area,
                 epoch=answer.epoch,
                 map_version=answer.map_version,
+                covered=answer.covered,
             )
         else:
             after = self._apply(state, answer, area, pose, now_s)
@@ -176,6 +177,7 @@ class WindowRefresher:
             area=area,
             epoch=answer.epoch,
             map_version=answer.map_version,
+            covered=answer.covered,
         )
 
     def _retain(self, pose: Intent, now_s: float) -> None:

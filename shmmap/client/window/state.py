@@ -13,13 +13,16 @@ import numpy as np
 from shmmap import geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
-from shmmap.errors import CellError, OverBudget
+from shmmap.errors import CellError, Offline, OverBudget
 from shmmap.protocol.messages import Intent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["EMPTY", "LayerKey", "WindowState", "WindowUpdate", "moved", "update_between"]
+
+PASSING: Final = (OverBudget, Offline)
+"""Failures that pass by themselves, perhaps in a moment: worth asking again."""
 
 LayerKey: TypeAlias = tuple[str, str]
 """Cell id and layer."""
@@ -42,6 +45,8 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     current : bool
         Whether the window answers the pose just given.  In the background mode it may still answer an
         earlier one.
+    covered : bool
+        Whether the daemon knows all that the map has in the window; where it does not, more may come.
     """
 
     added: tuple[Cell, ...] = ()
@@ -51,6 +56,7 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     pending: tuple[PendingLayer, ...] = ()
     failed: tuple[CellError, ...] = ()
     current: bool = False
+    covered: bool = True
 
     @property
     def any(self) -> bool:
@@ -60,7 +66,7 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     @property
     def complete(self) -> bool:
         """Whether the window answers the pose just given, and nothing in it is missing."""
-        return self.current and not self.pending and not self.failed
+        return self.current and self.covered and not self.pending and not self.failed
 
 
 class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
@@ -80,7 +86,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         Where the cells of ``failed`` lie, by id; of those that are not here nobody could tell.
     area
         What was asked about: all that the map has there is in ``cells``, or named in ``pending`` or
-        ``failed``.
+        ``failed``, if the daemon knows all of it (``covered``).
     """
 
     cells: Mapping[LayerKey, Cell] = {}
@@ -93,6 +99,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     area: geometry.Area | None = None
     epoch: int = 0
     map_version: int = 0
+    covered: bool = True
     failed_boxes: Mapping[str, tuple[float, float, float, float]] = {}
 
     @property
@@ -100,8 +107,9 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         """Whether asking again at once cannot bring more."""
         return (
             self.asked is not None
+            and self.covered
             and not self.pending
-            and not any(isinstance(failure, OverBudget) for failure in self.failed)
+            and not any(isinstance(failure, PASSING) for failure in self.failed)
         )
 
     def covers(self, x: float, y: float, radius: float, layer: str | None = None) -> bool:
@@ -110,7 +118,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         A cell is missing that is being loaded or has failed, and of which no older version is here.  Where
         nobody knows where it lies, it counts as if it lay in the circle.
         """
-        if self.area is None or not self.area.contains_circle(x, y, radius):
+        if self.area is None or not self.covered or not self.area.contains_circle(x, y, radius):
             return False
         missing = [(cell.id, cell.layer) for cell in self.pending]
         missing += [(failure.cell_id, failure.layer) for failure in self.failed]
@@ -136,6 +144,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         area: geometry.Area,
         epoch: int,
         map_version: int,
+        covered: bool = True,
     ) -> WindowState:
         """Sort the cells and lay their boxes out for `points_around`."""
         ordered = {key: cells[key] for key in sorted(cells)}
@@ -153,6 +162,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
             area,
             epoch,
             map_version,
+            covered,
         )
 
 
@@ -176,7 +186,13 @@ def update_between(before: Mapping[LayerKey, int], state: WindowState, *, curren
     """Compare a state with the versions of an earlier one."""
     if before is state.versions:
         kept_all = tuple(state.cells.values())
-        return WindowUpdate(kept=kept_all, pending=state.pending, failed=state.failed, current=current)
+        return WindowUpdate(
+            kept=kept_all,
+            pending=state.pending,
+            failed=state.failed,
+            current=current,
+            covered=state.covered,
+        )
     added: list[Cell] = []
     kept: list[Cell] = []
     changed: list[Cell] = []
@@ -191,4 +207,5 @@ def update_between(before: Mapping[LayerKey, int], state: WindowState, *, curren
         state.pending,
         state.failed,
         current,
+        state.covered,
     )

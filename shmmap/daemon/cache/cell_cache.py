@@ -20,6 +20,7 @@ from shmmap.daemon.cache.survey import Survey
 from shmmap.daemon.cache.warm_index import WarmIndex
 from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog, PressureEvents
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Key, Resident
 from shmmap.failpoints import step
 from shmmap.geometry import ZRange
@@ -27,7 +28,6 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.statistics.writer import StatisticsWriter
@@ -66,7 +66,7 @@ class CellCache:
 
     def __init__(
         self,
-        catalogue: Catalogue,
+        catalogue: CatalogueView,
         reclaimer: Reclaimer,
         statistics: StatisticsWriter,
         event_log: EventLog,

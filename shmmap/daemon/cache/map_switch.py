@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.origin.catalogue import Catalogue, CatalogueChange, compare
+from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.origin.catalogue import CatalogueChange, compare
 from shmmap.segment.version import Stamp
 
 __all__ = ["MapSwitch"]
@@ -72,7 +73,7 @@ class MapSwitch:
         cache.chill(index)
         cache.tell(cache.events.changed, cell_id, cache.catalogue.version(index))
 
-    def switch(self, new: Catalogue, now_s: float) -> CatalogueChange:
+    def switch(self, new: CatalogueView, now_s: float) -> CatalogueChange:
         """Serve another state of the map; takes effect cell by cell as cells are asked for."""
         cache = self._cache
         change = compare(cache.catalogue, new)

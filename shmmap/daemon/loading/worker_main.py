@@ -21,7 +21,7 @@ from typing import Final
 from shmmap import __version__
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
-from shmmap.errors import MapDataError, SegmentCorrupt, ShmmapError
+from shmmap.errors import MapDataError, Offline, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
@@ -97,8 +97,8 @@ class _Worker:
 
     def _load(self, job: worker_messages.Job) -> None:
         started_ns = time.monotonic_ns()
-        _test_hook(job.path)
         try:
+            _test_hook(job.path)
             fd = self.directory.create()
             try:
                 step("worker.alloc")
@@ -119,6 +119,8 @@ class _Worker:
             step("worker.done")
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
+        except Offline as error:
+            self._fail(job, error.code, error.message)
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
@@ -182,8 +184,13 @@ class _Worker:
 
 
 def _test_hook(path: str) -> None:
-    """Crash or hang on a named file, for the tests of exactly that (``SHMMAP_TEST_WORKER``)."""
+    """Crash or hang on a named file, for the tests of exactly that (``SHMMAP_TEST_WORKER``).
+
+    Or find the origin of each out of reach while a file of that name and ``.offline`` lies beside it.
+    """
     what, _, name = os.environ.get("SHMMAP_TEST_WORKER", "").partition(":")
+    if what == "offline" and os.path.exists(path + ".offline"):
+        raise Offline(f"{path}: its origin does not answer")
     if name and Path(path).name == name:
         if what == "crash":
             os.kill(os.getpid(), signal.SIGSEGV)

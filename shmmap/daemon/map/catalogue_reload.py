@@ -12,14 +12,13 @@ import os
 import threading
 from collections.abc import Callable
 
+from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.map_origin import MapOrigin
 
 __all__ = ["Reloader"]
 
-Answer = Callable[[Catalogue | ShmmapError], None]
+Answer = Callable[[CatalogueView | ShmmapError], None]
 
 
 class Reloader:
@@ -31,11 +30,11 @@ class Reloader:
         Readable when a result is there: call `collect` then.
     """
 
-    def __init__(self, origin: MapOrigin) -> None:
+    def __init__(self, origin: ViewOrigin) -> None:
         self._origin = origin
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._thread: threading.Thread | None = None
-        self._result: Catalogue | ShmmapError | None = None
+        self._result: CatalogueView | ShmmapError | None = None
         self._asked: list[Answer] = []
         self._next: list[Answer] = []
 
@@ -69,7 +68,7 @@ class Reloader:
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
-    def collect(self, apply: Callable[[Catalogue], None], failed: Callable[[ShmmapError], None]) -> None:
+    def collect(self, apply: Callable[[CatalogueView], None], failed: Callable[[ShmmapError], None]) -> None:
         """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
         os.eventfd_read(self.fd)
         if self._thread is not None:
@@ -77,11 +76,11 @@ class Reloader:
             self._thread = None
         result, asked = self._result, self._asked
         self._result, self._asked = None, []
-        if isinstance(result, Catalogue):
-            apply(result)
-        elif result is not None:
+        if isinstance(result, ShmmapError):
             log.error("reload failed", map=self._origin.path, message=result, served="the old state")
             failed(result)
+        elif result is not None:
+            apply(result)
         if result is not None:
             for answer in asked:
                 answer(result)

@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of one state of the map, as requests see them: by index, whatever keeps the tables."""
+"""The cells of one state of the map, as requests see them: by index, whatever keeps the tables.
+
+Of a map that comes in pages, a view has the cells that are known by now.  Where it knows all of an area it
+says so.  More cells are another state of the map: a reload brings a view that has them, too.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.geometry import Area
+from shmmap.origin.catalogue import Tables
 from shmmap.segment.version import Stamp
 
-__all__ = ["CatalogueView"]
+__all__ = ["CatalogueView", "ViewOrigin"]
 
 
-class CatalogueView(Protocol):
+class CatalogueView(Tables, Protocol):
     """What the daemon asks of a catalogue (`shmmap.origin.catalogue.Catalogue` is one).
 
-    Nothing here looks at a file: a stamp is what was known when the catalogue was made, or what a loader
-    has found since.
+    Nothing here looks at a file or asks a server: a stamp is what was known when the catalogue was made, or
+    what a loader has found since.
     """
 
     def __len__(self) -> int:
@@ -26,15 +32,15 @@ class CatalogueView(Protocol):
 
     @property
     def map_version(self) -> int:
-        """64-bit version of the whole catalogue."""
+        """64-bit version of the whole catalogue: another one when more cells are known."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether all cells of the map are known."""
 
     @property
     def frame_id(self) -> str:
         """Name of the map frame."""
-
-    @property
-    def id_prefix(self) -> str:
-        """What all ids start with."""
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
@@ -45,17 +51,17 @@ class CatalogueView(Protocol):
         """Mean extent of the cells along x and y, metres."""
 
     @property
-    def boxes(self) -> NDArray[np.float64]:
-        """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame."""
+    def problems(self) -> Sequence[str]:
+        """Oddities found while reading the map, one sentence each."""
 
-    def query(self, area: Area, most: int | None = None) -> NDArray[np.intp]:
-        """Cells whose box touches ``area``, ascending (which is id order).
+    def query(self, area: Area, most: int | None = None) -> tuple[NDArray[np.intp], bool]:
+        """Cells whose box touches ``area``, ascending (which is id order), and whether these are all.
 
         If there are more than ``most``, some of them, more than ``most``, in no order.
         """
 
     def find(self, cell: str) -> int | None:
-        """Index of a cell by its id or a unique base name; None where there is none."""
+        """Index of a cell by its id or a unique base name; None where there is none, or none known."""
 
     def id(self, index: int) -> str:
         """Id of a cell."""
@@ -66,8 +72,25 @@ class CatalogueView(Protocol):
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
 
+    def path(self, index: int) -> str:
+        """What a loader reads for a cell."""
+
     def stamp(self, index: int) -> Stamp:
         """Stamp of a cell's source as last known."""
 
     def source_bytes(self, index: int) -> int:
         """Size of a cell's source as last known."""
+
+    def set_stamp(self, index: int, stamp: Stamp) -> None:
+        """Correct a cell's stamp: a loader has found another one; versions follow."""
+
+
+class ViewOrigin(Protocol):
+    """What views come from (`shmmap.origin.map_origin.MapOrigin` is one)."""
+
+    @property
+    def path(self) -> str:
+        """The map as a person would name it."""
+
+    def load(self, *, fresh: bool = False) -> CatalogueView:
+        """Find out which cells are known now; errors are those of `MapOrigin.load`."""

@@ -66,19 +66,30 @@ class CellReplies:
                     answer.residents.append(resident)
                 else:
                     self._answer_cold(wanted, index, layer, answer, now_s)
-        self.reply(wanted.session, wanted.request, answer, wanted.removed, wanted.removed_packed)
+        self.reply(
+            wanted.session, wanted.request, answer, wanted.layers, wanted.covered,
+            removed=wanted.removed, removed_packed=wanted.removed_packed,
+        )  # fmt: skip
         if wanted.began_s:
             self.cache.statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
         yield from self.hand_out(wanted.session, answer, now_s)
 
     def reply(
-        self, session: Session, request: int, answer: Answer, removed: tuple[str, ...], removed_packed: bytes
+        self,
+        session: Session,
+        request: int,
+        answer: Answer,
+        layers: tuple[str, ...],
+        covered: bool = True,
+        *,
+        removed: tuple[str, ...],
+        removed_packed: bytes,
     ) -> None:
         """Send a reply; the bookkeeping follows in `hand_out`, when it is on its way."""
         cache = self.cache
         reply = encode_cells(
             request, cache.epoch, cache.catalogue.map_version, answer.handles, removed, removed_packed,
-            answer.pending, answer.failed,
+            answer.pending, answer.failed, layers, covered,
         )  # fmt: skip
         session.connection.reply(reply)
 

@@ -81,10 +81,12 @@ class CellRequests:
         note_area(session, area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        found = cache.catalogue.query(area, limits.MOST_CELLS)
+        found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         cells = [(index, layer) for index in cache.at_height(found.tolist(), area.z) for layer in layers]
-        wanted = PendingRequest(session, message.request, cells, cache.catalogue, area=area)
+        wanted = PendingRequest(
+            session, message.request, cells, cache.catalogue, limits.layers_named(message), covered, area=area
+        )
         return self._serve(wanted, message.wait)
 
     def selected(self, session: Session, message: messages.Selected) -> Iterator[None]:
@@ -93,16 +95,16 @@ class CellRequests:
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
         limits.check_count(len(message.ids) * len(layers))
-        cells: list[tuple[int, str]] = []
-        unknown: list[tuple[str, str]] = []
+        wanted = PendingRequest(session, message.request, [], cache.catalogue, limits.layers_named(message))
         for number, ids in enumerate(parts(message.ids)):
             if number:
                 yield
+                yield from wanted.follow(cache)
             indices = [cache.index_of(cell_id) for cell_id in ids]
-            cells += [(index, layer) for index in indices if index is not None for layer in layers]
+            wanted.cells += [(index, layer) for index in indices if index is not None for layer in layers]
             absent = [cell_id for cell_id, index in zip(ids, indices, strict=True) if index is None]
-            unknown += [(cell_id, layer) for cell_id in absent for layer in layers]
-        wanted = PendingRequest(session, message.request, cells, cache.catalogue, unknown=unknown)
+            wanted.unknown += [(cell_id, layer) for cell_id in absent for layer in layers]
+        wanted.covered = not wanted.unknown or cache.catalogue.complete
         yield from self._serve(wanted, message.wait)
 
     def differential(self, session: Session, message: messages.Differential) -> Iterator[None]:
@@ -113,13 +115,16 @@ class CellRequests:
         note_area(session, area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        found = cache.catalogue.query(area, limits.MOST_CELLS)
+        found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
-        if len(layers) == 1 and area.z is None and len(found) <= MOST_AT_ONCE:
+        if len(layers) == 1 and area.z is None and covered and len(found) <= MOST_AT_ONCE:
             warm = warm_difference(cache, message, found, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
                 answer = Answer([resident.handle for resident in warm.residents], warm.residents)
-                self._answers.reply(session, message.request, answer, warm.removed, warm.removed_packed)
+                self._answers.reply(
+                    session, message.request, answer, limits.layers_named(message),
+                    removed=warm.removed, removed_packed=warm.removed_packed,
+                )  # fmt: skip
                 # the bookkeeping can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
                 return self._answers.hand_out(session, answer, self._now_s())

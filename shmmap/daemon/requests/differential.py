@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.limits import MOST_CELLS, check_count
+from shmmap.daemon.requests.limits import MOST_CELLS, check_count, layers_named
 from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, parts
 from shmmap.daemon.transport.sessions import Session
 from shmmap.geometry import Area
@@ -118,12 +118,15 @@ def difference(
     message: Differential,
     indices: Sequence[int],
     layers: tuple[str, ...],
+    covered: bool,
     pause: Callable[[], Iterator[None]],
 ) -> Generator[None, None, Difference]:
     """Find what the client lacks of the area's cells ``indices``, whether in memory or not.
 
     Parameters
     ----------
+    covered
+        Whether these are all; else a cell that is not known may lie in the area.
     pause
         Lets others have a turn: called before each part but the first.
     """
@@ -143,7 +146,8 @@ def difference(
         for cell in some:
             index = cache.index_of(cell.id)
             if index is None or index not in inside:
-                removed[cell.id] = None
+                if covered or index is not None:
+                    removed[cell.id] = None
                 continue
             named = layers if cell.layers is None else canonical_layers(cell.layers)
             mine = [layer for layer in named if layer in layers]
@@ -172,6 +176,8 @@ def difference(
             if known in inside:
                 gone.discard(version)
                 result.old.add(Key(id_of(known), layer))
+            elif known < 0 and not covered:
+                gone.discard(version)
     result.removed = tuple(removed)
     result.removed_packed = pack_versions(gone)
     return result
@@ -190,12 +196,16 @@ def lacking(
         The session has ended meanwhile.
     """
     while True:
-        found = cache.catalogue.query(area, MOST_CELLS)
+        found, covered = cache.catalogue.query(area, MOST_CELLS)
         check_count(len(found) * len(layers))
-        wanted = PendingRequest(session, message.request, [], cache.catalogue, area=area)
+        wanted = PendingRequest(
+            session, message.request, [], cache.catalogue, layers_named(message), covered, area=area
+        )
         with contextlib.suppress(MapChanged):
             indices = cache.at_height(found.tolist(), area.z)
-            lacks = yield from difference(cache, message, indices, layers, partial(wanted.pause, cache))
+            lacks = yield from difference(
+                cache, message, indices, layers, covered, partial(wanted.pause, cache)
+            )
             wanted.cells, wanted.held_old = lacks.cells, lacks.old
             wanted.removed, wanted.removed_packed = lacks.removed, lacks.removed_packed
             return wanted

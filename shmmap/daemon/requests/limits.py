@@ -15,12 +15,12 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest, parts
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
 from shmmap.errors import BadRequest, Busy
-from shmmap.layers.spec import canonical_layers
-from shmmap.origin.catalogue import Catalogue
+from shmmap.layers.spec import canonical_layer, canonical_layers
 from shmmap.protocol import messages
 from shmmap.quantities import format_bytes
 
@@ -32,6 +32,7 @@ __all__ = [
     "check_count",
     "check_held",
     "check_queue",
+    "layers_named",
 ]
 
 MOST_CELLS: Final = 20_000
@@ -79,7 +80,7 @@ def check_held(message: messages.Differential) -> None:
 
 
 def check_queue(
-    catalogue: Catalogue, loads: Loads, session: Session, cold: Sequence[tuple[int, str]]
+    catalogue: CatalogueView, loads: Loads, session: Session, cold: Sequence[tuple[int, str]]
 ) -> None:
     """Refuse to queue more loads for a process that waits for very many; ``cold`` is what they are of.
 
@@ -109,6 +110,11 @@ def admitted_layers(cache: CellCache, specs: Sequence[str]) -> tuple[str, ...]:
     for layer in layers:
         cache.layers.check_reach(layer)
     return layers
+
+
+def layers_named(message: messages.Area | messages.Differential | messages.Selected) -> tuple[str, ...]:
+    """The layers that an admitted request names, one for each, in canonical form."""
+    return tuple(map(canonical_layer, message.layers))
 
 
 def bounded_intent(intent: messages.Intent) -> messages.Intent:

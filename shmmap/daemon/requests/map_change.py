@@ -12,10 +12,11 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue, CatalogueChange
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.protocol import events
 
 __all__ = ["MapChange"]
@@ -39,7 +40,7 @@ class MapChange:
         """A reload is over: serve what it found, and tell those who asked for it."""
         self.reloader.collect(self._apply, self._keep)
 
-    def _apply(self, catalogue: Catalogue) -> None:
+    def _apply(self, catalogue: CatalogueView) -> None:
         """Serve another state of the map from now on."""
         cache, statistics = self.cache, self.cache.statistics
         change = self.map_switch.switch(catalogue, time.monotonic())

@@ -122,7 +122,7 @@ class MapQueries:
         if area is None:
             end = min(start + limit, count)
             return range(start, end), end if end < count else None
-        found = catalogue.query(area, LOOKED_AT)
+        found, _ = catalogue.query(area, LOOKED_AT)
         if len(found) <= LOOKED_AT:
             found = found[found.searchsorted(start) :]
             more = len(found) > limit

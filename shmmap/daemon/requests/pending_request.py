@@ -61,6 +61,10 @@ class PendingRequest:
         Catalogue index and layer of each handle to send, in reply order.
     catalogue
         The state of the map whose indices they are.
+    layers
+        What it asks for of each cell, as the reply says it.
+    covered
+        Whether all cells of what it asks about are known.
     removed, removed_packed
         What the client should drop, as the reply says it.
     unknown
@@ -83,6 +87,8 @@ class PendingRequest:
     request: int
     cells: list[tuple[int, str]]
     catalogue: CatalogueView
+    layers: tuple[str, ...]
+    covered: bool = True
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
     unknown: list[tuple[str, str]] = field(default_factory=list)
@@ -127,6 +133,8 @@ class PendingRequest:
                         unknown.append((cell_id, layer))
             self.cells, self.catalogue = cells, new
             self.unknown += unknown
+            known = new.query(self.area, 0)[1] if self.area is not None else new.complete or not self.unknown
+            self.covered = self.covered and known
 
     def distances_m(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far boxes, (N, 4), are from the client, as far as it said where it is.

@@ -40,6 +40,7 @@ def test_pending_and_failed_make_it_incomplete() -> None:
         ("load_timeout", errors.LoadTimeout),
         ("over_budget", errors.OverBudget),
         ("no_space", errors.NoSpace),
+        ("offline", errors.Offline),
         ("of_a_later_version", errors.CellError),
     ],
 )
@@ -47,7 +48,21 @@ def test_errors_have_the_kind_of_their_code(code: str, kind: type[errors.CellErr
     error = cell_error(FailedCell("a", "points", code, "why"), "/map/a")
     assert type(error) is kind
     assert (error.cell_id, error.layer) == ("/map/a", "points")
-    assert str(error) == "/map/a (points): why"
+    assert error.message == "/map/a (points): why"
+    assert str(error) == error.message + (f" ({error.hint})" if error.hint else "")
+
+
+def test_what_passes_says_so() -> None:
+    """A client that gives up ends as one that met a busy daemon does; the hint says to ask again."""
+    error = cell_error(FailedCell("a", "points", "offline", "no answer"), "/map/a")
+    assert (error.code, error.exit_code) == ("offline", errors.Busy.exit_code)
+    assert "ask again" in error.hint
+
+
+def test_what_is_not_covered_is_incomplete() -> None:
+    assert CellSet().complete
+    assert not CellSet(covered=False).complete
+    assert "not covered" in repr(CellSet(covered=False))
 
 
 def test_holders_are_lines_that_name_who() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from tests.support.divided_map import DividedMap, make_map
 from tests.unit.daemon.inner_daemon import InnerDaemon
+from tests.unit.daemon.whole_daemon import WholeDaemon
 
 
 @pytest.fixture
@@ -31,3 +33,18 @@ def inner(tmp_path: Path) -> Iterator[Callable[..., InnerDaemon]]:
     yield factory
     for one in made:
         one.close()
+
+
+@pytest.fixture
+def whole() -> Iterator[Callable[..., WholeDaemon]]:
+    """Make a daemon with its sockets: ``whole(map_path, origin=..., ...)``; closed at the end."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as scratch:
+        made: list[WholeDaemon] = []
+
+        def factory(map_path: Path, **options: Any) -> WholeDaemon:
+            made.append(WholeDaemon(map_path, scratch, **options))
+            return made[-1]
+
+        yield factory
+        for one in made:
+            one.close()

@@ -97,7 +97,7 @@ def test_find_in_an_empty_catalogue() -> None:
     assert len(empty) == 0
     assert empty.find("a.pcd") is None
     assert empty.find("/m/a.pcd") is None
-    assert empty.query(Circle(0.0, 0.0, 1e6)).tolist() == []
+    assert empty.query(Circle(0.0, 0.0, 1e6))[0].tolist() == []
     assert empty.map_version == catalogue({}).map_version
 
 
@@ -186,7 +186,8 @@ def test_boxes_and_query_speak_of_the_same_cells() -> None:
         for y in range(side)
     ]
     made = Catalogue.from_cells(cells)
-    found = made.query(Circle(310.0, 350.0, 50.0))
+    found, covered = made.query(Circle(310.0, 350.0, 50.0))
+    assert covered
     expected = sorted(
         cell_id
         for cell_id, (a, b, c, d), _ in cells

@@ -51,7 +51,7 @@ def check(map_path: Path | str, cells: Path, **options: object) -> None:
         status = (cells / name).stat()
         assert catalogue.stamp(index) == SourceStamp.of(status).token
         assert catalogue.source_bytes(index) == status.st_size
-    assert catalogue.ids(catalogue.query(Circle(-10.0, 50.0, 1.0))) == [str(cells / "t_-20_40.pcd")]
+    assert catalogue.ids(catalogue.query(Circle(-10.0, 50.0, 1.0))[0]) == [str(cells / "t_-20_40.pcd")]
 
 
 def test_yaml_beside_the_directory(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ failed = st.builds(FailedCell, texts, texts, texts, texts, st.lists(holders, max
     st.binary(max_size=80),
     st.lists(st.builds(PendingCell, texts, texts), max_size=20),
     st.lists(failed, max_size=20),
+    st.lists(texts, max_size=3),
+    st.booleans(),
 )
 def test_any_content(
     ids: tuple[int, int, int],
@@ -38,9 +40,16 @@ def test_any_content(
     packed: bytes,
     pending: list[PendingCell],
     failures: list[FailedCell],
+    layers: list[str],
+    covered: bool,
 ) -> None:
-    whole = Cells(*ids, tuple(cells), tuple(removed), packed, tuple(pending), tuple(failures))
-    parts = encode_cells(*ids, [encode_handle(h) for h in cells], tuple(removed), packed, pending, failures)
+    whole = Cells(
+        *ids, tuple(cells), tuple(removed), packed, tuple(pending), tuple(failures), tuple(layers), covered
+    )
+    parts = encode_cells(
+        *ids, [encode_handle(h) for h in cells], tuple(removed), packed, pending, failures,
+        tuple(layers), covered,
+    )  # fmt: skip
     assert parts == encode(whole)
     assert decode_reply(parts) == whole
 
@@ -49,12 +58,14 @@ def test_any_content(
 def test_any_number_of_handles(count: int) -> None:
     """The head of a MessagePack array has one byte, three or five."""
     handle = Handle("a.pcd", 1, "points", "0" * 16, 0, 4096, 10, 0.0, 0.0, 20.0, 20.0)
-    parts = encode_cells(1, 2, 3, [encode_handle(handle)] * count, (), b"", [], [])
+    parts = encode_cells(1, 2, 3, [encode_handle(handle)] * count, (), b"", [], [], ())
     assert parts == encode(Cells(1, 2, 3, (handle,) * count))
 
 
 @pytest.mark.parametrize("count", [0, 15, 16, 65535, 65536])
 def test_any_number_of_removed_ids(count: int) -> None:
     removed = ("x",) * count
-    assert encode_cells(1, 2, 3, [], removed, b"", [], []) == encode(Cells(1, 2, 3, (), removed))
-    assert encode_cells(1, 2, 3, [], (), bytes(count), [], []) == encode(Cells(1, 2, 3, (), (), bytes(count)))
+    assert encode_cells(1, 2, 3, [], removed, b"", [], [], ()) == encode(Cells(1, 2, 3, (), removed))
+    assert encode_cells(1, 2, 3, [], (), bytes(count), [], [], ()) == encode(
+        Cells(1, 2, 3, (), (), bytes(count))
+    )

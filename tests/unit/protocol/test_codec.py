@@ -115,6 +115,9 @@ def test_areas_survive_the_wire(area: geometry.Area) -> None:
         ["box", 0, 0, math.inf, 1],
         ["circle", 0, 0, 1, 5, 4],
         ["circle", 0, 0, 1, math.nan, 4],
+        ["circle", 0, 0, 1, 4],
+        ["square", 0, 0, 1, None, 4],
+        ["box", 0, 0, 1, 1, 4, None],
     ],
 )
 def test_areas_that_make_no_sense_are_refused(area: list[object]) -> None:

@@ -157,6 +157,8 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             bytes([2, 0, 0, 0, 0, 0, 0, 0]),
             (m.PendingCell("c", "points"),),
             (m.FailedCell("d", "points", "over_budget", "no", (m.Holder(0, 0, 0, "unknown", 8, 1),)),),
+            ("points",),
+            False,
         ),
         [
             "cells",
@@ -168,12 +170,14 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             b"\x02\x00\x00\x00\x00\x00\x00\x00",
             [["c", "points"]],
             [["d", "points", "over_budget", "no", [[0, 0, 0, "unknown", 8, 1, ""]]]],
+            ["points"],
+            False,
         ],
         (
-            "99a563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
+            "9ba563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
             "000000cb0000000000000000cb4034000000000000cb4034000000000000c291a5622e706364c408"
             "02000000000000009192a163a6706f696e74739195a164a6706f696e7473ab6f7665725f62756467"
-            "6574a26e6f9197000000a7756e6b6e6f776e0801a0"
+            "6574a26e6f9197000000a7756e6b6e6f776e0801a091a6706f696e7473c2"
         ),
     ),
     (
@@ -349,11 +353,28 @@ def test_a_handle_packed_once_is_the_same_bytes_inside_a_reply() -> None:
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65535, 65536])
 def test_a_reply_put_together_from_packed_handles_is_the_same_bytes(count: int) -> None:
     """At every size at which MessagePack changes the form of an array."""
-    rest = (("b.pcd",), bytes(8), (m.PendingCell("c", "points"),), (m.FailedCell("d", "points", "x", "y"),))
-    whole = m.Cells(4, U64, 5, (HANDLE,) * count, *rest)
-    together = encode_cells(4, U64, 5, [encode_handle(HANDLE)] * count, *rest)
+    whole = m.Cells(
+        4, U64, 5, (HANDLE,) * count, ("b.pcd",), bytes(8), (m.PendingCell("c", "points"),),
+        (m.FailedCell("d", "points", "x", "y"),), ("points", "voxel(leaf=1.0)"), False,
+    )  # fmt: skip
+    together = encode_cells(
+        4, U64, 5, [encode_handle(HANDLE)] * count, whole.removed, whole.removed_packed, whole.pending,
+        whole.failed, whole.layers, whole.covered,
+    )  # fmt: skip
     assert together == encode(whole)
-    assert encode_cells(4, 3, 5, [], (), b"", (), ()) == encode(m.Cells(4, 3, 5))
+    assert encode_cells(4, 3, 5, [], (), b"", (), (), ()) == encode(m.Cells(4, 3, 5))
+
+
+def test_a_reply_of_a_daemon_older_than_1_3() -> None:
+    """It has neither layers nor covered: of what it answered it knew everything."""
+    (golden,) = [hexed for message, _, hexed in REPLIES if isinstance(message, m.Cells)]
+    elements = unpack(bytes.fromhex(golden))
+    reply = decode_reply(pack(elements[:9]))
+    assert isinstance(reply, m.Cells)
+    assert (reply.layers, reply.covered) == ((), True)
+    assert pack(elements[:9])[1:] == bytes.fromhex(golden)[1 : len(pack(elements[:9]))], (
+        "only grown at its end"
+    )
 
 
 def test_numbers_that_numpy_computed() -> None:

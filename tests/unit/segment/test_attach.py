@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import gc
 import os
@@ -236,3 +237,28 @@ def test_a_lease_that_is_not_given_back(
             attach(name, shm_dir=shm.path)
     finally:
         os.close(fd)
+
+
+def test_what_the_header_claims_must_lie_behind_the_offset(shm: ShmDirectory, publish: Publish) -> None:
+    """A segment that begins in the middle of an object ends, at the latest, where the object does."""
+    data = Path(shm.path, publish(1000).lstrip("/")).read_bytes()
+    path = Path(shm.path, "two")
+    path.write_bytes(bytes(4096) + data)
+    whole = attach("/two", offset=4096, nbytes=len(data), shm_dir=shm.path)
+    assert np.array_equal(whole.column(0), attach(publish(1000), shm_dir=shm.path).column(0))
+    path.write_bytes(bytes(4096) + data[:-4096])
+    assert path.stat().st_size == len(data), "total_bytes is not more than the object has"
+    for nbytes in (0, len(data) - 4096):
+        with pytest.raises(SegmentCorrupt):
+            attach("/two", offset=4096, nbytes=nbytes, shm_dir=shm.path)
+    path.unlink()
+
+
+def test_without_a_lock_it_is_just_as_safe(
+    shm: ShmDirectory, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(fd: int, slot: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(attach_module, "lock_slot", refuse)
+    assert len(attach(publish(), shm_dir=shm.path, slot=5).columns) == 2

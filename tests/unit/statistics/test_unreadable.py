@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+import struct
 import threading
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +57,36 @@ def test_cut_short_is_refused(shm: ShmDirectory, writer: StatisticsWriter, keep:
     with pytest.raises(SegmentCorrupt):
         read_statistics("cut", shm.path)
     Path(shm.path, "shmmap.cut.statistics").unlink()
+
+
+@pytest.mark.parametrize("at", [16, 20, 24, 28, 32, 36, 40, 44, 48, 52, 56, 64, 68, 72, 76, 80])
+def test_offsets_and_counts_are_compared_with_the_size(
+    shm: ShmDirectory, writer: StatisticsWriter, at: int
+) -> None:
+    """Also those of a header whose checksums are right: what lies outside is refused, or is no row."""
+    writer.cell_changed(1, row(1))
+    writer.beat()
+    data = bytearray(Path(shm.path, "shmmap.unit.statistics").read_bytes())
+    descriptions, count, size = struct.unpack_from("<III", data, 16)
+    counters_end = descriptions + count * size
+    histograms_end = counters_end + int.from_bytes(data[64:68], "little") * size
+    data[at : at + 4] = b"\xf0\xff\xff\xff"
+    data[60:64] = zlib.crc32(bytes(data[:60] + data[descriptions:counters_end])).to_bytes(4, "little")
+    extension = bytes(data[64:124] + data[counters_end:histograms_end])
+    data[124:128] = zlib.crc32(extension).to_bytes(4, "little")
+    Path(shm.path, "shmmap.lies.statistics").write_bytes(data)
+    truth = read_statistics("unit", shm.path)
+    try:
+        seen = read_statistics("lies", shm.path)
+    except SegmentCorrupt:
+        pass
+    else:
+        assert at > 44, "one of the blocks lies outside"
+        assert truth.cells
+        assert seen.cells in ([], truth.cells)
+        assert seen.clients in ([], truth.clients)
+    finally:
+        Path(shm.path, "shmmap.lies.statistics").unlink()
 
 
 @pytest.mark.root

@@ -10,11 +10,12 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 
@@ -74,14 +75,14 @@ class OperatorRequests:
             return  # the client repeats what it has no answer to yet
         self._reloading.add(asked)
 
-        def answer(result: Catalogue | ShmmapError) -> None:
+        def answer(result: CatalogueView | ShmmapError) -> None:
             self._reloading.discard(asked)
             if isinstance(result, ShmmapError):
                 session.connection.refuse(message.request, result)
                 return
             change = compare(before, result)
             counts = len(change.changed), len(change.added), len(change.removed)
-            reloaded = messages.Reloaded(message.request, result.map_version, *counts, result.problems)
+            reloaded = messages.Reloaded(message.request, result.map_version, *counts, tuple(result.problems))
             session.connection.reply(encode(reloaded))
 
         self.reloader.ask(answer)

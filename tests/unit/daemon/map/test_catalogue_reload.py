@@ -10,10 +10,11 @@ from collections.abc import Iterator
 import pytest
 
 from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.errors import ShmmapError
 from shmmap.origin.catalogue import Catalogue
 
-Result = Catalogue | ShmmapError
+Result = CatalogueView | ShmmapError
 
 
 class Origin:

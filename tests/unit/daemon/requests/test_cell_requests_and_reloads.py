@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shmmap.daemon.requests.pending_request import CELLS_A_STEP
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import (
     Area,
@@ -20,7 +21,7 @@ from shmmap.protocol.messages import (
 )
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.segment_reader import map_segment, parse
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish, names
 
 
 def rewrite(made: DividedMap, name: str, points: int, corner: tuple[int, int] | None = None) -> None:
@@ -158,12 +159,28 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
         assert parse(map_segment(one.path_of(cell.segment))).fields["box"][:2] == (cell.min_x, cell.min_y)
 
 
+def test_indices_change_between_the_parts_of_a_request(inner: Inner, small_map: DividedMap) -> None:
+    """What the first part has found is found again in the map that is served then."""
+    one = inner(small_map.root)
+    first, second = ["20_20.pcd", "0_0.pcd"] * (CELLS_A_STEP // 2), ["20_0.pcd", "20_20.pcd"]
+    work = one.cells.selected(one.session(), Selected(1, (*first, *second), wait=30.0))
+    next(work)
+    small_map.remove_cell("-40_-40.pcd")
+    small_map.remove_cell("0_0.pcd")
+    small_map.write_metadata()
+    one.reload()
+    finish(work)
+    reply = one.cells_of(1)
+    assert names(reply) == ["20_20.pcd"] * (CELLS_A_STEP // 2) + second
+    assert [failed.code for failed in reply.failed] == ["unknown_cell"] * (CELLS_A_STEP // 2)
+
+
 def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     before = one.everything()
     empty = Catalogue.from_cells([])
     one.scheduler.drop(one.map_switch.switch(empty, one.now_s()).removed)
-    assert one.everything(2) == Cells(2, 77, empty.map_version)
+    assert one.everything(2) == Cells(2, 77, empty.map_version, layers=("points",))
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.ask(one.session(), Differential(3, EVERYWHERE, packed=packed))
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)

@@ -80,7 +80,7 @@ def find(cache: CellCache, message: Differential, indices: list[int], layers: tu
     found: list[Difference] = []
 
     def steps() -> Iterator[None]:
-        found.append((yield from difference(cache, message, indices, layers, lambda: iter((None,)))))
+        found.append((yield from difference(cache, message, indices, layers, True, lambda: iter((None,)))))
 
     finish(steps())
     return found[0]

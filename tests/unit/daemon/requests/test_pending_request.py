@@ -23,7 +23,7 @@ NOWHERE = Catalogue.from_cells([])
 
 
 def waiting_request(session: Session, deadline_s: float, cells: int = 0) -> PendingRequest:
-    return PendingRequest(session, 0, [(0, "points")] * cells, NOWHERE, deadline_s=deadline_s)
+    return PendingRequest(session, 0, [(0, "points")] * cells, NOWHERE, (), deadline_s=deadline_s)
 
 
 def waiting_list() -> WaitingList:

@@ -7,10 +7,10 @@ import select
 from collections.abc import Callable
 
 from shmmap.daemon.map.catalogue_reload import Reloader
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.errors import ShmmapError
-from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.messages import Reload, Reloaded
 from tests.support.divided_map import DividedMap
@@ -22,7 +22,7 @@ def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map:
     reloader = Reloader(open_map(str(small_map.root)))
     operators = OperatorRequests(one.cache, OperatorPins(one.cache, one.scheduler), reloader)
     session = one.session()
-    read: list[Catalogue] = []
+    read: list[CatalogueView] = []
     failed: list[ShmmapError] = []
     for number in (7, 7, 7, 8):
         finish(operators.handle(session, Reload(number), 0.0))
