@@ -27,8 +27,7 @@ from shmmap.daemon.host.signals import (
     StartSignals,
     ignore_signals,
 )
-from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.requests.cell_requests import CellRequests
@@ -107,7 +106,7 @@ class Service:
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, cache.survey)
-        change = MapChange(reloader, cells, cache, scheduler, memory.map_switch, memory.event_log)
+        change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log)
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
         dispatch = Dispatch(
@@ -134,6 +133,7 @@ class Service:
             statistics,
             defects,
             memory.event_log,
+            memory.map_switch,
         )
 
     def run(self, started_s: float) -> None:
@@ -240,13 +240,13 @@ class Service:
         self._manager.reloading()
         self._reloader.ask(self._reloaded)
 
-    def _reloaded(self, result: CatalogueView | ShmmapError) -> None:
+    def _reloaded(self, result: Reread | ShmmapError) -> None:
         if isinstance(result, ShmmapError):
             self._manager.reloaded(f"reload failed, the old map stays: {result.message}")
             return
         if self._file_watch is not None:  # the metadata may name another directory now
-            self._file_watch.follow(self._directories(result.id_prefix))
-        self._manager.reloaded(f"map read again: {len(result)} cells")
+            self._file_watch.follow(self._directories(result.catalogue.id_prefix))
+        self._manager.reloaded(f"map read again: {len(result.catalogue)} cells")
 
     # --- signals ----------------------------------------------------------------------------------
 

@@ -111,7 +111,17 @@ def run(config: DaemonConfig) -> int:
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
             stack.push(partial(_close, memory, signals))
-        service = Service(config, memory, Reloader(origin), ServiceManager(), path, gid, signals, activated)
+        reloader = Reloader(origin, lambda: memory.cache.catalogue)
+        service = Service(
+            config,
+            memory,
+            reloader,
+            ServiceManager(),
+            path,
+            gid,
+            signals,
+            activated,
+        )
         service.run(started_s)
     log.info("stopped", instance=config.instance)
     return 0

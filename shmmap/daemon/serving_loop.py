@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
@@ -50,6 +51,7 @@ class ServingLoop:
     statistics: StatisticsWriter
     defects: Defects
     event_log: EventLog
+    map_switch: MapSwitch
     stopping: bool = False
     _answer_at_end: bool = True
     _turn_began_ns: int = field(default_factory=time.thread_time_ns)
@@ -77,7 +79,7 @@ class ServingLoop:
 
     def _patience_s(self) -> float:
         """How long nothing has to be done if nothing comes."""
-        if len(self.inbox):
+        if len(self.inbox) or self.map_switch.busy:
             return 0
         until_s = min(
             self.scheduler.next_event_s(),
@@ -149,6 +151,8 @@ class ServingLoop:
         self._guarded("loaders", self.scheduler.lost.end_overdue, now_s)
         self._guarded("answers", self.cells.answer_overdue, now_s)
         self._guarded("survey", self.cache.survey.turn, now_s)
+        if self.map_switch.busy:
+            self._guarded("map", self.map_switch.step, now_s)
         self._guarded("beat", self.sampler.turn, now_s)
         if now_s >= self.operators.stop_by_s:
             self.stop()

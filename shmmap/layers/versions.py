@@ -187,7 +187,7 @@ class LayerVersions:
             if not known:
                 del self._known[layer]
 
-    def forget(self) -> None:
-        """Indices mean other cells from now on."""
-        self._known.clear()
-        self._count = 0
+    def forget(self) -> list[dict[int, int]]:
+        """Indices mean other cells from now on; returns what was known, which takes time to be freed."""
+        known, self._known, self._count = list(self._known.values()), {}, 0
+        return known

@@ -238,23 +238,6 @@ class Catalogue:
         return self._index.query(area, most), True
 
 
-@dataclass(frozen=True, slots=True)
-class CatalogueChange:
-    """What differs between two catalogues of a map; ids in id order."""
-
-    added: tuple[str, ...]
-    """In the new one only."""
-    removed: tuple[str, ...]
-    """In the old one only."""
-    changed: tuple[str, ...]
-    """In both with different stamps: another version."""
-    moved: tuple[str, ...]
-    """In both with different boxes (the metadata was edited): another version, too."""
-
-    def __bool__(self) -> bool:
-        return bool(self.added or self.removed or self.changed or self.moved)
-
-
 class Tables(Protocol):
     """What is compared of two catalogues; each as `Catalogue` has it."""
 
@@ -269,6 +252,40 @@ class Tables(Protocol):
     def ids(self, indices: Indices) -> list[str]: ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CatalogueChange:
+    """What differs between two catalogues of a map; indices ascending, which is id order."""
+
+    old: Tables
+    new: Tables
+    added: Indices
+    """In the new one only."""
+    removed: Indices
+    """In the old one only; these are indices of the old one."""
+    changed: Indices
+    """In both with different stamps: another version."""
+    moved: Indices
+    """In both with different boxes (the metadata was edited): another version, too."""
+
+    def __bool__(self) -> bool:
+        return self.count > 0
+
+    @property
+    def count(self) -> int:
+        """How many cells there are in all of them."""
+        return len(self.added) + len(self.removed) + len(self.changed) + len(self.moved)
+
+    @property
+    def same_cells(self) -> bool:
+        """Whether indices mean the same cells as before."""
+        return not len(self.added) and not len(self.removed)
+
+    def ids(self, how: str, most: int | None = None) -> tuple[str, ...]:
+        """Ids of the cells that were ``how``: added, removed, changed or moved; the first ``most``."""
+        tables = self.old if how == "removed" else self.new
+        return tuple(tables.ids(getattr(self, how)[:most]))
+
+
 def compare(old: Tables, new: Tables) -> CatalogueChange:
     """Find what changed from ``old`` to ``new``, without visiting every cell in Python."""
     if old.id_prefix == new.id_prefix and np.array_equal(old.names, new.names):
@@ -281,10 +298,12 @@ def compare(old: Tables, new: Tables) -> CatalogueChange:
     differs = (old.stamps[in_old] != new.stamps[in_new]).any(axis=1)
     moved = (old.boxes[in_old] != new.boxes[in_new]).any(axis=1)
     return CatalogueChange(
-        added=tuple(new.ids(np.setdiff1d(np.arange(len(new.names)), in_new, assume_unique=True))),
-        removed=tuple(old.ids(np.setdiff1d(np.arange(len(old.names)), in_old, assume_unique=True))),
-        changed=tuple(new.ids(in_new[differs])),
-        moved=tuple(new.ids(in_new[moved])),
+        old,
+        new,
+        added=np.setdiff1d(np.arange(len(new.names)), in_new, assume_unique=True),
+        removed=np.setdiff1d(np.arange(len(old.names)), in_old, assume_unique=True),
+        changed=in_new[differs],
+        moved=in_new[moved],
     )
 
 

@@ -12,12 +12,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from shmmap.daemon.cache.cell_rows import CellRows
 from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
 from shmmap.daemon.cache.survey import Survey
-from shmmap.daemon.cache.warm_index import WarmIndex
+from shmmap.daemon.cache.warm_index import Heights, WarmIndex
 from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.map.catalogue_view import CatalogueView
@@ -60,8 +63,10 @@ class CellCache:
         Who maps a segment; who maps how much in all.
     warm
         The cells that are in memory at their current version.
-    heights : dict
-        Catalogue indices to lowest and highest z, metres, of cells that were loaded since they changed.
+    heights
+        Of cells that were loaded since they changed.
+    unentered : int
+        How many segments are still to be looked for in the state of the map that is served now.
     """
 
     def __init__(
@@ -85,7 +90,8 @@ class CellCache:
         self.warm = WarmIndex()
         self.id_prefix = catalogue.id_prefix
         self.segment_prefix = segment_prefix(instance)
-        self.heights: dict[int, tuple[float, float]] = {}
+        self.heights = Heights(len(catalogue))
+        self.unentered = 0
         self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
         self.events = CellEvents(event_log, statistics, self.wire_id, PressureEvents(event_log, self._memory))
         self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
@@ -95,7 +101,6 @@ class CellCache:
         self.epoch = event_log.epoch
         self.mode = mode
         self.gid = gid
-        self._indices: dict[str, int] = {}
         self._untold: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         reclaimer.on_retired = self._on_retired
         reclaimer.on_gone = lambda name: self.tell(self.rows.hide, name)
@@ -104,13 +109,9 @@ class CellCache:
 
     def index_of(self, cell: str) -> int | None:
         """Catalogue index of an id: whole, without the prefix, or a unique base name."""
-        index = self._indices.get(cell)
-        if index is None:
-            index = self.catalogue.find(cell)
-            if index is None and not cell.startswith("/"):
-                index = self.catalogue.find(self.id_prefix + cell)
-            if index is not None and len(self._indices) < 1 << 20:
-                self._indices[cell] = index
+        index = self.catalogue.find(cell)
+        if index is None and not cell.startswith("/"):
+            index = self.catalogue.find(self.id_prefix + cell)
         return index
 
     def wire_id(self, cell_id: str) -> str:
@@ -122,6 +123,10 @@ class CellCache:
     def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
         """The current version of a cell, if it is in memory (retired ones are put back in service)."""
         resident = self.warm.get(index, layer)
+        if resident is None and self.unentered:
+            resident = self.ledger.by_key.get(Key(self.catalogue.id(index), layer))
+            if resident is not None and not self.enter_if_current(resident, index):
+                resident = None
         if resident is None and self.ledger.retired:
             key = Key(self.catalogue.id(index), layer)
             if self.reclaimer.may_revive(key):
@@ -135,8 +140,7 @@ class CellCache:
         """Leave out cells whose heights, known once they were loaded, lie outside the range."""
         if z is None:
             return indices
-        heights = self.heights
-        return [i for i in indices if (known := heights.get(i)) is None or z.overlaps(*known)]
+        return self.heights.overlapping(indices, z)
 
     def estimate(self, index: int, layer: str) -> int:
         """Bytes to reserve before a load: `points` has its file's bytes, plus its header, at most.
@@ -209,27 +213,45 @@ class CellCache:
 
         One that is not checked yet only shows: who holds its version need not be sent it again.
         """
-        self.warm.note_version(resident, index)
+        self.warm.note_version(resident)
         current = True
         if resident.checked:
             segment = resident.name.removeprefix(self.segment_prefix)
             self.warm.encode(resident, self.wire_id(resident.key.cell_id), segment)
-            current = resident.version == self.layers.version(index, resident.key.layer)
-            if current:
-                self.warm.enter(resident, index, len(self.catalogue))
-                self.heights[index] = (resident.z_min, resident.z_max)
-            self._indices[self.wire_id(resident.key.cell_id)] = index
+            current = self.enter_if_current(resident, index)
         self.tell(self.rows.show, resident, "resident" if current else "stale")
 
-    def forget_indices(self) -> None:
-        """Catalogue indices mean other cells from now on; what is resident is entered anew."""
-        self._indices.clear()
-        self.warm.clear()
-        self.heights.clear()
-        for retired in self.ledger.retired.values():
-            index = self.index_of(retired.resident.key.cell_id)
-            if index is not None:
-                self.warm.note_version(retired.resident, index)
+    def enter_if_current(self, resident: Resident, index: int) -> bool:
+        """Whether a segment is of its cell's current version; then it is found by index from now on."""
+        if not resident.checked or resident.version != self.layers.version(index, resident.key.layer):
+            return False
+        self.warm.enter(resident, index, len(self.catalogue))
+        self.heights.learn(index, resident.z_min, resident.z_max)
+        return True
+
+    def serve(self, new: CatalogueView, changed: NDArray[np.intp] | None) -> list[dict[int, Any]]:
+        """Serve another state of the map.
+
+        Nothing is warm in it before `find_warm` or `MapSwitch.step` has found it in the ledger.
+
+        Parameters
+        ----------
+        changed
+            Indices of cells that have changed; None where indices mean other cells.
+
+        Returns
+        -------
+        list
+            Tables that are not used any more; to free many entries at once takes long.
+        """
+        left: list[dict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
+        self.catalogue = new
+        self.warm = self.warm.successor()
+        if changed is None:
+            self.heights = Heights(len(new))
+        else:
+            self.heights.forget(changed)
+        return left
 
     # --- telling --------------------------------------------------------------------------------
 
@@ -255,7 +277,7 @@ class CellCache:
 
         The same goes for its neighbours in layers that look into it.
         """
-        self.heights.pop(index, None)
+        self.heights.forget(np.array([index]))
         self.layers.cell_changed(index)
         for layer, cells in self.layers.dependents(index, list(self.warm.layers)):
             for cell in cells:

@@ -5,24 +5,39 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.origin.catalogue import CatalogueChange, compare
+from shmmap.daemon.records import Resident
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.segment.version import Stamp
 
 __all__ = ["MapSwitch"]
 
 STATES_REMEMBERED: Final = 64
+CELLS_REMEMBERED: Final = 2048
+"""Changes of cells, in all states that are remembered; who asks for changes before reads the whole list."""
+SEGMENTS_A_STEP: Final = 16
+ENTRIES_A_STEP: Final = 2048
+"""Segments looked at, and entries of tables freed, in one turn: less than a millisecond."""
 
 
 class MapSwitch:
-    """Changes the catalogue that the cache serves, and remembers the changes."""
+    """Changes the catalogue that the cache serves, and remembers the changes.
+
+    To change over takes one short step.  What is in memory is then looked at little by little, in `step`; a
+    cell that is asked for meanwhile is looked for at once (`CellCache.find_warm`).
+    """
 
     def __init__(self, cache: CellCache) -> None:
         self._cache = cache
         self._history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=STATES_REMEMBERED)
+        self._remembered = 0
+        self._residents: deque[Resident] = deque()
+        self._leftovers: list[dict[int, Any]] = []
 
     def changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
         """Ids that changed or appeared, and that vanished, since a map version; None: not known."""
@@ -73,36 +88,63 @@ class MapSwitch:
         cache.chill(index)
         cache.tell(cache.events.changed, cell_id, cache.catalogue.version(index))
 
-    def switch(self, new: CatalogueView, now_s: float) -> CatalogueChange:
-        """Serve another state of the map; takes effect cell by cell as cells are asked for."""
+    def switch(self, new: CatalogueView, change: CatalogueChange) -> None:
+        """Serve another state of the map; ``change`` is what it differs in from the one served now."""
         cache = self._cache
-        change = compare(cache.catalogue, new)
-        if change:
-            self._remember({*change.changed, *change.added, *change.moved}, change.removed)
-        cache.catalogue = new
-        cache.layers.forget()
-        if change.added or change.removed:
-            cache.forget_indices()
-        changed, gone, moved = set(change.changed), set(change.removed), set(change.moved)
-        for cold in [index for index in cache.heights if new.id(index) in changed]:
-            cache.chill(cold)
-        for retired in cache.ledger.retired.values():
-            if retired.resident.key.cell_id in moved:
-                cache.reclaimer.never_revive(retired.resident.key)
-        for resident in list(cache.ledger.residents()):
-            cell_id = resident.key.cell_id
-            index = cache.index_of(cell_id)
-            if index is None or cell_id in gone or cell_id in moved:
-                cache.reclaimer.retire(resident, now_s, "map")
-                if cell_id not in gone:
-                    cache.reclaimer.never_revive(resident.key)  # its header has the old box
-                continue
-            cache.warm.leave(index, resident.key.layer)
-            if resident.checked or cache.is_current(resident):
-                cache.enter(resident, index)
+        if change.count <= CELLS_REMEMBERED:
+            touched = {cell for how in ("changed", "added", "moved") for cell in change.ids(how)}
+            if change:
+                self._remember(touched, change.ids("removed"))
+        else:
+            self._history.clear()
+            self._remembered = 0
+        changed = np.union1d(change.changed, change.moved)
+        self._leftovers += cache.serve(new, changed if change.same_cells else None)
+        self._residents = deque(cache.ledger.residents())
+        cache.unentered = len(self._residents)
+
+    @property
+    def busy(self) -> bool:
+        """Whether `step` has something to do."""
+        return bool(self._residents or self._leftovers)
+
+    def step(self, now_s: float) -> None:
+        """Look at some of what is in memory: it is right, out of date, or of no cell of the map any more."""
+        cache = self._cache
+        for _ in range(min(SEGMENTS_A_STEP, len(self._residents))):
+            resident = self._residents.popleft()
+            if cache.ledger.resident_named(resident.name) is resident:
+                self._look_at(resident, now_s)
+        cache.unentered = len(self._residents)
+        for _ in range(ENTRIES_A_STEP):
+            if not self._leftovers:
+                break
+            if self._leftovers[-1]:
+                self._leftovers[-1].popitem()
             else:
-                cache.reclaimer.retire(resident, now_s, "map")
-        return change
+                self._leftovers.pop()
+
+    def _look_at(self, resident: Resident, now_s: float) -> None:
+        cache, cell = self._cache, resident.key.cell_id
+        index = cache.index_of(cell)
+        if index is None or cache.catalogue.box(index) != resident.box:
+            cache.reclaimer.retire(resident, now_s, "map")
+        elif cache.enter_if_current(resident, index):
+            cache.tell(cache.rows.show, resident, "resident")
+        elif resident.checked:
+            cache.tell(cache.rows.show, resident, "stale")
+        elif not cache.is_current(resident):
+            cache.reclaimer.retire(resident, now_s, "map")
 
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:
-        self._history.append((self._cache.catalogue.map_version, frozenset(changed), removed))
+        history = self._history
+        if len(history) == STATES_REMEMBERED:
+            self._forget_oldest()
+        history.append((self._cache.catalogue.map_version, frozenset(changed), removed))
+        self._remembered += len(changed) + len(removed)
+        while self._remembered > CELLS_REMEMBERED:
+            self._forget_oldest()
+
+    def _forget_oldest(self) -> None:
+        _version, changed, removed = self._history.popleft()
+        self._remembered -= len(changed) + len(removed)

@@ -11,11 +11,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.records import Resident
+from shmmap.daemon.records import Key, Resident
+from shmmap.geometry import ZRange
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
 
-__all__ = ["WarmIndex"]
+__all__ = ["Heights", "WarmIndex"]
 
 
 TABLES_BYTES: Final = 64 << 20
@@ -23,6 +24,44 @@ TABLES_BYTES: Final = 64 << 20
 LEAST_TABLES: Final = 4
 RETIRED_REMEMBERED: Final = 1 << 16
 """Versions out of service; who holds an older one is told to drop it, as if the daemon had been restarted."""
+
+
+class Heights:
+    """Lowest and highest z of cells by catalogue index, metres; as far as they are known.
+
+    Parameters
+    ----------
+    cells
+        How many cells there are.
+    """
+
+    def __init__(self, cells: int) -> None:
+        self._z = np.zeros((cells, 2))  # takes memory as it is written
+        self._known = np.zeros(cells, np.bool_)
+
+    def learn(self, index: int, z_min: float, z_max: float) -> None:
+        """A cell was loaded."""
+        self._z[index] = z_min, z_max
+        self._known[index] = True
+
+    def forget(self, indices: NDArray[np.intp]) -> None:
+        """Cells have changed."""
+        self._known[indices] = False
+
+    def get(self, index: int) -> tuple[float, float] | None:
+        """Lowest and highest z of a cell; None where they are not known."""
+        if not self._known[index]:
+            return None
+        z_min, z_max = self._z[index].tolist()
+        return z_min, z_max
+
+    def overlapping(self, indices: list[int], z: ZRange) -> list[int]:
+        """Those cells of which it is not known that they lie outside a range."""
+        cells = np.array(indices, dtype=np.intp)
+        z_min, z_max = self._z[cells].T
+        outside = self._known[cells] & ((z_max < z.min) | (z_min > z.max))
+        inside: list[int] = cells[~outside].tolist()
+        return inside
 
 
 @dataclass(eq=False, slots=True)
@@ -38,12 +77,12 @@ class WarmIndex:
     tables : dict
         Per layer that has one, (cells,) uint64: the version, 0 where the cell is not in memory.
     of_version : dict
-        Versions handed out, current and earlier ones, to catalogue index and layer.
+        Versions handed out, current and earlier ones, to cell and layer.
     """
 
     layers: dict[str, dict[int, Resident]] = field(default_factory=dict)
     tables: dict[str, NDArray[np.uint64]] = field(default_factory=dict)
-    of_version: dict[int, tuple[int, str]] = field(default_factory=dict)
+    of_version: dict[int, Key] = field(default_factory=dict)
     _retired: OrderedDict[int, None] = field(default_factory=OrderedDict)
     _count: int = 0
 
@@ -107,9 +146,9 @@ class WarmIndex:
         for index, resident in found.items():
             table[index] = resident.version
 
-    def note_version(self, resident: Resident, index: int) -> None:
+    def note_version(self, resident: Resident) -> None:
         """What a segment's version is of."""
-        self.of_version[resident.version] = index, resident.key.layer
+        self.of_version[resident.version] = resident.key
         self._retired.pop(resident.version, None)
 
     def note_retired(self, resident: Resident) -> None:
@@ -132,10 +171,6 @@ class WarmIndex:
             del self.layers[layer]
             self.tables.pop(layer, None)
 
-    def clear(self) -> None:
-        """Indices mean other cells from now on."""
-        self.layers.clear()
-        self.tables.clear()
-        self.of_version.clear()
-        self._retired.clear()
-        self._count = 0
+    def successor(self) -> WarmIndex:
+        """Return an empty one, for indices that mean other cells; versions are of the same as before."""
+        return WarmIndex(of_version=self.of_version, _retired=self._retired)

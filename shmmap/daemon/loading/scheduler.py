@@ -13,7 +13,9 @@ cell that failed: only workers look at files, because a look may take as long as
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Hashable, Iterable
+from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
@@ -31,6 +33,9 @@ from shmmap.segment.directory import is_full
 from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
+
+LOOKS_A_PUMP: Final = 64
+"""Loads that one `pump` hands out or finds to be of no use any more."""
 
 
 class Scheduler:
@@ -65,6 +70,7 @@ class Scheduler:
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
+        self._doubtful: deque[Key] = deque()
         self.room = Room(cache, self.loads, pool)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
@@ -92,12 +98,16 @@ class Scheduler:
         load.unless = failure.stamp
         return load
 
-    def drop(self, cells: Iterable[str]) -> None:
-        """These cells left the map: nobody asks for them any more."""
-        gone = set(cells)
-        for key in [key for key in {*self.loads.by_key, *self.loads.failures} if key.cell_id in gone]:
-            self.loads.cancel(key)
-            self.on_settled(key)
+    def map_changed(self) -> None:
+        """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
+        self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+
+    def _drop_some(self) -> None:
+        for _ in range(min(LOOKS_A_PUMP, len(self._doubtful))):
+            key = self._doubtful.popleft()
+            if self._cache.index_of(key.cell_id) is None:
+                self.loads.cancel(key)
+                self.on_settled(key)
 
     # --- handing out jobs -----------------------------------------------------------------------
 
@@ -107,9 +117,10 @@ class Scheduler:
             self.loads.forget_refusals()
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
-        while self.pool.has_room:
-            load = self.loads.next_queued()
-            if load is None:
+        if self._doubtful:
+            self._drop_some()
+        for _ in range(LOOKS_A_PUMP):
+            if not self.pool.has_room or (load := self.loads.next_queued()) is None:
                 return
             job = self._job(load, self._job_numbers + 1)
             if job is None:
@@ -168,6 +179,8 @@ class Scheduler:
 
     def next_event_s(self) -> float:
         """When `pump` has something to do although nothing arrives; infinity for never."""
+        if self._doubtful:
+            return 0.0
         reclaimer = self._cache.reclaimer
         return min(reclaimer.next_sweep_s(), reclaimer.wake_s, self.pool.next_deadline_s())
 

@@ -2,7 +2,8 @@
 """Reading the map's catalogue again, beside the serving loop.
 
 Looking at every file of a large map takes seconds, so it happens in a thread; the loop is told
-through an event descriptor and then changes over in one step.  Requests for another reload while
+through an event descriptor and then changes over in one step; what has changed is found out in the
+thread, too.  Requests for another reload while
 one runs are answered by the next one, which sees everything that they could mean.
 """
 
@@ -11,18 +12,36 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
+from shmmap.origin.catalogue import CatalogueChange, compare
 
-__all__ = ["Reloader"]
+__all__ = ["Reloader", "Reread"]
 
-Answer = Callable[[CatalogueView | ShmmapError], None]
+
+@dataclass(frozen=True, slots=True)
+class Reread:
+    """Another state of the map, and what it differs in from the one that was served when it was asked for."""
+
+    catalogue: CatalogueView
+    change: CatalogueChange
+
+
+Answer = Callable[[Reread | ShmmapError], None]
 
 
 class Reloader:
     """Loads the catalogue in a thread, one at a time.
+
+    Parameters
+    ----------
+    origin
+        Where the map comes from.
+    served
+        Gives the state of the map that is served.
 
     Attributes
     ----------
@@ -30,11 +49,12 @@ class Reloader:
         Readable when a result is there: call `collect` then.
     """
 
-    def __init__(self, origin: ViewOrigin) -> None:
+    def __init__(self, origin: ViewOrigin, served: Callable[[], CatalogueView]) -> None:
         self._origin = origin
+        self._served = served
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._thread: threading.Thread | None = None
-        self._result: CatalogueView | ShmmapError | None = None
+        self._result: Reread | ShmmapError | None = None
         self._asked: list[Answer] = []
         self._next: list[Answer] = []
 
@@ -46,7 +66,7 @@ class Reloader:
 
     def _begin(self) -> None:
         self._asked, self._next = self._next, []
-        self._thread = threading.Thread(target=self._load, name="reload", daemon=True)
+        self._thread = threading.Thread(target=self._load, args=(self._served(),), name="reload", daemon=True)
         try:
             self._thread.start()
         except RuntimeError as error:  # there are as many threads as there may be
@@ -56,9 +76,11 @@ class Reloader:
             )
             os.eventfd_write(self.fd, 1)
 
-    def _load(self) -> None:
+    def _load(self, before: CatalogueView) -> None:
         try:
-            self._result = self._origin.load(fresh=True)
+            catalogue = self._origin.load(fresh=True)
+            _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # found here, not in the loop
+            self._result = Reread(catalogue, compare(before, catalogue))
         except ShmmapError as error:
             self._result = error
         except OSError as error:
@@ -68,7 +90,7 @@ class Reloader:
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
-    def collect(self, apply: Callable[[CatalogueView], None], failed: Callable[[ShmmapError], None]) -> None:
+    def collect(self, apply: Callable[[Reread], None], failed: Callable[[ShmmapError], None]) -> None:
         """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
         os.eventfd_read(self.fd)
         if self._thread is not None:

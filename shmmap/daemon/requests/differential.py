@@ -62,16 +62,17 @@ def warm_difference(
         held.update(cast("list[int]", given))
     if 0 in current:
         return None  # 0 stands for "not in memory"
-    warm, of_version = cache.warm.layers[layer], cache.warm.of_version
-    missing = [of_version[version][0] for version in current - held]
+    warm, of_version, index_of = cache.warm.layers[layer], cache.warm.of_version, cache.catalogue.find
+    missing = [index_of(of_version[version].cell_id) or 0 for version in current - held]
     missing.sort()
     removed: tuple[str, ...] = ()
     removed_packed = b""
     gone = held - current
     if gone:
         # an old version of a cell inside the area is replaced, not removed
-        known = ((version, of_version.get(version, (-1, ""))[0]) for version in gone)
-        replaced = [v for v, index in known if index in warm and warm[index].version in current]
+        known = ((version, key) for version in gone if (key := of_version.get(version)) is not None)
+        of_cells = ((version, index_of(key.cell_id)) for version, key in known)
+        replaced = [v for v, index in of_cells if index in warm and warm[index].version in current]
         gone.difference_update(replaced)
         if named:
             removed = _removed_names(cache, named, gone, current, layer)
@@ -172,11 +173,11 @@ def difference(
         if number:
             yield from pause()
         for version in outdated:
-            known, layer = cache.warm.of_version.get(version, (-1, ""))
-            if known in inside:
+            key = cache.warm.of_version.get(version)
+            if key is not None and cache.index_of(key.cell_id) in inside:
                 gone.discard(version)
-                result.old.add(Key(id_of(known), layer))
-            elif known < 0 and not covered:
+                result.old.add(key)
+            elif key is None and not covered:
                 gone.discard(version)
     result.removed = tuple(removed)
     result.removed_packed = pack_versions(gone)

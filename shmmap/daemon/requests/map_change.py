@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass
 from typing import Final
@@ -11,9 +12,7 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import CatalogueChange
@@ -21,8 +20,10 @@ from shmmap.protocol import events
 
 __all__ = ["MapChange"]
 
-CELLS_TOLD: Final = 256
+CELLS_TOLD: Final = 128
 """Changed cells named one by one: a map written anew has a million; `metadata` names them all."""
+PROBLEMS_TOLD: Final = 64
+"""Problems of the map in the log."""
 
 
 @dataclass(eq=False, slots=True)
@@ -30,7 +31,6 @@ class MapChange:
     """Carries out what a reload found."""
 
     reloader: Reloader
-    cells: CellRequests
     cache: CellCache
     scheduler: Scheduler
     map_switch: MapSwitch
@@ -40,26 +40,24 @@ class MapChange:
         """A reload is over: serve what it found, and tell those who asked for it."""
         self.reloader.collect(self._apply, self._keep)
 
-    def _apply(self, catalogue: CatalogueView) -> None:
+    def _apply(self, reread: Reread) -> None:
         """Serve another state of the map from now on."""
-        cache, statistics = self.cache, self.cache.statistics
-        change = self.map_switch.switch(catalogue, time.monotonic())
-        self.scheduler.drop(change.removed)
-        cache.tell_all()
+        statistics, catalogue = self.cache.statistics, reread.catalogue
+        self.map_switch.switch(catalogue, reread.change)
+        self.scheduler.map_changed()
         statistics.add("reloads")
         statistics.set("last_reload_unix_ns", time.time_ns())
         statistics.set("last_reload_failed", 0)
         statistics.set("map_problems", len(catalogue.problems))
-        self._tell(change)
-        for problem in catalogue.problems:
+        self._tell(reread.change)
+        for problem in itertools.islice(catalogue.problems, PROBLEMS_TOLD):
             log.warning("problem in the map", what=problem)
 
     def _tell(self, change: CatalogueChange) -> None:
         """Say what is new in the map."""
         cache, catalogue = self.cache, self.cache.catalogue
-        kinds = {how: getattr(change, how) for how in ("changed", "moved", "added", "removed")}
-        counts = {how: len(cells) for how, cells in kinds.items()}
-        named = [(how, cell) for how, cells in kinds.items() for cell in cells[:CELLS_TOLD]][:CELLS_TOLD]
+        counts = {how: len(getattr(change, how)) for how in ("changed", "moved", "added", "removed")}
+        named = [(how, cell) for how in counts for cell in change.ids(how, CELLS_TOLD)][:CELLS_TOLD]
         log.info("reload done", cells=len(catalogue), **counts)
         self.event_log.publish(
             events.Reloaded, catalogue.map_version, counts["changed"] + counts["moved"], counts["added"],

@@ -135,7 +135,7 @@ class MapQueries:
 
     def _row(self, index: int) -> messages.MetadataRow:
         catalogue = self._catalogue
-        heights = self.cache.heights.get(index, (None, None))
+        heights = self.cache.heights.get(index) or (None, None)
         wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.source_bytes(index)
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
@@ -170,7 +170,7 @@ class MapQueries:
             return messages.ShownCell(message.request, found[0].key.cell_id, 0, *found[0].box, 0, shown)
         (cell_id,) = ids
         failures = [failure for key, failure in self.loads.failures.items() if key.cell_id == cell_id]
-        z_min, z_max = cache.heights.get(index, (None, None))
+        z_min, z_max = cache.heights.get(index) or (None, None)
         return messages.ShownCell(
             message.request, cell_id, catalogue.version(index), *catalogue.box(index),
             catalogue.source_bytes(index), shown,

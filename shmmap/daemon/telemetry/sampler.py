@@ -73,7 +73,8 @@ class Sampler:
         set_value("workers", len(self.scheduler.pool))
         set_value("load_queue", len(self.scheduler.loads))
         set_value("cells_resident", ledger.resident_count)
-        set_value("stale_cells", ledger.resident_count - ledger.unchecked_count - len(cache.warm))
+        found = ledger.unchecked_count + len(cache.warm) + cache.unentered
+        set_value("stale_cells", max(0, ledger.resident_count - found))
         set_value("bytes_resident", ledger.resident_bytes)
         set_value("zombies", len(ledger.retired))
         set_value("bytes_zombie", ledger.retired_bytes)

@@ -33,7 +33,7 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
 from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Selected
@@ -164,6 +164,7 @@ class InnerDaemon:
         self.scheduler.lost.end_overdue(now_s)
         self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
+        self.map_switch.step(now_s)
         while not self.hold_answers and self.due:
             finish(self.due.pop(0))
         self.cache.tell_all()
@@ -221,7 +222,8 @@ class InnerDaemon:
     def reload(self) -> Catalogue:
         """Read the map again and serve what it is now."""
         new = self.origin.load(fresh=True)
-        self.scheduler.drop(self.map_switch.switch(new, self.now_s()).removed)
+        self.map_switch.switch(new, compare(self.cache.catalogue, new))
+        self.scheduler.map_changed()
         self.cache.tell_all()
         return new
 

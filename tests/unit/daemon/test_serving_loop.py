@@ -75,6 +75,7 @@ def test_a_defect_beside_a_request_does_not_starve_its_process() -> None:
         statistics,
         Defects(statistics),
         nothing,
+        nothing,
     )
     connection = cast("Connection", Client())
     for body in (b"first", b"second", b"third"):
@@ -105,7 +106,7 @@ def test_turns_are_measured(inner: Inner, small_map: DividedMap) -> None:
     nothing.lost = nothing.survey = nothing
     loop = ServingLoop(
         one.watched, Inbox(one.statistics), nothing, nothing, nothing, nothing, nothing, nothing,
-        one.statistics, Defects(one.statistics), one.event_log,
+        one.statistics, Defects(one.statistics), one.event_log, one.map_switch,
     )  # fmt: skip
     told = one.event_log.last
     try:

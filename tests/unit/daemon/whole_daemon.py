@@ -59,8 +59,9 @@ class WholeDaemon:
         origin = origin or open_map(str(map_path), cache_dir=scratch)
         self.memory = MapInMemory(config, origin.load(), directory, PinWatch(directory), path, 0o400, -1)
         signals = cast("StartSignals", SimpleNamespace(keep=False, reload_wanted=False))
+        reloader = Reloader(origin, lambda: self.memory.cache.catalogue)
         self.service = Service(
-            config, self.memory, Reloader(origin), ServiceManager(), path, -1, signals, activated=None
+            config, self.memory, reloader, ServiceManager(), path, -1, signals, activated=None
         )
         self.service._listen()
         self._context: zmq.Context[Any] = zmq.Context()

@@ -345,9 +345,9 @@ def test_reload_sees_what_changed(tmp_path: Path) -> None:
     put_cells(cells, ["new.pcd"])
     (root / "pointcloud_map_metadata.yaml").write_text(metadata_text(NAMES[::2], "new.pcd: [60, 60]\n"))
     change = compare(before, origin.load(fresh=True))
-    assert change.added == (str(cells / "new.pcd"),)
-    assert change.removed == (str(cells / "t_20_0.pcd"),)
-    assert change.changed == (str(cells / "t_0_0.pcd"),)
+    assert change.ids("added") == (str(cells / "new.pcd"),)
+    assert change.ids("removed") == (str(cells / "t_20_0.pcd"),)
+    assert change.ids("changed") == (str(cells / "t_0_0.pcd"),)
     assert before.map_version != origin.load().map_version
 
 

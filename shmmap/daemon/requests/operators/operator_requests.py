@@ -9,13 +9,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import compare
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 
@@ -70,19 +68,20 @@ class OperatorRequests:
             self.stop_by_s = -math.inf
 
     def _reload(self, session: Session, message: messages.Reload) -> None:
-        before, asked = self.cache.catalogue, (session.slot, message.request)
+        asked = session.slot, message.request
         if asked in self._reloading:
             return  # the client repeats what it has no answer to yet
         self._reloading.add(asked)
 
-        def answer(result: CatalogueView | ShmmapError) -> None:
+        def answer(result: Reread | ShmmapError) -> None:
             self._reloading.discard(asked)
             if isinstance(result, ShmmapError):
                 session.connection.refuse(message.request, result)
                 return
-            change = compare(before, result)
+            catalogue, change = result.catalogue, result.change
             counts = len(change.changed), len(change.added), len(change.removed)
-            reloaded = messages.Reloaded(message.request, result.map_version, *counts, tuple(result.problems))
+            problems = tuple(catalogue.problems)
+            reloaded = messages.Reloaded(message.request, catalogue.map_version, *counts, problems)
             session.connection.reply(encode(reloaded))
 
         self.reloader.ask(answer)

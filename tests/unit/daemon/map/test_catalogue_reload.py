@@ -9,12 +9,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.errors import ShmmapError
 from shmmap.origin.catalogue import Catalogue
 
-Result = CatalogueView | ShmmapError
+Result = Reread | ShmmapError
 
 
 class Origin:
@@ -29,7 +28,7 @@ class Origin:
 
 @pytest.fixture
 def reloader() -> Iterator[Reloader]:
-    one = Reloader(Origin())
+    one = Reloader(Origin(), lambda: Catalogue.from_cells([]))
     yield one
     one.close()
 
@@ -66,4 +65,4 @@ def test_no_thread_is_to_be_had(reloader: Reloader, monkeypatch: pytest.MonkeyPa
     assert "can't start new thread" in answers[0].message
     reloader.ask(answers.append)
     collect(reloader)
-    assert isinstance(answers[1], Catalogue)
+    assert isinstance(answers[1], Reread)

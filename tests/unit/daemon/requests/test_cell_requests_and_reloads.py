@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
-from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.protocol.messages import (
     Area,
     Cells,
@@ -179,7 +179,8 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     before = one.everything()
     empty = Catalogue.from_cells([])
-    one.scheduler.drop(one.map_switch.switch(empty, one.now_s()).removed)
+    one.map_switch.switch(empty, compare(one.cache.catalogue, empty))
+    one.scheduler.map_changed()
     assert one.everything(2) == Cells(2, 77, empty.map_version, layers=("points",))
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.ask(one.session(), Differential(3, EVERYWHERE, packed=packed))

@@ -6,8 +6,7 @@ from __future__ import annotations
 import select
 from collections.abc import Callable
 
-from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.errors import ShmmapError
@@ -19,10 +18,10 @@ from tests.unit.daemon.inner_daemon import InnerDaemon, finish
 
 def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map: DividedMap) -> None:
     one = inner(small_map.root)
-    reloader = Reloader(open_map(str(small_map.root)))
+    reloader = Reloader(open_map(str(small_map.root)), lambda: one.cache.catalogue)
     operators = OperatorRequests(one.cache, OperatorPins(one.cache, one.scheduler), reloader)
     session = one.session()
-    read: list[CatalogueView] = []
+    read: list[Reread] = []
     failed: list[ShmmapError] = []
     for number in (7, 7, 7, 8):
         finish(operators.handle(session, Reload(number), 0.0))
