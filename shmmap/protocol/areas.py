@@ -97,7 +97,10 @@ class Intent(msgspec.Struct, array_like=True, frozen=True):
 
 
 class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """A cell the client says it has: version nil means "the current one", layers nil "all asked for"."""
+    """A cell the client says it has: version nil means "the current one", layers nil "all asked for".
+
+    A version stands for the layer that has it, of those named or asked for.
+    """
 
     id: str
     version: int | None = None

@@ -75,7 +75,7 @@ class Differential(msgspec.Struct, array_like=True, tag="differential"):
     """Cells that touch an area, minus those the client holds.
 
     ``held`` names cells one by one; ``packed`` is the same as versions alone, 8 bytes little-endian
-    each, and stands for cells held in every layer asked for.
+    each: a version names one layer of one cell.
     """
 
     request: int

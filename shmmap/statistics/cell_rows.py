@@ -35,7 +35,7 @@ class CellRow:
     layer
         Layer spec; of one longer than 40 bytes only the beginning is kept (``layer_cut``).
     version
-        64-bit version of the cell.
+        64-bit version, as in the handle.
     segment
         Segment name without the prefix ``/shmmap.<instance>.``, at most 16 bytes.
     state

@@ -172,7 +172,7 @@ class CellRequests:
         yield from self._quota.check(wanted, sizes)
         if not cold:
             return False
-        limits.check_queue(cache.catalogue, self._scheduler.loads, wanted.session, cold)
+        yield from limits.check_queue(cache, self._scheduler.loads, wanted, cold)
         self._statistics.add("misses", len(cold))
         waits = bool(wait_s) and self._patient.has_room(wanted)
         yield from self._load(wanted, cold, note=waits)

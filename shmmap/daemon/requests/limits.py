@@ -15,7 +15,6 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest, parts
 from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
@@ -80,20 +79,25 @@ def check_held(message: messages.Differential) -> None:
 
 
 def check_queue(
-    catalogue: CatalogueView, loads: Loads, session: Session, cold: Sequence[tuple[int, str]]
-) -> None:
+    cache: CellCache, loads: Loads, wanted: PendingRequest, cold: Sequence[tuple[int, str]]
+) -> Iterator[None]:
     """Refuse to queue more loads for a process that waits for very many; ``cold`` is what they are of.
 
     Raises
     ------
     Busy
         It waits for `MOST_QUEUED` loads, and these are others.
+    MapChanged, NoSession
+        See `PendingRequest.pause`.
     """
-    if loads.queued_of(session.asker) < MOST_QUEUED:
+    if loads.queued_of(wanted.session.asker) < MOST_QUEUED:
         return
-    for index, layer in cold:
-        if Key(catalogue.id(index), layer) not in loads.by_key:
-            raise Busy(f"{MOST_QUEUED} loads of this process wait already", hint="wait for some of them")
+    for number, part in enumerate(parts(cold)):
+        if number:
+            yield from wanted.pause(cache)
+        for index, layer in part:
+            if Key(cache.catalogue.id(index), layer) not in loads.by_key:
+                raise Busy(f"{MOST_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
 def admitted_layers(cache: CellCache, specs: Sequence[str]) -> tuple[str, ...]:

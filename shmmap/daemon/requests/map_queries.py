@@ -7,9 +7,10 @@ import itertools
 import os
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -38,6 +39,14 @@ LOOKED_AT: Final = 20_000
 """Cells that are tested for one page of an area's metadata, retired segments that are looked through."""
 
 
+class _Changes(NamedTuple):
+    """What differs between two states of the map: catalogue indices, ascending, and ids of what left it."""
+
+    between: tuple[int, int]
+    cells: NDArray[np.intp]
+    removed: tuple[str, ...]
+
+
 @dataclass(eq=False, slots=True)
 class MapQueries:
     """Answers from the catalogue and from what is in memory.
@@ -58,6 +67,7 @@ class MapQueries:
     loads: Loads
     event_log: EventLog
     events_path: str = ""
+    _changes: _Changes | None = None
     _kinds: tuple[str, ...] = field(init=False, default_factory=lambda: tuple(k.describe() for k in kinds()))
 
     @property
@@ -87,7 +97,7 @@ class MapQueries:
         raise BadRequest(f"a {type(message).__name__} cannot be answered here")
 
     def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
-        cache, catalogue = self.cache, self._catalogue
+        catalogue = self._catalogue
         removed: tuple[str, ...] = ()
         known = True
         start, limit = max(0, message.start), max(1, min(message.limit, PAGE_ROWS))
@@ -95,18 +105,17 @@ class MapQueries:
         if message.since is None:
             page, following = self._page(area, start, limit)
         else:
-            change = self.map_switch.changes_since(message.since)
+            change = self._changes_since(message.since)
             known = change is not None
             if change is None:
                 page, following = self._page(area, start, limit)
             else:
-                touched = sorted({i for cell in change[0] if (i := cache.index_of(cell)) is not None})
+                touched = change.cells
                 if area is not None:
-                    boxes = catalogue.boxes[np.array(touched, dtype=np.intp)]
-                    touched = list(itertools.compress(touched, touches(area, boxes).tolist()))
-                page = touched[start : start + limit]
+                    touched = touched[touches(area, catalogue.boxes[touched])]
+                page = touched[start : start + limit].tolist()
                 following = start + limit if start + limit < len(touched) else None
-                removed = tuple(map(cache.wire_id, change[1])) if start == 0 else ()
+                removed = change.removed if start == 0 else ()
         rows = tuple(map(self._row, page))
         return messages.MetadataPage(
             message.request, self.cache.epoch, catalogue.map_version, rows, following, known, removed
@@ -132,6 +141,18 @@ class MapQueries:
         if len(found) > limit:
             return found[:limit].tolist(), int(found[limit])
         return found.tolist(), end if end < count else None
+
+    def _changes_since(self, map_version: int) -> _Changes | None:
+        """What changed, remembered for the pages that follow; None where that is not known."""
+        between = map_version, self._catalogue.map_version
+        if self._changes is None or self._changes.between != between:
+            change = self.map_switch.changes_since(map_version)
+            if change is None:
+                return None
+            touched = {i for cell in change[0] if (i := self.cache.index_of(cell)) is not None}
+            removed = tuple(map(self.cache.wire_id, change[1]))
+            self._changes = _Changes(between, np.array(sorted(touched), dtype=np.intp), removed)
+        return self._changes
 
     def _row(self, index: int) -> messages.MetadataRow:
         catalogue = self._catalogue

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import mmap
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
 from shmmap.origin.catalogue import Catalogue, compare
@@ -17,6 +19,7 @@ from shmmap.protocol.messages import (
     Differential,
     Hello,
     Metadata,
+    MetadataPage,
     Selected,
 )
 from tests.support.divided_map import DividedMap, random_points
@@ -72,6 +75,32 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
     one.reload()
     assert one.cache.catalogue.version(one.cache.index_of("0_0.pcd") or 0) == reply.cells[0].version
+
+
+def test_what_changed_since_a_state_of_the_map_is_found_once_for_all_pages(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = inner(small_map.root)
+    before, sought = one.cache.catalogue.map_version, Mock(wraps=one.map_switch.changes_since)
+    monkeypatch.setattr(one.map_switch, "changes_since", sought)
+    changed = ["-20_-20.pcd", "0_0.pcd", "20_20.pcd"]
+    for name in changed:
+        rewrite(small_map, name, 33)
+    small_map.remove_cell("-40_-40.pcd")
+    small_map.write_metadata()
+    one.reload()
+    for area, expected in ((None, changed), (CircleMessage(20, 20, 15), changed[1:])):
+        for number, name in enumerate(expected):
+            page = one.queries.answer(Metadata(1, area, before, number, 1))
+            assert isinstance(page, MetadataPage)
+            assert [Path(row.id).name for row in page.rows] == [name]
+            assert page.next == (number + 1 if name != expected[-1] else None)
+            assert [Path(cell).name for cell in page.removed] == ["-40_-40.pcd"][number:]
+    sought.assert_called_once_with(before)
+    rewrite(small_map, "20_0.pcd", 33)
+    one.reload()
+    page = one.queries.answer(Metadata(2, since=before))
+    assert [Path(row.id).name for row in page.rows] == sorted([*changed, "20_0.pcd"])  # type: ignore[union-attr]
 
 
 def test_a_map_switched_back_by_its_symlink(inner: Inner, small_map: DividedMap, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.records import Key
 from shmmap.daemon.requests.differential import Difference, difference, warm_difference
 from shmmap.errors import BadRequest
 from shmmap.protocol.codec import pack_versions, unpack_versions
@@ -198,6 +199,29 @@ def test_layers_are_held_one_by_one(served: Served) -> None:
         found = find(served.inner.cache, message, [index], ("points",))
         assert found.cells == lacks
         assert found.removed == ()
+
+
+def test_a_version_stands_for_its_layer(served: Served) -> None:
+    """Packed or named, and whatever other layers are asked for."""
+    name, layers = "-20_-20.pcd", ("points", "voxel(leaf=1.0)", "denoise")
+    index, cache = served.names.index(name), served.inner.cache
+    points, voxel, denoise = (cache.layers.version(index, layer) for layer in layers)
+    key = {layer: Key(cache.catalogue.id(index), layer) for layer in layers}
+    for held, packed, lacks, old in (
+        ([], [points], layers[1:], []),
+        ([], [points, denoise], layers[1:2], []),
+        ([], [points, voxel, denoise], (), []),
+        ([HeldCell(name, voxel)], [denoise], layers[:1], []),
+        ([HeldCell(name, voxel), HeldCell(name, points)], [], layers[2:], []),
+        ([HeldCell(name, 99)], [], layers, [*layers]),
+        ([HeldCell(name, points, layers[1:2])], [], layers, [*layers[1:2]]),
+        ([HeldCell(name, points, ("crop(z_max=1.0)",))], [], layers, []),
+    ):
+        message = Differential(1, EVERYWHERE, layers, tuple(held), pack_versions(packed))
+        found = find(cache, message, [index], layers)
+        assert found.cells == [(index, layer) for layer in lacks]
+        assert found.old == {key[layer] for layer in old}
+        assert (found.removed, found.removed_packed) == ((), b"")
 
 
 @pytest.mark.parametrize("packed", [b"1234567", b"123456789"])

@@ -4,16 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import UNKNOWN_A_STEP
+from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
 from shmmap.errors import BadRequest, NoSession
 from shmmap.protocol.codec import pack_versions
-from shmmap.protocol.messages import Area, CircleMessage, Differential, HeldCell, Selected
+from shmmap.protocol.messages import Area, CircleMessage, Differential, HeldCell, Release, Selected
 from tests.support.divided_map import DividedMap, make_map
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon, finish, names
 
@@ -190,3 +192,17 @@ def test_the_map_changes_while_differences_are_found(inner: Inner, tmp_path: Pat
         finish(work)
         reply = one.cells_of(count)
         assert ([Path(cell).name for cell in reply.removed], names(reply)) == (left, gone[:1])
+
+
+def test_very_much_is_let_go_in_parts(inner: Inner, made: DividedMap) -> None:
+    one = inner(str(made.root))
+    session = one.session()
+    one.ask(session, Area(1, EVERYWHERE, wait=30.0))
+    versions = [cell.version for cell in one.cells_of(1).cells]
+    assert len(session.held) == CELLS
+    dispatch = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
+    dispatch.cells = one.cells
+    work = dispatch._route(session.connection, Release(2, pack_versions(versions[1:]))) or ()
+    assert [len(session.held) for _ in work] == [CELLS - CELLS_A_STEP * part for part in range(1, PARTS)]
+    assert list(session.held) == versions[:1]
+    assert one.replies[-1][1].request == 2
