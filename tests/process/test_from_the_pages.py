@@ -483,3 +483,32 @@ def test_the_daemon_knows_who_maps(served: DaemonProcess, plain: Plain) -> None:
         assert without.read(8) == b"SHMMAP\0\x01"
         with pytest.raises(Stale):
             one.attach(handle)
+
+
+FORKING = """
+import os, sys
+from tests.support.plain_client import PlainClient
+
+one = PlainClient(sys.argv[1])
+one.hello()
+_, mapping = one.attach(one.ask("selected", ["0_0.pcd"], ["points"], 60.0)[4][0])
+read, write = os.pipe()
+if os.fork() == 0:
+    os.close(write)
+    os.read(read, 1)
+    os._exit(mapping[:6] != b"SHMMAP")
+mapping.close()
+before = one.ask("stats")[5][0][11]
+os.close(write)
+_, status = os.wait()
+print(status, before > 0, one.ask("stats")[5][0][11])
+"""
+
+
+def test_after_a_fork_both_have_it_until_both_let_go(served: DaemonProcess) -> None:
+    """Under the parent's session, as the kernel reports it."""
+    done = subprocess.run(
+        [sys.executable, "-c", FORKING, served.endpoint],
+        capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2],
+    )  # fmt: skip
+    assert done.stdout.split() == ["0", "True", "0"]

@@ -85,7 +85,7 @@ class PlainClient:
     """
 
     def __init__(
-        self, path: str | list[str], *, ready: str = "ready of a DEALER", timeout_s: float = 30.0
+        self, path: str | list[str], *, ready: str = "ready of a DEALER", timeout_s: float = 60.0
     ) -> None:
         self.connection = connect_first([path] if isinstance(path, str) else path)
         self.connection.settimeout(timeout_s)

@@ -113,6 +113,6 @@ def test_who_gives_up_ends_as_with_a_busy_daemon(
     assert out_of_reach.exists()
     one = whole(small_map.root)
     with one.turning(), connect(one.endpoint) as client, pytest.raises(Offline) as refused:
-        client.selected(CELL).raise_for_failures()
+        client.selected(CELL, wait=60.0).raise_for_failures()
     assert (refused.value.cell_id, refused.value.exit_code) == (small_map.id(CELL), 75)
     assert "ask again" in refused.value.hint

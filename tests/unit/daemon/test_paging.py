@@ -154,11 +154,13 @@ def test_what_became_known_since_a_map_version(paged: Paged) -> None:
 
 def test_the_client_library_says_so(paged: Paged) -> None:
     with paged.daemon.turning(), connect(paged.daemon.endpoint) as client:
-        found = client.area(Box(-35.0, -35.0, 35.0, 35.0), ["voxel( 1 )", "points", "voxel(leaf=1.0)"])
+        found = client.area(
+            Box(-35.0, -35.0, 35.0, 35.0), ["voxel( 1 )", "points", "voxel(leaf=1.0)"], wait=60.0
+        )
         assert (found.covered, found.complete) == (False, False)
         assert found.layers == ("voxel(leaf=1.0)", "points", "voxel(leaf=1.0)")
         assert (len(found), found.failed, found.pending) == (24, (), ())
-        found = client.area(Box(-35.0, -35.0, -5.0, 35.0))
+        found = client.area(Box(-35.0, -35.0, -5.0, 35.0), wait=60.0)
         assert (found.covered, found.complete, found.layers) == (True, True, ("points",))
 
 
