@@ -251,3 +251,16 @@ def test_directories_are_named_from_where_the_daemon_was_started(
         assert client.welcome.shm_dir == one.shm_dir
         assert len(client.around(0, 0, 5, layers="voxel(leaf=1.0)")) == 4
     assert list((tmp_path / "cache" / "layers").iterdir())
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/autogroup"), reason="this kernel has no autogroups")
+def test_loaders_weigh_less_than_the_daemon(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Against everybody on the machine: their nice value alone counts only within their session."""
+    one = daemon(divided_map.root)
+    connect(one).area(circle(0, 0, 25))
+    loaders = [pid for pid in one.children() if os.getsid(pid) == pid]
+    assert loaders
+    groups = [Path(f"/proc/{pid}/autogroup").read_text().split()[-1] for pid in (one.pid, *loaders)]
+    assert groups == ["0", *["5"] * len(loaders)]

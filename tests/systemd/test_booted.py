@@ -138,6 +138,11 @@ def test_the_daemon_has_no_rights_it_does_not_need(fresh: BootedSystemd) -> None
     status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
     assert (status["CapEff"].strip("0"), status["CapBnd"].strip("0")) == ("", "")
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
+    unit = fresh.properties("shmmapd")
+    assert unit["CPUWeight"] == "100"
+    controllers = fresh.shell(f"cat /sys/fs/cgroup{unit['ControlGroup']}/cgroup.controllers").split()
+    offered = fresh.shell("cat /sys/fs/cgroup/cgroup.controllers").split()
+    assert ("cpu" in controllers) == ("cpu" in offered)  # then the nice values of loaders count
     inside = ["nsenter", f"--target={pid}", "--mount", "--net", "setpriv", "--reuid=shmmap", "--regid=shmmap"]
     inside += ["--init-groups", "--"]
     assert fresh.run(*inside, "ls", "/home/alice").stdout == "autoware_map\n"

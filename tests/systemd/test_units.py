@@ -163,6 +163,12 @@ def test_what_can_get_better_is_tried_for_ever_after_a_growing_pause(path: Path,
     assert stop_s > 20, "else systemd would cut the pause short"
 
 
+@pytest.mark.parametrize("path", SERVICES)
+def test_the_service_is_one_group_of_the_scheduler(path: Path) -> None:
+    """In which the nice values of loaders count; the manager makes none for a weight that is not written."""
+    assert parsed(path)["Service"]["CPUWeight"] == "100"
+
+
 @pytest.mark.parametrize("path", [*(UNITS / "system").glob("*.socket"), *(UNITS / "user").glob("*.socket")])
 def test_a_waiting_client_does_not_start_for_ever_what_stays_down(path: Path) -> None:
     """Pauses between starts that may help make at most five starts in this time."""

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Short time slices for the serving threads, so that a warm request does not wait for a loader.
+"""How a warm request does not wait for a loader: short turns for who serves, and a lower weight for loaders.
 
 On Linux 6.12 and later a thread of the ordinary policy may say how long its turns on a core are.  One
 with shorter turns than whoever runs there is let in as soon as it wakes; with equal ones it waits
 until that turn ends, which is 1 to 3 ms, and niceness does not change that.  Measured on two cores
 while layers are built: p99 of warm requests 0.3 ms instead of 0.5 to 1.2 ms, idle 0.1 ms.  Threads and
 processes inherit it.  Older kernels do not know it: nothing changes there.
+
+A nice value counts only inside its scheduling group.  The units make one of the service (``CPUWeight=``), and
+there the loaders' nice values count.  Elsewhere every session is a group of its own (autogroup, sched(7)),
+and loaders have sessions of their own: `weigh_less` makes their groups nice.
 """
 
 from __future__ import annotations
@@ -16,10 +20,17 @@ import platform
 import struct
 from typing import Final
 
-__all__ = ["SERVING_SLICE_NS", "slice_ns", "take_slices"]
+__all__ = ["SERVING_SLICE_NS", "slice_ns", "take_slices", "weigh_less"]
 
 SERVING_SLICE_NS: Final = 100_000
 """The shortest that the kernel grants (``kernel/sched/syscalls.c``)."""
+
+LOADER_GROUP_NICENESS: Final = 5
+"""A third of the usual weight.  Measured on two cores, with a client that asks 500 times a second beside
+loads: at 0, 3, 5, 7 and 10 the p99 of warm requests is 3.6, 3.7, 3.1, 2.5 and 1.9 ms, and loads take 1, 1.1,
+1.1, 1.3 and 1.5 times as long; beside a busy program 1.4 times at 5, 2.7 at 10.  In the unit's group, with
+nice values alone, p99 is 2.8 instead of 4.5 ms, and loads take 1.15 times as long.  Groups within it for
+daemon and loaders, of weights 100 and 11, bring the same."""
 
 _SYSCALLS: Final = {"x86_64": (314, 315), "aarch64": (274, 275)}  # sched_setattr, sched_getattr
 _ATTRIBUTES: Final = struct.Struct("=IIQiIQQQ")  # struct sched_attr, first version (linux/sched/types.h)
@@ -50,3 +61,32 @@ def slice_ns() -> int:
     if ctypes.CDLL(None, use_errno=True).syscall(numbers[1], 0, told, _ATTRIBUTES.size, 0) != 0:
         return 0
     return int(_ATTRIBUTES.unpack(told.raw)[5])
+
+
+def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") -> bool:
+    """Lower the weight of this process's session against all others on the machine.
+
+    True when there is no more to do, also where the kernel has no such groups, or they do not count because
+    a control group shares out the processors.  False when it has to be asked again: from others than root the
+    kernel takes ten such changes a second, of all processes together.
+
+    Parameters
+    ----------
+    niceness
+        As nice(2) has them, of the group as a whole.
+    proc
+        Directory with ``autogroup`` of this process.
+    """
+    if os.getsid(0) != os.getpid():
+        return True  # the group is somebody else's, too
+    try:
+        fd = os.open(f"{proc}/autogroup", os.O_WRONLY | os.O_CLOEXEC)
+        try:
+            os.write(fd, str(niceness).encode())
+        finally:
+            os.close(fd)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True

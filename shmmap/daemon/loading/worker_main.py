@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from shmmap import __version__
-from shmmap.daemon.host.scheduling import take_slices
+from shmmap.daemon.host.scheduling import take_slices, weigh_less
 from shmmap.daemon.loading import worker_messages
 from shmmap.errors import MapDataError, Offline, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
@@ -54,6 +54,7 @@ class _Worker:
     directory: ShmDirectory
     cache: LayerCache | None
     _waiting: list[worker_messages.Job | worker_messages.Check] = field(default_factory=list)
+    _light: bool = False
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
@@ -62,6 +63,7 @@ class _Worker:
             job = self._waiting.pop(0) if self._waiting else self._receive()
             if job is None:
                 return
+            self._light = self._light or weigh_less()
             if isinstance(job, worker_messages.Job):
                 self._load(job)
             elif isinstance(job, worker_messages.Check):

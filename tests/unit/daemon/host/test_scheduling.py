@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Short turns are the kernel's to grant; niceness and policy are not touched by asking."""
+"""Short turns are the kernel's to grant, niceness and policy stay; a loader's session is made nice."""
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from shmmap.daemon.host.scheduling import LOADER_GROUP_NICENESS, weigh_less
 
 PROGRAM = """
 import os, threading
@@ -48,3 +52,59 @@ def test_the_kernel_grants_short_turns_where_it_knows_them() -> None:
 def test_another_policy_is_left_alone() -> None:
     _, agreed, _, _, _, _, policy = run("chrt", "--batch", "0")
     assert (agreed, policy) == (0, os.SCHED_BATCH)
+
+
+WEIGH = """
+import os, sys, time
+from shmmap.daemon.host.scheduling import weigh_less
+if sys.argv[1] == "session":
+    os.setsid()
+end_s = time.monotonic() + 60
+while not weigh_less() and time.monotonic() < end_s:
+    os.sched_yield()
+print(open("/proc/self/autogroup").read().split()[-1], os.getpriority(os.PRIO_PROCESS, 0))
+"""
+
+
+def weight(session: str, *command: str) -> tuple[int, int]:
+    """Nice value of a new process's group, and its own."""
+    done = subprocess.run(
+        [*command, sys.executable, "-c", WEIGH, session], capture_output=True, text=True, check=True
+    )
+    group, own = map(int, done.stdout.split())
+    return group, own
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/autogroup"), reason="this kernel has no autogroups")
+def test_a_session_weighs_less_and_one_that_is_another_s_stays() -> None:
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    before = int(Path("/proc/self/autogroup").read_text().split()[-1])
+    assert weight("session") == (LOADER_GROUP_NICENESS, own)
+    assert weight("none") == (before, own)
+    assert int(Path("/proc/self/autogroup").read_text().split()[-1]) == before
+
+
+@pytest.mark.root
+@pytest.mark.skipif(not os.path.exists("/proc/self/autogroup"), reason="this kernel has no autogroups")
+def test_an_ordinary_user_s_too_though_the_kernel_takes_few_changes_a_second(tmp_path: Path) -> None:
+    user = ["setpriv", "--reuid=61005", "--clear-groups"]
+    for _ in range(3):  # at once: the later ones are told to ask again
+        assert weight("session", *user)[0] == LOADER_GROUP_NICENESS
+
+
+def test_what_is_written_and_what_the_kernel_may_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getsid", lambda _: os.getpid())
+    assert weigh_less(proc=str(tmp_path)), "there are no such groups: nothing to ask again for"
+    file = tmp_path / "autogroup"
+    file.touch()
+    assert weigh_less(7, str(tmp_path))
+    assert file.read_text() == "7"
+    before = os.listdir("/proc/self/fd")
+    for number, done in ((errno.EAGAIN, False), (errno.EPERM, True), (errno.EINVAL, True)):
+
+        def refuse(fd: int, data: bytes, number: int = number) -> int:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(os, "write", refuse)
+        assert weigh_less(proc=str(tmp_path)) == done
+    assert os.listdir("/proc/self/fd") == before
