@@ -218,7 +218,7 @@ class Service:
     def _status(self) -> str:
         cache = self._memory.cache
         return status_line(
-            resident=len({key.cell_id for key in cache.ledger.by_key}),  # some have layers, too
+            resident=cache.ledger.cell_count,
             cells=len(cache.catalogue), clients=len(self._memory.sessions),
             used_bytes=cache.ledger.used_bytes, budget_bytes=cache.ledger.budget_bytes,
             failed=self._memory.statistics.values["loads_failed"],
@@ -276,7 +276,12 @@ class Service:
 
 
 def _settle_memory() -> None:
-    """Give back what reading the map took, and keep what stays out of the garbage collector's way."""
+    """Give back what reading the map took, and keep what stays out of the garbage collector's way.
+
+    From now on it looks at what is new only: going over all that there is would take 20 ms with 10^5 segments
+    in memory.  What is removed here is freed by counting references; nothing that lasts refers to itself.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(*gc.get_threshold()[:2], 1 << 30)
     ctypes.CDLL(None).malloc_trim(0)

@@ -9,7 +9,8 @@ import time
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -89,9 +90,10 @@ class MapInMemory:
         self.statistics.reserve = ledger.add_overhead
         self.event_log = EventLog(epoch)
         self.sessions = Sessions()
-        reclaimer = Reclaimer(ledger, directory, self.sessions, POLICIES[config.eviction], pins)
+        reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
+        evictor = Evictor(reclaimer, POLICIES[config.eviction])
         self.cache = CellCache(
-            catalogue, reclaimer, self.statistics, self.event_log,
+            catalogue, evictor, self.statistics, self.event_log,
             instance=config.instance, mode=mode, gid=gid,
         )  # fmt: skip
         self.watched = WatchedDescriptors()
@@ -103,6 +105,7 @@ class MapInMemory:
         self.scheduler = Scheduler(self.cache, self.map_switch, pool, clock=time.monotonic)
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
         self.cache.tell_all()
+        self.watched.watch(reclaimer.closer.fd, self.scheduler.hear_of_freed)
         if pins.fd >= 0:
             self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(time.monotonic()), "memory")
         if self.cache.names.fd >= 0:

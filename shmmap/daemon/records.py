@@ -53,13 +53,15 @@ class Retired:
     """A segment out of service; ``resident`` says what it was.
 
     ``probe_after_s`` is when its use is next worth a look, ``condemned`` that nobody had it open
-    at the last look, ``interval_s`` how long the last wait between two looks was.
+    at the last look, ``interval_s`` how long the last wait between two looks was; before ``tick_over_s``
+    somebody may be just opening it.
     """
 
     resident: Resident
     condemned: bool = False
     probe_after_s: float = 0.0
     interval_s: float = 0.0
+    tick_over_s: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

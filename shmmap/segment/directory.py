@@ -99,6 +99,10 @@ class ShmDirectory:
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         return os.open(name.lstrip("/"), flags, dir_fd=self._fd)
 
+    def open_path(self, name: str) -> int:
+        """Open a segment's place alone: it can be unlinked at once, its memory goes when this is closed."""
+        return os.open(name.lstrip("/"), os.O_PATH | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=self._fd)
+
     @contextlib.contextmanager
     def opened(self, name: str) -> Iterator[int]:
         """`open` a segment for a moment."""

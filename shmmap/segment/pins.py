@@ -19,7 +19,7 @@ from typing import Final
 
 from shmmap.failpoints import step
 
-__all__ = ["LOADER_SLOT", "MAX_SLOT", "holders", "in_use", "lock_slot", "prepare_process"]
+__all__ = ["LOADER_SLOT", "MAX_SLOT", "has_slot", "holders", "in_use", "lock_slot", "prepare_process"]
 
 MAX_SLOT: Final = (1 << 62) - 1
 MOST_RANGES: Final = 32
@@ -43,6 +43,12 @@ def prepare_process() -> None:
 def lock_slot(fd: int, slot: int) -> None:
     """Take the shared lock that says "session ``slot`` uses this"; the mapping keeps it."""
     fcntl.fcntl(fd, _OFD_SETLK, _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, slot, 1, 0))
+
+
+def has_slot(fd: int, slot: int) -> bool:
+    """Whether session ``slot`` holds the file, or somebody has locked a range that goes over it."""
+    asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, slot, 1, 0)
+    return bool(_FLOCK.unpack(fcntl.fcntl(fd, _OFD_GETLK, asked))[0] != fcntl.F_UNLCK)
 
 
 def in_use(fd: int) -> bool:

@@ -9,8 +9,10 @@ kernel's word on mappings of them.
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
+import select
 import shutil
 import tempfile
 from dataclasses import dataclass, field
@@ -19,7 +21,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from shmmap.daemon.cache.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
 from shmmap.daemon.loading.loads import Loads
@@ -69,8 +72,9 @@ class Wanted:
 class Machine(RuleBasedStateMachine):
     """One life of ledger and loads; it hears of the reclaimer what leaves and what is freed."""
 
-    @initialize(policy=st.sampled_from(sorted(POLICIES)))
-    def begin(self, policy: str) -> None:
+    @initialize(policy=st.sampled_from(sorted(POLICIES)), elsewhere=st.booleans())
+    def begin(self, policy: str, elsewhere: bool) -> None:
+        """With ``elsewhere`` all memory is freed in the other thread, not only of large segments."""
         prepare_process()
         self.path = tempfile.mkdtemp(prefix="shmmap-model-", dir="/dev/shm")
         self.directory = ShmDirectory(self.path)
@@ -79,9 +83,10 @@ class Machine(RuleBasedStateMachine):
         self.ledger.overhead_bytes = OVERHEAD_PAGES * PAGE
         self.sessions = Sessions()
         self.clients = [self.sessions.open(connections.of(), f"client {n}", 0.0) for n in range(2)]
-        self.reclaimer = Reclaimer(
-            self.ledger, self.directory, self.sessions, POLICIES[policy], PinWatch(self.directory)
-        )
+        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory))
+        if elsewhere:
+            self.reclaimer.closer.small_bytes = 0
+        self.evictor = Evictor(self.reclaimer, POLICIES[policy])
         self.names_retired: list[str] = []
         self.names_freed: list[str] = []
         self.reclaimer.on_retired = lambda resident, _why: self.names_retired.append(resident.name)
@@ -146,7 +151,7 @@ class Machine(RuleBasedStateMachine):
         nearest = min(queued, key=lambda w: (w.priority, w.order))
         assert load is nearest.load
         used = sum(s.pages for s in self.segments.values()) + OVERHEAD_PAGES
-        used += sum(w.reserved for w in self.loads.values()) // PAGE
+        used += (sum(w.reserved for w in self.loads.values()) + self.ledger.freeing_bytes) // PAGE
         shortage = used + load.estimate // PAGE - BUDGET_PAGES
         assert self.ledger.shortage(load.estimate) == shortage * PAGE
         if shortage > 0:
@@ -338,7 +343,18 @@ class Machine(RuleBasedStateMachine):
         before = self.ledger.retired_bytes
         freed = self.reclaimer.sweep(self.now_s)
         assert freed == before - self.ledger.retired_bytes
+        before = self.ledger.retired_bytes
+        assert self.reclaimer.collect() == before - self.ledger.retired_bytes
         self.follow()
+
+    @rule()
+    def wait_for_the_other_thread(self) -> None:
+        """What it frees counts as used until it has."""
+        while self.ledger.freeing_bytes:
+            select.select([self.reclaimer.closer.fd], [], [], 10.0)
+            before = self.ledger.used_bytes
+            freed = self.reclaimer.collect()
+            assert freed == before - self.ledger.used_bytes > 0
 
     @rule(pages=st.integers(1, BUDGET_PAGES))
     def make_room(self, pages: int) -> None:
@@ -355,12 +371,14 @@ class Machine(RuleBasedStateMachine):
             if shortage <= 0:
                 assert pages <= room
                 return
-            on_its_way = self.reclaimer.free(shortage, self.now_s)
+            on_its_way = self.evictor.free(shortage, self.now_s)
             self.follow()
             if not on_its_way:
                 assert pages > room
                 return
-            self.now_s = max(self.now_s + 1e-6, min(self.reclaimer.wake_s, self.reclaimer.next_sweep_s()))
+            self.wait_for_the_other_thread()
+            due_s = min(self.evictor.wake_s, self.reclaimer.next_sweep_s())
+            self.now_s = max(self.now_s + 1e-6, due_s if due_s < math.inf else 0.0)
             self.reclaimer.sweep(self.now_s)
             self.follow()
         raise AssertionError("no end to making room")
@@ -370,7 +388,7 @@ class Machine(RuleBasedStateMachine):
         """Whoever got a handle a moment ago can still open it, unless somebody evicted it on purpose."""
         for segment in self.of_state("resident"):
             if segment.last_use_s + HAND_OUT_GRACE_S > self.now_s:
-                self.reclaimer.free(BUDGET_PAGES * PAGE, self.now_s)
+                self.evictor.free(BUDGET_PAGES * PAGE, self.now_s)
                 self.follow()
                 assert segment.state == "resident"
                 assert os.path.exists(self.path + segment.name)
@@ -381,7 +399,15 @@ class Machine(RuleBasedStateMachine):
     def bytes_are_in_one_place(self) -> None:
         ledger = self.ledger
         assert ledger.resident_bytes == sum(s.pages for s in self.of_state("resident")) * PAGE
-        assert ledger.retired_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
+        zombie_bytes = ledger.retired_bytes - ledger.freeing_bytes
+        assert zombie_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
+        assert ledger.condemned_bytes == sum(
+            retired.resident.nbytes for retired in ledger.retired.values() if retired.condemned
+        )
+        everything = [*ledger.residents(), *(retired.resident for retired in ledger.retired.values())]
+        assert len(ledger.segments) == len(everything)
+        assert set(ledger.segments.walk()) == set(everything)
+        assert len(ledger.order) == ledger.resident_count
         assert ledger.reserved_bytes == sum(w.reserved for w in self.loads.values())
         parts = ledger.resident_bytes + ledger.retired_bytes + ledger.reserved_bytes + ledger.overhead_bytes
         assert ledger.used_bytes == parts <= ledger.budget_bytes
@@ -394,7 +420,8 @@ class Machine(RuleBasedStateMachine):
         expected = {s.name + (".zombie" if s.state == "zombie" else "") for s in self.segments.values()}
         found = {"/" + entry.name: entry.stat().st_blocks * 512 for entry in os.scandir(self.path)}
         assert set(found) == expected
-        assert sum(found.values()) == self.ledger.resident_bytes + self.ledger.retired_bytes
+        named_bytes = self.ledger.resident_bytes + self.ledger.retired_bytes - self.ledger.freeing_bytes
+        assert sum(found.values()) == named_bytes
 
     @invariant()
     def they_say_what_the_model_says(self) -> None:
@@ -433,9 +460,11 @@ class Machine(RuleBasedStateMachine):
             self.queue.finish(wanted.load)
         for _ in range(8):
             self.now_s += 2.0
-            self.reclaimer.free(BUDGET_PAGES * PAGE, self.now_s)
+            self.evictor.free(BUDGET_PAGES * PAGE, self.now_s)
             self.reclaimer.sweep(self.now_s)
+            self.wait_for_the_other_thread()
         self.follow()
+        self.reclaimer.close()
         left, used = os.listdir(self.path), self.ledger.used_bytes
         for session in self.clients:
             self.sessions.close(session)

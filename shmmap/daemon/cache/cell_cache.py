@@ -9,15 +9,16 @@ of `shmmap.daemon.loading.scheduler`, which publishes here.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_rows import CellRows
+from shmmap.daemon.cache.eviction.evictor import Evictor
 from shmmap.daemon.cache.holders import Holders
-from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
 from shmmap.daemon.cache.survey import Survey
 from shmmap.daemon.cache.warm_index import Heights, WarmIndex
@@ -39,6 +40,8 @@ __all__ = ["CellCache"]
 
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
+LOOKS_FOR_NAMES: Final = 64
+"""Names looked for per turn of the serving loop: a tenth of a millisecond."""
 
 
 class CellCache:
@@ -72,7 +75,7 @@ class CellCache:
     def __init__(
         self,
         catalogue: CatalogueView,
-        reclaimer: Reclaimer,
+        evictor: Evictor,
         statistics: StatisticsWriter,
         event_log: EventLog,
         *,
@@ -81,7 +84,8 @@ class CellCache:
         gid: int,
     ) -> None:
         self.catalogue = catalogue
-        self.reclaimer = reclaimer
+        self.evictor = evictor
+        self.reclaimer = reclaimer = evictor.reclaimer
         self.ledger = reclaimer.ledger
         self.directory = reclaimer.directory
         self.layers = LayerVersions(lambda: self.catalogue)
@@ -101,6 +105,7 @@ class CellCache:
         self.epoch = event_log.epoch
         self.mode = mode
         self.gid = gid
+        self._unsure: Iterator[Resident] = iter(())
         self._untold: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         reclaimer.on_retired = self._on_retired
         reclaimer.on_gone = lambda name: self.tell(self.rows.hide, name)
@@ -296,8 +301,19 @@ class CellCache:
     def hear_of_names(self, now_s: float) -> None:
         """Names vanished from the directory: what somebody else removed is handed out no more."""
         names = self.names.gone()
-        residents = self.ledger.residents() if names is None else map(self.ledger.resident_named, names)
-        for resident in [r for r in residents if r is not None and not self.directory.exists(r.name)]:
+        if names is None:
+            self._unsure = self.ledger.segments.walk()
+            return
+        for name in names:
+            self._look_for(self.ledger.resident_named(name), now_s)
+
+    def look_for_some(self, now_s: float) -> None:
+        """Look for a few segments of which nobody knows whether they vanished: too many names had."""
+        for resident in islice(self._unsure, LOOKS_FOR_NAMES):
+            self._look_for(self.ledger.resident_named(resident.name), now_s)
+
+    def _look_for(self, resident: Resident | None, now_s: float) -> None:
+        if resident is not None and not self.directory.exists(resident.name):
             cell = resident.key.cell_id
             log.warning("segment removed by somebody else", segment=resident.name, cell=cell)
             self.reclaimer.retire(resident, now_s, "damaged")
@@ -306,5 +322,5 @@ class CellCache:
         """Take every segment's name away, or leave the names to the next life."""
         if not keep:
             self.reclaimer.remove_all()
-        self.reclaimer.pins.close()
+        self.reclaimer.close()
         self.names.close()

@@ -14,7 +14,7 @@ from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.records import Resident
 from shmmap.protocol.messages import Holder
-from shmmap.segment.pins import LOADER_SLOT, holders
+from shmmap.segment.pins import LOADER_SLOT, has_slot, holders
 
 __all__ = ["UNKNOWN_SLOT", "Holders"]
 
@@ -44,6 +44,14 @@ class Holders:
                 return holders(fd)
         except OSError:
             return None
+
+    def has(self, resident: Resident, slot: int) -> bool:
+        """Whether a session may have a segment locked: not, if its name is there and its lock is not."""
+        try:
+            with self.reclaimer.pins.opened(self.reclaimer.name_on_disk(resident)) as fd:
+                return has_slot(fd, slot)
+        except OSError:
+            return True
 
     def users_among(self, resident: Resident, slots: Sequence[int]) -> list[int]:
         """Slots of sessions, of those that have a segment locked, and 0 if somebody unknown uses it, too.

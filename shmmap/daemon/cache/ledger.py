@@ -13,9 +13,44 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
+from shmmap.daemon.cache.eviction.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
 
-__all__ = ["Ledger"]
+__all__ = ["Ledger", "Segments"]
+
+
+class Segments:
+    """All segments in memory, to go over a few at a time while they come and go."""
+
+    def __init__(self) -> None:
+        self._by_size: list[list[Resident]] = [[] for _ in range(64)]
+        self._places: dict[Resident, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def add(self, resident: Resident) -> None:
+        """One more."""
+        alike = self._by_size[resident.nbytes.bit_length()]
+        self._places[resident] = len(alike)
+        alike.append(resident)
+
+    def remove(self, resident: Resident) -> None:
+        """One less."""
+        alike = self._by_size[resident.nbytes.bit_length()]
+        at, last = self._places.pop(resident), alike.pop()
+        if last is not resident:  # it takes the empty place
+            alike[at], self._places[last] = last, at
+
+    def walk(self) -> Iterator[Resident]:
+        """Go over all that are there now and stay, larger ones first (to a factor of two).
+
+        What comes meanwhile may be left out; what stays may come twice.
+        """
+        for alike in reversed(self._by_size):
+            at = len(alike)
+            while (at := min(at, len(alike)) - 1) >= 0:  # from the end: what fills a gap has been seen
+                yield alike[at]
 
 
 class Ledger:
@@ -32,6 +67,14 @@ class Ledger:
         What can be handed out.
     retired : dict
         By the name they had, segments out of service.
+    segments
+        All in memory, retired ones included.
+    order
+        In which order residents give way.
+    retired_bytes, freeing_bytes
+        Memory of what is out of service, and how much of it the kernel is taking back just now.
+    condemned_bytes
+        Bytes of retired segments that nobody had open at the last look.
     overhead_bytes
         What the daemon itself keeps in shared memory (its statistics); counts as used.
     unchecked_count
@@ -43,7 +86,11 @@ class Ledger:
         self.by_key: dict[Key, Resident] = {}
         self.retired: dict[str, Retired] = {}
         self.resident_bytes = 0
+        self.segments = Segments()
+        self.order = EvictionOrder()
         self.retired_bytes = 0
+        self.freeing_bytes = 0
+        self.condemned_bytes = 0
         self.reserved_bytes = 0
         self.overhead_bytes = 0
         self.unchecked_count = 0
@@ -92,10 +139,15 @@ class Ledger:
         found = (self.by_key.get(Key(cell_id, layer)) for layer in self._layers)
         return [resident for resident in found if resident is not None]
 
-    def everything(self) -> list[Resident]:
-        """All segments in memory, retired ones included, largest first."""
-        found = [*self._by_name.values(), *(retired.resident for retired in self.retired.values())]
-        return sorted(found, key=lambda resident: -resident.nbytes)
+    @property
+    def cell_count(self) -> int:
+        """Of how many cells there are segments that can be handed out, of the layer that most have."""
+        return max(self._layers.values(), default=0)
+
+    @property
+    def coming_bytes(self) -> int:
+        """Memory that is about to be free."""
+        return self.condemned_bytes + self.freeing_bytes
 
     # --- being needed ---------------------------------------------------------------------------
 
@@ -108,6 +160,12 @@ class Ledger:
         count = self._needed.pop(key) - 1
         if count:
             self._needed[key] = count
+        elif key in self.by_key:
+            self.order.again(self.by_key[key])
+
+    def is_needed(self, key: Key) -> bool:
+        """Whether somebody needs this."""
+        return key in self._needed
 
     # --- coming ---------------------------------------------------------------------------------
 
@@ -118,6 +176,8 @@ class Ledger:
         self._layers[resident.key.layer] += 1
         self.resident_bytes += resident.nbytes
         self.unchecked_count += not resident.checked
+        self.segments.add(resident)
+        self.order.enter(resident)
         if old is not None:
             self._leave_service(old)
         return old
@@ -136,10 +196,13 @@ class Ledger:
             del self._layers[resident.key.layer]
         self.unchecked_count -= not resident.checked
         self.resident_bytes -= resident.nbytes
-        self.add_retired(resident)
+        self.order.leave(resident)
+        self.retired_bytes += resident.nbytes
+        self.retired[resident.name] = Retired(resident)
 
     def add_retired(self, resident: Resident) -> Retired:
-        """Count a segment that is out of service, perhaps since an earlier life of the daemon."""
+        """Count a segment that has been out of service since an earlier life of the daemon."""
+        self.segments.add(resident)
         self.retired_bytes += resident.nbytes
         retired = self.retired[resident.name] = Retired(resident)
         return retired
@@ -164,29 +227,35 @@ class Ledger:
         Returns the version that it supersedes, to be retired by name (the map went back to an
         earlier state).
         """
-        self.freed(retired.resident.name)
+        self._gone(retired.resident.name)
+        self.retired_bytes -= retired.resident.nbytes
         return self.enter(retired.resident)
+
+    def condemn(self, retired: Retired, condemned: bool) -> None:
+        """Nobody had this open at the last look, or somebody has."""
+        self.condemned_bytes += retired.resident.nbytes * (condemned - retired.condemned)
+        retired.condemned = condemned
 
     def freed(self, name: str) -> int:
         """A retired segment's memory is back with the kernel; returns its bytes."""
-        nbytes = self.retired.pop(name).resident.nbytes
+        nbytes = self._gone(name)
         self.retired_bytes -= nbytes
         return nbytes
 
-    def condemned_bytes(self) -> int:
-        """Bytes of retired segments that nobody had open at the last look: they are about to be freed."""
-        return sum(one.resident.nbytes for one in self.retired.values() if one.condemned)
+    def freeing(self, name: str) -> int:
+        """The kernel is about to take a retired segment's memory back: it counts until `closed`."""
+        nbytes = self._gone(name)
+        self.freeing_bytes += nbytes
+        return nbytes
 
-    def candidates(self, now_s: float, grace_s: float) -> tuple[list[Resident], list[Resident]]:
-        """Residents that may be retired now, and those that may be soon, first come first.
+    def closed(self, nbytes: int) -> None:
+        """So many bytes that were being freed are back with the kernel."""
+        self.freeing_bytes -= nbytes
+        self.retired_bytes -= nbytes
 
-        Left out are those somebody needs.  Those handed out less than ``grace_s`` ago come second: their
-        reader may not have opened them yet.
-        """
-        free: list[Resident] = []
-        graced: list[Resident] = []
-        for resident in self._by_name.values():
-            if resident.key not in self._needed:
-                (graced if resident.last_use_s + grace_s > now_s else free).append(resident)
-        graced.sort(key=lambda resident: resident.last_use_s)
-        return free, graced
+    def _gone(self, name: str) -> int:
+        retired = self.retired[name]
+        self.condemn(retired, False)
+        del self.retired[name]
+        self.segments.remove(retired.resident)
+        return retired.resident.nbytes

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Getting memory back: retire a segment by renaming it, free it once the kernel says nobody has it.
 
+A bounded number of segments is looked at per turn of the serving loop; a longer way goes on in the next.
+
 Renaming first means that nobody new can open the segment; looking again on a later tick catches
 whoever was just opening it.  A retired segment that is still mapped stays in the ledger, and is
 looked at again when its reader says that it let go, when the kernel reports that somebody closed it,
@@ -10,12 +12,14 @@ or when a client's session ends; on a timer only as a precaution.
 from __future__ import annotations
 
 import contextlib
+import heapq
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final
 
-from shmmap.daemon.cache.eviction_policy import EvictionPolicy
+from shmmap.daemon.cache.closer import Closer
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
@@ -34,19 +38,17 @@ RETIRED_INTERVAL_S: Final = 0.1
 WATCHED_INTERVAL_S: Final = 5.0
 """How often, at most, where it does: a precaution.  A report comes a moment before the close counts,
 so the first looks after it follow each other quickly."""
-RETIRED_SHARE_S: Final = 0.0005
+SHARE_S: Final = 0.0005
 """With very many of them each is looked at less often: at most one per this time (a look takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment just handed out is not evicted for this long, so that its reader can open it."""
-PROBES_AT_ONCE: Final = 64
-"""Looks per turn of the serving loop (about 15 us each)."""
-PIN_MEMO_S: Final = 0.2
-"""How long a segment found pinned is not considered again for eviction."""
+LOOKS_AT_ONCE: Final = 16
+"""Segments looked at, retired or freed per turn: a look takes 15 us, retiring 50."""
 
 
 @dataclass(eq=False, slots=True)
 class Reclaimer:
-    """Carries out what the ledger and the eviction policy decide about memory.
+    """Retires segments, and gives their memory back.
 
     Parameters
     ----------
@@ -60,23 +62,21 @@ class Reclaimer:
         or ``damaged``.
     on_gone
         Called with a name under which there is no segment any more: it was freed, or has another.
-    evicted_count
-        Segments retired to make room.
-    wake_s
-        When `free` is worth calling again although nothing changed (hand-out grace ends).
+    closer
+        Closes what takes long to close.
     """
 
     ledger: Ledger
     directory: ShmDirectory
     sessions: Sessions
-    policy: EvictionPolicy
     pins: PinWatch
     on_retired: Callable[[Resident, str], None] = field(init=False)
     on_gone: Callable[[str], None] = field(init=False)
-    evicted_count: int = 0
-    wake_s: float = math.inf
-    _pinned_until_s: dict[str, float] = field(default_factory=dict)
+    closer: Closer = field(default_factory=Closer)
     _by_key: dict[Key, Retired] = field(default_factory=dict)
+    _due: list[tuple[float, int, Retired]] = field(default_factory=list)
+    _number: int = 0
+    _unheard: Iterator[Resident] = field(default_factory=lambda: iter(()))
 
     # --- retiring -----------------------------------------------------------------------------
 
@@ -124,15 +124,33 @@ class Reclaimer:
             return True
         if resident.checked:
             self._by_key[resident.key] = retired
-        self.pins.keep(retired_name(resident.name))
-        retired.condemned = self.is_pinned(resident) is False
-        retired.probe_after_s = now_s + TICK_S
-        return retired.condemned
+        condemned = self.is_pinned(resident) is False
+        if not condemned:
+            self.pins.keep(retired_name(resident.name))
+        self.ledger.condemn(retired, condemned)
+        self._begin_tick(retired, now_s)
+        return condemned
 
     def adopt(self, resident: Resident, now_s: float) -> None:
         """Watch a retired segment of an earlier life of the daemon."""
-        self.ledger.add_retired(resident).probe_after_s = now_s + TICK_S
+        self._begin_tick(self.ledger.add_retired(resident), now_s)
         self.pins.keep(retired_name(resident.name))
+
+    def _begin_tick(self, retired: Retired, now_s: float) -> None:
+        """It may be freed when nobody can be just opening it."""
+        retired.tick_over_s = now_s + TICK_S
+        self._look_at(retired, retired.tick_over_s)
+
+    def _look_at(self, retired: Retired, when_s: float) -> None:
+        """A retired segment is worth a look then."""
+        retired.probe_after_s = when_s = max(when_s, retired.tick_over_s)
+        self._number += 1
+        heapq.heappush(self._due, (when_s, self._number, retired))
+
+    def retired_of(self, key: Key) -> Resident | None:
+        """The last segment of a key that left service, while there is one."""
+        retired = self._by_key.get(key)
+        return retired.resident if retired is not None else None
 
     def may_revive(self, key: Key) -> bool:
         """Whether a segment is retired that could be handed out again, if its version is the current one."""
@@ -164,7 +182,8 @@ class Reclaimer:
         """What is retired of this key must not be handed out again."""
         self._by_key.pop(key, None)
 
-    def _forget(self, retired: Retired) -> int:
+    def _forget(self, retired: Retired) -> None:
+        """There is no such segment any more, or only its memory."""
         resident = retired.resident
         self.pins.release(retired_name(resident.name))
         if self._by_key.get(resident.key) is retired:
@@ -174,106 +193,122 @@ class Reclaimer:
             if session is not None:
                 session.drop_segment(resident)
         self.on_gone(resident.name)
-        return self.ledger.freed(resident.name)
 
     # --- freeing ------------------------------------------------------------------------------
 
     def sweep(self, now_s: float) -> int:
-        """Look at the retired segments that are due and free those nobody has; returns the bytes freed."""
-        due = [one for one in self.ledger.retired.values() if one.probe_after_s <= now_s]
-        return sum(self._probe(one, now_s) for one in due[:PROBES_AT_ONCE])
+        """Look at some retired segments that are due and free those nobody has; returns the bytes freed.
 
-    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Somebody dropped these: free what nobody else has."""
-        for resident in residents:
-            self._pinned_until_s.pop(resident.name, None)
+        Those whose memory is being freed in another thread do not count, see `collect`.
+        """
+        freed = 0
+        for _ in range(LOOKS_AT_ONCE):
+            retired = self._next_due(now_s)
+            if retired is None:
+                break
+            heapq.heappop(self._due)
+            freed += self._probe(retired, now_s)
+        for resident in islice(self._unheard, LOOKS_AT_ONCE):
             retired = self.ledger.retired.get(resident.name)
             if retired is not None:
-                self._probe(retired, now_s)
+                self._look_at(retired, min(now_s, retired.probe_after_s))
+        return freed
+
+    def _next_due(self, now_s: float = math.inf) -> Retired | None:
+        """The retired segment that is to be looked at next, if its time has come."""
+        while self._due and self._due[0][0] <= now_s:
+            when_s, _, retired = self._due[0]
+            known = self.ledger.retired.get(retired.resident.name)
+            if known is retired and when_s == retired.probe_after_s:
+                return retired
+            heapq.heappop(self._due)  # it is gone, or another time was set
+        return None
+
+    def next_sweep_s(self) -> float:
+        """When the next look at a retired segment is due; infinity when there is none."""
+        retired = self._next_due()
+        return retired.probe_after_s if retired is not None else math.inf
+
+    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
+        """Somebody dropped these: what nobody else has is freed soon."""
+        for resident in residents:
+            retired = self.ledger.retired.get(resident.name)
+            if retired is None:
+                self.ledger.order.again(resident)
+            elif retired.probe_after_s > now_s and not retired.condemned:
+                self._look_at(retired, now_s)
 
     def _probe(self, retired: Retired, now_s: float) -> int:
-        used = self.is_pinned(retired.resident)
-        if used:
-            retired.condemned = False
-            retired.probe_after_s = now_s + self._interval_s(retired)
+        """Look at a retired segment whose tick is over; returns the bytes that were freed."""
+        if self.is_pinned(retired.resident):
+            self.ledger.condemn(retired, False)
+            name = retired_name(retired.resident.name)
+            if not self.pins.keeps(name):
+                self.pins.keep(name)
+            self._look_at(retired, now_s + self._interval_s(retired))
             return 0
-        if used is False and now_s < retired.probe_after_s:
-            retired.condemned = True  # its tick is not over yet
+        if self.closer.full:
+            self.ledger.condemn(retired, True)
+            self._look_at(retired, now_s + TICK_S)
             return 0
-        self.directory.unlink(retired_name(retired.resident.name))
-        return self._forget(retired)
+        return self._free(retired)
+
+    def _free(self, retired: Retired) -> int:
+        """Remove a segment that nobody has; a large one's memory goes back in another thread."""
+        resident = retired.resident
+        name = retired_name(resident.name)
+        fd = -1
+        if resident.nbytes > self.closer.small_bytes:
+            with contextlib.suppress(OSError):
+                fd = self.directory.open_path(name)
+        self.directory.unlink(name)
+        self._forget(retired)
+        if fd < 0:
+            return self.ledger.freed(resident.name)
+        self.closer.close(fd, self.ledger.freeing(resident.name))
+        return 0
+
+    def collect(self) -> int:
+        """Count memory that the other thread has freed since the last time; returns its bytes."""
+        nbytes = self.closer.closed()
+        self.ledger.closed(nbytes)
+        return nbytes
 
     def _interval_s(self, retired: Retired) -> float:
         """When to look again at a segment that was found in use."""
         if self.pins.keeps(retired_name(retired.resident.name)):
             retired.interval_s = min(max(TICK_S, 2 * retired.interval_s), WATCHED_INTERVAL_S)
             return retired.interval_s
-        return max(RETIRED_INTERVAL_S, RETIRED_SHARE_S * len(self.ledger.retired))
+        return max(RETIRED_INTERVAL_S, SHARE_S * len(self.ledger.retired))
 
     def hear(self, now_s: float) -> bool:
-        """Somebody closed something: free what nobody has now; whether anything may fit that did not."""
+        """Somebody closed something: have a look at it; whether anything may fit that did not."""
         names = self.pins.closed()
         if names is None:
-            self._pinned_until_s.clear()
-            names = {retired_name(name) for name in self.ledger.retired}
+            self.ledger.order.all_again()
+            self._unheard = self.ledger.segments.walk()
+            return True
         changed = False
         for name in names:
             retired = self.ledger.retired.get(name.removesuffix(retired_name("")))
+            resident = self.ledger.resident_named(name)
             if retired is not None:
                 retired.interval_s = 0.0
-                changed |= self._probe(retired, now_s) > 0
-            else:
-                changed |= self._pinned_until_s.pop(name, None) is not None
+                if not retired.condemned:
+                    self._look_at(retired, now_s)
+            elif resident is not None:
+                changed |= self.ledger.order.again(resident)
         return changed
-
-    def next_sweep_s(self) -> float:
-        """When the next look at a retired segment is due; infinity when there is none."""
-        return min((one.probe_after_s for one in self.ledger.retired.values()), default=math.inf)
-
-    def free(self, shortage: int, now_s: float) -> bool:
-        """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
-
-        Looks at a bounded number per call; True also means that calling again later helps.
-        """
-        self.wake_s = math.inf
-        missing = shortage - self.ledger.condemned_bytes()
-        if missing <= 0:
-            return True
-        candidates, graced = self.ledger.candidates(now_s, HAND_OUT_GRACE_S)
-        self._pinned_until_s = {name: t for name, t in self._pinned_until_s.items() if t > now_s}
-        unknown = [r for r in candidates if r.name not in self._pinned_until_s]
-        ordered = self.policy(unknown, self.sessions.poses())
-        # what a session says it holds is most likely pinned: look at the others first
-        ordered.sort(key=lambda resident: bool(resident.sessions))
-        for resident in ordered[:PROBES_AT_ONCE]:
-            if self.is_pinned(resident):
-                self._pinned_until_s[resident.name] = now_s + PIN_MEMO_S
-                self.pins.tell_once(resident.name)
-                continue
-            missing -= resident.nbytes
-            self.retire(resident, now_s, "room")
-            self.evicted_count += 1
-            if missing <= 0:
-                return True
-        if len(ordered) > PROBES_AT_ONCE:
-            self.wake_s = now_s
-            return True
-        # their readers may be just opening these; those that have done so are no reason to wait
-        unknown = [r for r in graced if r.name not in self._pinned_until_s]
-        for resident in unknown[:PROBES_AT_ONCE]:
-            if not self.is_pinned(resident):
-                self.wake_s = resident.last_use_s + HAND_OUT_GRACE_S
-                return True
-            self._pinned_until_s[resident.name] = now_s + PIN_MEMO_S
-        if len(unknown) > PROBES_AT_ONCE:
-            self.wake_s = now_s
-            return True
-        return self.ledger.condemned_bytes() >= shortage
 
     # --- the end --------------------------------------------------------------------------------
 
+    def close(self) -> None:
+        """Let go of every descriptor."""
+        self.closer.end()
+        self.pins.close()
+
     def remove_all(self) -> None:
         """Take every name away; memory goes back as soon as its last reader ends."""
-        for resident in self.ledger.everything():
+        for resident in self.ledger.segments.walk():
             with contextlib.suppress(OSError):
                 self.directory.unlink(self.name_on_disk(resident))

@@ -4,19 +4,21 @@
 Only the kernel knows.  One look at a segment takes about 30 us, and there may be thousands: there is one
 walk over all of them, in slices.  A slice a beat keeps the gauges of the statistics up to date; when
 somebody asks, a new walk begins and the serving loop does a slice a turn, and everybody who asked before
-it began gets its result.
+it began gets its result.  What a single session has is looked up in slices of the same size, in its own
+turns, before it is refused what would be too much beside what it may have let go of.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container, Generator, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.holders import UNKNOWN_SLOT, Holders
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.records import Resident
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import Busy
 
@@ -31,11 +33,9 @@ LONG_STEP_S: Final = 0.003
 SHARE: Final = 0.1
 """Part of the loop's time that steps get when they take long (somebody holds very many locks)."""
 MOST_SEGMENTS: Final = 2048
-"""Where somebody waits for the result, the largest are looked at."""
+"""Where somebody waits for the result, so many are looked at: the largest, of a session's the oldest."""
 MOST_ASKED: Final = 16
 """Answers one session may wait for."""
-REFRESH_S: Final = 0.03
-"""Time of the processor that looking at what one session holds may take."""
 
 
 @dataclass(slots=True)
@@ -80,7 +80,7 @@ class Survey:
         self._in_service = in_service
         self._asked: list[tuple[Session, Answer]] = []
         self._running: list[tuple[Session, Answer]] = []
-        self._left: list[Resident] = []
+        self._left: Iterator[Resident] | None = None
         self.usage = self._found = Usage()
         self._rests_until_s = 0.0
         self._asking_s = 0.0
@@ -115,34 +115,44 @@ class Survey:
         took_s = time.monotonic() - now_s
         self._rests_until_s = now_s + took_s / SHARE if took_s > LONG_STEP_S else 0.0
 
+    def look_at(
+        self, session: Session, before_s: float, enough: Callable[[], bool], wanted: Container[Key] = ()
+    ) -> Generator[None, None, None]:
+        """Note what a session does not map any more, a few segments a turn, until that is ``enough``.
+
+        Of what was handed out at ``before_s`` or later it may be about to open; what is ``wanted`` again
+        counts either way.
+        """
+        if not self._holders.by_slot:
+            return
+        looked = 0
+        for version in list(session.held):  # what was handed out longest ago first
+            for resident in list(session.held.get(version, ())):
+                if looked == MOST_SEGMENTS or enough():
+                    return
+                if resident.key in wanted:
+                    continue
+                looked += 1
+                if looked % LOOKS_AT_ONCE == 0:
+                    yield
+                if resident.last_use_s < before_s and not self._holders.has(resident, session.slot):
+                    session.drop_segment(resident)
+
     def step(self) -> None:
         """Look at a few segments, or hand the result to one who asked."""
         if self._asked and not self._running:
             self._running, self._asked = self._asked[::-1], []
             self._begin(MOST_SEGMENTS)
-        elif self._running and not self._left:
+        elif self._running and self._left is None:
             _, answer = self._running.pop()
             answer(self.usage)
             return
-        elif not self._left:
+        elif self._left is None:
             self._begin(None)
         self._look()
 
-    def drop_unused(self, session: Session, before_s: float) -> None:
-        """Note what a session does not map any more, for a bounded time, largest first.
-
-        Of what was handed out at ``before_s`` or later it may be about to open.
-        """
-        end_s = time.thread_time() + REFRESH_S
-        for resident in sorted(session.residents(), key=lambda resident: -resident.nbytes):
-            if time.thread_time() > end_s:
-                break
-            slots = self._holders.slots_of(resident) if resident.last_use_s < before_s else None
-            if slots is not None and session.slot not in slots:
-                session.drop_segment(resident)
-
     def _begin(self, most: int | None) -> None:
-        self._left = self._ledger.everything()[:most]
+        self._left = islice(self._ledger.segments.walk(), most)
         self._found = Usage(by_slot=self._holders.by_slot)
         self._asking_s = 0.0
 
@@ -157,10 +167,13 @@ class Survey:
 
     def _look(self) -> None:
         found, end_s = self._found, time.thread_time() + STEP_S
-        for _ in range(min(LOOKS_AT_ONCE, len(self._left))):
+        for _ in range(LOOKS_AT_ONCE):
             if time.thread_time() > end_s:
                 break  # somebody holds very many locks
-            resident = self._left.pop()
+            resident = next(self._left, None) if self._left is not None else None
+            if resident is None:
+                self._left, self.usage = None, found
+                break
             users = self._holders.users_among(resident, self._slots_of(resident))
             if users:
                 found.count += 1
@@ -171,8 +184,6 @@ class Survey:
                     found.unknown_bytes += resident.nbytes
                 else:
                     self._add(found.shares.setdefault(slot, Share()), resident)
-        if not self._left:
-            self.usage = found
 
     def _add(self, share: Share, resident: Resident) -> None:
         share.mapped_bytes += resident.nbytes

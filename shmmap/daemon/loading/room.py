@@ -37,7 +37,7 @@ class Room:
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
-        if self.cache.reclaimer.free(shortage, now_s) or self._may_be_given_back():
+        if self.cache.evictor.free(shortage, now_s) or self._may_be_given_back():
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
@@ -54,7 +54,7 @@ class Room:
                 granted = self.loads.grow(load, nbytes)
                 if not granted and nbytes + ledger.overhead_bytes <= ledger.budget_bytes:
                     shortage = ledger.shortage(nbytes - load.reserved)
-                    if self.cache.reclaimer.free(shortage, now_s) or self._may_be_given_back():
+                    if self.cache.evictor.free(shortage, now_s) or self._may_be_given_back():
                         continue
                 self.pool.answer(worker, Decision(granted))
             del self.hungry[number]

@@ -115,6 +115,9 @@ class Scheduler:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.forget_refusals()
+        if now_s < self._cache.evictor.refresh_until_s:
+            self._cache.evictor.refresh(now_s)
+        self._cache.look_for_some(now_s)
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
         if self._doubtful:
@@ -172,6 +175,11 @@ class Scheduler:
         if self._cache.reclaimer.hear(now_s):
             self.loads.forget_refusals()
 
+    def hear_of_freed(self) -> None:
+        """Memory is back with the kernel."""
+        if self._cache.reclaimer.collect():
+            self.loads.forget_refusals()
+
     def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
         """Somebody dropped these: what was refused for lack of memory may fit now."""
         self._cache.reclaimer.let_go(residents, now_s)
@@ -181,8 +189,8 @@ class Scheduler:
         """When `pump` has something to do although nothing arrives; infinity for never."""
         if self._doubtful:
             return 0.0
-        reclaimer = self._cache.reclaimer
-        return min(reclaimer.next_sweep_s(), reclaimer.wake_s, self.pool.next_deadline_s())
+        cache = self._cache
+        return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())
 
     # --- what workers say -----------------------------------------------------------------------
 

@@ -129,7 +129,7 @@ class CellReplies:
             holders: tuple[Holder, ...] = ()
             if failure.code in SPACE_CODES:
                 if answer.blockers is None:
-                    answer.blockers = cache.holders.of(cache.ledger.everything())
+                    answer.blockers = cache.holders.of(cache.ledger.segments.walk())
                 holders = answer.blockers
             answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders))
         elif not current:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Final
@@ -174,29 +174,54 @@ class SessionQuota:
         session, cache = wanted.session, self.cache
         if session.held_bytes + sum(sizes) <= self.nbytes:
             return
-        cache.survey.drop_unused(session, self.clock() - HAND_OUT_GRACE_S)
-        left = self.nbytes - session.exclusive_bytes()
-        # a new version takes the place of the old one that its holder is about to drop
-        replaced = {r.key: r.nbytes for r in session.residents() if not cache.is_current(r)}
+        too_much, added, keys = yield from self._excess(wanted, sizes)
+        if too_much:  # unless it has let go of something
+            before_s = self.clock() - HAND_OUT_GRACE_S
+            enough = lambda: session.exclusive_bytes + added <= self.nbytes  # noqa: E731
+            for _ in cache.survey.look_at(session, before_s, enough, keys):
+                yield from wanted.pause(cache)
+            too_much, _, _ = yield from self._excess(wanted, sizes)
+        message = (
+            f"this client would keep more than its quota of {format_bytes(self.nbytes)} for itself alone"
+        )
+        for number, part in enumerate(parts(too_much)):
+            if number:
+                yield from wanted.pause(cache)
+            for key in part:
+                wanted.refused[key] = ("over_budget", message)
+                cache.statistics.add("refused_quota")
+                cache.events.pressure.refused(cache.wire_id(key.cell_id), key.layer, "quota", self.clock())
+
+    def _excess(
+        self, wanted: PendingRequest, sizes: Sequence[int]
+    ) -> Generator[None, None, tuple[list[Key], int, set[Key]]]:
+        """What is too much, how many bytes all would add to what nobody else holds, and what all is."""
+        session, cache = wanted.session, self.cache
         boxes = cache.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
-        counted: set[tuple[int, str]] = set()
+        counted: set[Key] = set()
+        too_much: list[Key] = []
+        added = 0
         nearest = np.argsort(wanted.distances_m(boxes), kind="stable").tolist()
         for number, part in enumerate(parts(nearest)):
             if number:
                 yield from wanted.pause(cache)
             for position in part:
                 index, layer = wanted.cells[position]
-                if (index, layer) in counted:
-                    continue
-                counted.add((index, layer))
                 key = Key(cache.catalogue.id(index), layer)
+                if key in counted:
+                    continue
+                counted.add(key)
                 resident = cache.warm.get(index, layer)
                 if resident is not None and resident.sessions:
                     continue  # somebody keeps it anyway, perhaps this session itself
-                left -= sizes[position] - replaced.get(key, 0)
-                if left < 0:
-                    quota = format_bytes(self.nbytes)
-                    message = f"this client would keep more than its quota of {quota} for itself alone"
-                    wanted.refused[key] = ("over_budget", message)
-                    cache.statistics.add("refused_quota")
-                    cache.events.pressure.refused(cache.wire_id(key.cell_id), layer, "quota", self.clock())
+                added += sizes[position] - self._replaced_bytes(session, key)
+                if session.exclusive_bytes + added > self.nbytes:
+                    too_much.append(key)
+        return too_much, added, counted
+
+    def _replaced_bytes(self, session: Session, key: Key) -> int:
+        """Bytes of an old version: its holder is about to drop it for the new one."""
+        for known in (self.cache.ledger.by_key.get(key), self.cache.reclaimer.retired_of(key)):
+            if known is not None and session.slot in known.sessions and not self.cache.is_current(known):
+                return known.nbytes
+        return 0

@@ -83,7 +83,7 @@ class Sampler:
         set_value("bytes_reserved", ledger.reserved_bytes)
         set_value("bytes_statistics", cache.statistics.size_bytes)
         set_value("budget_bytes", ledger.budget_bytes)
-        set_value("evictions", cache.reclaimer.evicted_count)
+        set_value("evictions", cache.evictor.evicted_count)
         set_value("map_cells", len(cache.catalogue))
         set_value("events_published", self.event_log.last)
 

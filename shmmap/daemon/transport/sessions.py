@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -18,10 +19,17 @@ from shmmap.logfmt import escaped
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["Session", "Sessions", "predicted_path"]
+__all__ = ["Places", "Session", "Sessions", "predicted_path", "squares_of"]
 
 LOOK_AHEAD_S: Final = 5
 ROUTE_VERTICES: Final = 64
+SQUARE_M: Final = 16.0
+"""Where clients are and will be counts to the square of this grid."""
+SQUARES_ORIGIN: Final = 1 << 22
+"""Column and row of the square at the map's origin; what is farther away counts at the grid's edge."""
+GRID_M: Final = (SQUARES_ORIGIN - 1) * SQUARE_M
+FIRST_STEP_M: Final = 32.0
+"""Along its path a client's places are so far apart at first, then each twice as far away as the last."""
 
 
 @dataclass(eq=False, slots=True)
@@ -29,7 +37,8 @@ class Session:
     """One client.
 
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
-    naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``says_where`` tells
+    naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``exclusive_bytes`` are
+    those that no other session holds.  ``says_where`` tells
     an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
     asked for.  ``asker`` is whose turn its requests and loads count for: the process's, else the
     session's own.
@@ -39,9 +48,12 @@ class Session:
     connection: Connection
     client: str
     command: str
+    sessions: Sessions
     held: dict[int, list[Resident]] = field(default_factory=dict)
     held_bytes: int = 0
-    intent: Intent | None = None
+    exclusive_bytes: int = 0
+    _intent: Intent | None = None
+    _squares: frozenset[int] = frozenset()
     says_where: bool = False
     area: Area | None = None
     requests: int = 0
@@ -52,6 +64,20 @@ class Session:
     def peer(self) -> Peer:
         """The client's process."""
         return self.connection.peer
+
+    @property
+    def intent(self) -> Intent | None:
+        """Where the client is and is going to be, as far as that is known."""
+        return self._intent
+
+    @intent.setter
+    def intent(self, intent: Intent | None) -> None:
+        squares: frozenset[int] = frozenset()
+        if intent is not None:
+            squares = squares_of(predicted_path(intent))
+        if squares != self._squares:
+            self.sessions.places.move(self._squares, squares)
+        self._intent, self._squares = intent, squares
 
     def connect(self, connection: Connection) -> None:
         """The session goes on on this connection."""
@@ -74,15 +100,28 @@ class Session:
                 continue
             else:
                 known.append(resident)
-            self.held_bytes += resident.nbytes
+            resident.sessions.discard(self.slot)  # it may be that of an earlier session of this slot
+            self._count(resident, 1)
             resident.sessions.add(self.slot)
+
+    def _count(self, resident: Resident, one: int) -> None:
+        """One more of the segment's holders is this session, or (-1) one less."""
+        self.held_bytes += one * resident.nbytes
+        others = resident.sessions
+        if not others:
+            self.exclusive_bytes += one * resident.nbytes
+        elif len(others) == 1:
+            (slot,) = others
+            other = self.sessions.by_slot(slot)
+            if other is not None:
+                other.exclusive_bytes -= one * resident.nbytes
 
     def drop(self, versions: Iterable[int]) -> list[Resident]:
         """The session does not have these versions any more; returns what it had of them."""
         dropped = [resident for version in versions for resident in self.held.pop(version, ())]
         for resident in dropped:
-            self.held_bytes -= resident.nbytes
             resident.sessions.discard(self.slot)
+            self._count(resident, -1)
         return dropped
 
     def drop_segment(self, resident: Resident) -> None:
@@ -90,18 +129,14 @@ class Session:
         known = self.held.get(resident.version, [])
         if resident in known:
             known.remove(resident)
-            self.held_bytes -= resident.nbytes
             resident.sessions.discard(self.slot)
+            self._count(resident, -1)
             if not known:
                 del self.held[resident.version]
 
     def residents(self) -> list[Resident]:
         """Everything the session holds."""
         return [resident for known in self.held.values() for resident in known]
-
-    def exclusive_bytes(self) -> int:
-        """Bytes that nobody but this session holds."""
-        return sum(resident.nbytes for resident in self.residents() if len(resident.sessions) == 1)
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
         """This session as a line in a reply."""
@@ -123,6 +158,62 @@ def predicted_path(intent: Intent) -> list[tuple[float, float]]:
     return path
 
 
+def squares_of(path: Sequence[tuple[float, float]]) -> frozenset[int]:
+    """Squares in which a client is at the begin of its path, along it and at its end.
+
+    The farther ahead the farther apart: what is needed soon counts exactly, and a path of any length gives
+    a few squares.  A square is ``column << 32 | row``.
+    """
+    (x, y), *ahead = [(_within_grid(x), _within_grid(y)) for x, y in path]
+    if not ahead:
+        return frozenset((_square(x, y),))
+    squares = {_square(x, y)}
+    come_m, next_m = 0.0, FIRST_STEP_M
+    for to_x, to_y in ahead:
+        step_m = math.hypot(to_x - x, to_y - y)
+        while come_m + step_m >= next_m:
+            share = (next_m - come_m) / step_m
+            squares.add(_square(x + share * (to_x - x), y + share * (to_y - y)))
+            next_m *= 2.0
+        come_m, x, y = come_m + step_m, to_x, to_y
+    squares.add(_square(x, y))
+    return frozenset(squares)
+
+
+def _within_grid(metres: float) -> float:
+    return metres if -GRID_M < metres < GRID_M else math.copysign(GRID_M, metres)
+
+
+def _square(x: float, y: float) -> int:
+    return int(x // SQUARE_M) + SQUARES_ORIGIN << 32 | int(y // SQUARE_M) + SQUARES_ORIGIN
+
+
+class Places:
+    """Squares in which any client is or will be.
+
+    Attributes
+    ----------
+    squares : dict
+        To how many clients' paths each belongs.
+    version : int
+        Another one after each change.
+    """
+
+    def __init__(self) -> None:
+        self.squares: dict[int, int] = {}
+        self.version = 0
+
+    def move(self, old: frozenset[int], new: frozenset[int]) -> None:
+        """One client is and will be elsewhere."""
+        for square in new - old:
+            self.squares[square] = self.squares.get(square, 0) + 1
+        for square in old - new:
+            count = self.squares.pop(square) - 1
+            if count:
+                self.squares[square] = count
+        self.version += 1
+
+
 def command_of(pid: int) -> str:
     """Command name of a process, empty where it cannot be read."""
     if pid <= 0:
@@ -142,6 +233,8 @@ class Sessions:
     ----------
     departed : dict
         By slot, those whose connection has ended and who may still map what they were handed.
+    places
+        Where the clients are and are going to be.
     """
 
     LIMIT = 4096
@@ -149,6 +242,7 @@ class Sessions:
     def __init__(self) -> None:
         self._by_slot: dict[int, Session] = {}
         self.departed: dict[int, Session] = {}
+        self.places = Places()
 
     def __len__(self) -> int:
         return len(self._by_slot)
@@ -183,8 +277,9 @@ class Sessions:
             slot = secrets.randbelow(MAX_SLOT) + 1
         pid = connection.peer.pid
         session = Session(
-            slot, connection, escaped(client)[:64], command_of(pid), last_request_s=now_s, asker=pid or -slot
-        )
+            slot, connection, escaped(client)[:64], command_of(pid), self, last_request_s=now_s,
+            asker=pid or -slot,
+        )  # fmt: skip
         connection.session = session
         self._by_slot[slot] = session
         return session
@@ -194,7 +289,3 @@ class Sessions:
         session.disconnect()
         self._by_slot.pop(session.slot, None)
         self.departed.pop(session.slot, None)
-
-    def poses(self) -> list[tuple[float, float]]:
-        """Where the clients are and are going to be, metres, map frame."""
-        return [pose for s in self if s.intent is not None for pose in predicted_path(s.intent)]

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -88,9 +89,8 @@ class InnerDaemon:
         self.sessions = Sessions()
         self.ledger = Ledger(budget_bytes)
         self.ledger.overhead_bytes = self.statistics.size_bytes
-        self.reclaimer = Reclaimer(
-            self.ledger, self.directory, self.sessions, POLICIES["distance"], PinWatch(self.directory)
-        )
+        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory))
+        self.evictor = Evictor(self.reclaimer, POLICIES["distance"])
         self.watched = WatchedDescriptors()
         self.pool = WorkerPool(
             workers,
@@ -101,7 +101,7 @@ class InnerDaemon:
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
-            catalogue, self.reclaimer, self.statistics, self.event_log,
+            catalogue, self.evictor, self.statistics, self.event_log,
             instance="inner", mode=0o400, gid=-1,
         )  # fmt: skip
         self.offset_s = 0.0
@@ -109,6 +109,7 @@ class InnerDaemon:
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
         self.loads = self.scheduler.loads
+        self.watched.watch(self.reclaimer.closer.fd, self.scheduler.hear_of_freed)
         self.hold_answers = False
         self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []
@@ -162,6 +163,7 @@ class InnerDaemon:
                 callback()
         now_s = self.now_s()
         self.scheduler.lost.end_overdue(now_s)
+        self.cache.survey.turn(now_s)
         self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
         self.map_switch.step(now_s)

@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import pytest
 
+from shmmap.daemon.cache import survey
 from shmmap.daemon.cache.holders import UNKNOWN_SLOT, Holders
-from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.ledger import Ledger, Segments
 from shmmap.daemon.cache.survey import LOOKS_AT_ONCE, MOST_ASKED, Survey, Usage
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
@@ -28,16 +29,24 @@ class Memory:
     """Segments and who maps them; stands for the ledger and the holders."""
 
     def __init__(self, count: int = SEGMENTS) -> None:
-        self.segments = [resident(number) for number in range(count)]
+        self.those = [resident(number) for number in range(count)]
+        self._segments = Segments()
+        for one in self.those:
+            self._segments.add(one)
         self.users: dict[str, list[int]] = {}
         self.looked = 0
         self.by_slot = True
 
-    def everything(self) -> list[Resident]:
-        return sorted(self.segments, key=lambda one: -one.nbytes)
+    @property
+    def segments(self) -> Segments:
+        return self._segments
+
+    def has(self, one: Resident, slot: int) -> bool:
+        self.looked += 1
+        return one not in self.those or slot in self.users.get(one.name, [])
 
     def slots_of(self, one: Resident) -> list[int] | None:
-        if one not in self.segments:
+        if one not in self.those:
             return None
         return [slot for slot in self.users.get(one.name, []) if slot != UNKNOWN_SLOT]
 
@@ -61,17 +70,18 @@ def test_the_gauges_follow_one_walk_behind() -> None:
     memory = Memory()
     survey = survey_of(memory)
     memory.users = {"1": [7], "2": [UNKNOWN_SLOT], "40": [7, 8]}
-    survey.step()
-    survey.step()
-    assert memory.looked == 2 * LOOKS_AT_ONCE
+    for _ in range(3):
+        survey.step()
+    assert memory.looked == 3 * LOOKS_AT_ONCE
     assert survey.usage == Usage()
     survey.step()
     assert (survey.usage.count, survey.usage.nbytes) == (3, 101 + 102 + 140)
     memory.users = {"2": [UNKNOWN_SLOT]}
-    for _ in range(3):
+    for _ in range(4):
         survey.step()
     assert (survey.usage.count, survey.usage.nbytes) == (1, 102)
-    memory.segments.clear()
+    for one in memory.those:
+        memory.segments.remove(one)
     survey.step()
     assert survey.usage == Usage()
 
@@ -117,13 +127,45 @@ def test_one_session_waits_for_so_many_answers() -> None:
     survey.ask(session(), nothing)
 
 
+def no(*_: object) -> bool:
+    return False
+
+
 def test_a_session_keeps_what_it_maps_or_was_just_given() -> None:
     memory, mine = Memory(4), session()
-    mapped, dropped, fresh, gone = memory.segments
-    mine.hold(memory.segments)
+    mapped, dropped, fresh, gone = memory.those
+    mine.hold(memory.those)
     memory.users = {mapped.name: [mine.slot]}
     fresh.last_use_s = 99.5
-    memory.segments.remove(gone)
-    survey_of(memory).drop_unused(mine, 99.0)
+    memory.those.remove(gone)
+    assert list(survey_of(memory).look_at(mine, 99.0, no)) == []
     assert dropped not in mine.residents()
     assert {one.name for one in mine.residents()} == {mapped.name, fresh.name, gone.name}
+
+
+def test_what_a_session_has_is_looked_up_a_few_at_a_time() -> None:
+    """Oldest first, until enough was let go of."""
+    memory, mine = Memory(), session()
+    mine.hold(memory.those)
+    turns = before = 0
+    for _ in survey_of(memory).look_at(mine, 99.0, lambda: len(mine.held) <= 10):
+        assert memory.looked - before <= LOOKS_AT_ONCE
+        before, turns = memory.looked, turns + 1
+    assert turns == memory.looked // LOOKS_AT_ONCE == 2
+    assert list(mine.held) == [one.version for one in memory.those[-10:]], "and no further"
+
+
+def test_so_many_of_a_session_s_segments_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(survey, "MOST_SEGMENTS", 20)
+    memory, mine = Memory(), session()
+    mine.hold(memory.those)
+    list(survey_of(memory).look_at(mine, 99.0, no))
+    assert memory.looked == 20
+
+
+def test_where_the_kernel_does_not_tell_who_has_what_nothing_is_taken_for_dropped() -> None:
+    memory, mine = Memory(), session()
+    memory.by_slot = False
+    mine.hold(memory.those)
+    assert list(survey_of(memory).look_at(mine, 99.0, no)) == []
+    assert len(mine.held) == SEGMENTS

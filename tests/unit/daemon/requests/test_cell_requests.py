@@ -72,7 +72,7 @@ def test_areas_at_the_end_of_the_world(
     assert (reply.pending, reply.failed) == ((), ())
     assert len(one.everything(2).cells) == 16
     one.offset_s += 2.0
-    one.reclaimer.free(one.ledger.budget_bytes, one.now_s())
+    one.evictor.free(one.ledger.budget_bytes, one.now_s())
     one.run_until(lambda: one.ledger.used_bytes == one.ledger.overhead_bytes)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,10 +14,13 @@ from shmmap.daemon.requests.cell_requests import note_area
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import (
     ROUTE_VERTICES,
+    SQUARE_M,
+    SQUARES_ORIGIN,
     Session,
     Sessions,
     command_of,
     predicted_path,
+    squares_of,
 )
 from shmmap.geometry import Circle
 from shmmap.protocol.messages import Intent
@@ -62,7 +66,7 @@ def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
             assert len(session.residents()) == len(numbers)
             assert set(session.held) == {n // 2 + 1 for n in numbers}
             alone = [n for n in numbers if sum(n in other for other in model) == 1]
-            assert session.exclusive_bytes() == sum(10**n for n in alone)
+            assert session.exclusive_bytes == sum(10**n for n in alone)
         for number, segment in enumerate(segments):
             assert segment.sessions == {
                 c.slot for c, has in zip(clients, model, strict=True) if number in has
@@ -86,7 +90,7 @@ def test_a_session_and_its_connections() -> None:
     session.connect(second)
     assert [first.session, second.session] == [None, session]
     assert session.connection is second
-    assert sessions.poses() == []
+    assert sessions.places.squares == {}
     sessions.departed[session.slot] = session
     sessions.close(session)
     assert [second.session, sessions.by_slot(session.slot), sessions.departed] == [None, None, {}]
@@ -129,18 +133,29 @@ def test_who_gives_way() -> None:
     assert sessions.spare() is busy
 
 
+def middles(sessions: Sessions) -> set[tuple[float, float]]:
+    """Middles of the squares in which clients are or will be."""
+    return {
+        (
+            ((square >> 32) - SQUARES_ORIGIN + 0.5) * SQUARE_M,
+            ((square & 0xFFFFFFFF) - SQUARES_ORIGIN + 0.5) * SQUARE_M,
+        )
+        for square in sessions.places.squares
+    }
+
+
 def test_where_a_client_is() -> None:
     """The middle of what it asks for, until it says so itself."""
     sessions = Sessions()
     session = sessions.open(connections.of(), "", 0.0)
     sessions.open(connections.of(), "", 0.0)
-    assert sessions.poses() == []
-    for at in ((1.0, 2.0), (300.0, 4.0)):
+    assert middles(sessions) == set()
+    for at, middle in (((1.0, 2.0), (8.0, 8.0)), ((300.0, -4.0), (296.0, -8.0))):
         note_area(session, Circle(*at, 5.0))
-        assert sessions.poses() == [at]
-    session.intent, session.says_where = Intent(7.0, 8.0), True
+        assert middles(sessions) == {middle}
+    session.intent, session.says_where = Intent(70.0, 8.0), True
     note_area(session, Circle(1.0, 1.0, 5.0))
-    assert sessions.poses() == [(7.0, 8.0)]
+    assert middles(sessions) == {(72.0, 8.0)}
 
 
 def test_where_a_client_is_going_counts() -> None:
@@ -156,8 +171,27 @@ def test_where_a_client_is_going_counts() -> None:
 
 
 def test_eviction_is_told_where_clients_are_going() -> None:
+    """All clients together, each square once; who stays in its square changes nothing."""
     sessions = Sessions()
-    session = sessions.open(connections.of(), "", 0.0)
-    session.says_where = True
-    session.intent = Intent(1.0, 2.0, route=((50.0, 60.0), (70.0, 80.0)))
-    assert sessions.poses() == [(1.0, 2.0), (50.0, 60.0), (70.0, 80.0)]
+    one, other = (sessions.open(connections.of(), "", 0.0) for _ in range(2))
+    one.intent = Intent(1.0, 2.0, route=((60.0, 2.0), (140.0, 2.0)))
+    assert middles(sessions) == {(8.0, 8.0), (40.0, 8.0), (72.0, 8.0), (136.0, 8.0)}
+    other.intent, version = Intent(2.0, 3.0), sessions.places.version
+    assert middles(sessions) == {(8.0, 8.0), (40.0, 8.0), (72.0, 8.0), (136.0, 8.0)}
+    other.intent = Intent(3.0, 4.0)
+    assert sessions.places.version == version + 1
+    one.connection.session = None
+    sessions.close(one)
+    assert middles(sessions) == {(8.0, 8.0)}
+    other.disconnect()
+    assert middles(sessions) == set()
+
+
+@pytest.mark.parametrize("far", [1e4, 1e9, 1e308])
+def test_however_long_a_route_is_it_counts_as_a_few_squares(far: float) -> None:
+    """The farther ahead, the farther apart; also where it leaves the grid."""
+    route = tuple((far * (1 + n % 3), far * n * (-1) ** n) for n in range(ROUTE_VERTICES))
+    for intent in (Intent(0.0, 0.0, route=route), Intent(far, far, vx=-far, vy=far)):
+        assert len(squares_of(predicted_path(intent))) <= 32
+    straight = squares_of([(0.0, 0.0), (1000.0, 0.0)])
+    assert sorted((square >> 32) - SQUARES_ORIGIN for square in straight) == [0, 2, 4, 8, 16, 32, 62]

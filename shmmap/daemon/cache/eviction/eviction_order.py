@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The order in which segments give way, kept while they come, go and are used; without any I/O.
+
+Asking for the next ones costs O(log n), however many segments there are.  Scores are remembered: those at
+the front are checked whenever somebody asks, so that nothing goes by an outdated one; all others are
+brought up to date a few at a time (`EvictionOrder.refresh`) while clients move.  What has become worth
+less since is found at the next round.  As long as no client moves, the order is exactly that of a sort.
+
+A segment that cannot go now is set aside: until a time, or until somebody says that it may (`again`).
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from bisect import bisect_left, insort
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final, NamedTuple
+
+from shmmap.daemon.records import Resident
+
+__all__ = ["BATCH", "FRONT", "EvictionOrder", "Score", "SetAside"]
+
+FRONT: Final = 32
+"""Segments offered at a time."""
+TRIES: Final = 4
+"""How often the front is scored anew for one question, if its scores were outdated."""
+BATCH: Final = 128
+"""Segments scored, or taken back, at a time: a quarter of a millisecond."""
+TOLERANCE: Final = 0.1
+"""A score that has changed by a smaller part stays as it is while it is not at the front."""
+_BLOCK: Final = 512
+
+
+class Score(NamedTuple):
+    """How segments are scored now; ``version`` changes when scores may."""
+
+    of: Callable[[Sequence[Resident]], Iterable[float]]
+    version: int = 0
+
+
+class _Entry(NamedTuple):
+    """A segment by its score; the greatest goes first. No two have the same number."""
+
+    loose: bool  # no session says that it holds it: most likely nobody has it mapped
+    score: float
+    unused: float
+    number: int
+    resident: Resident
+    version: int
+
+    def is_outdated(self, version: int) -> bool:
+        resident = self.resident
+        return (
+            self.version != version
+            or self.unused != -resident.last_use_s
+            or self.loose is bool(resident.sessions)
+        )
+
+
+class _Sorted:
+    """Entries in ascending order, in blocks: adding and removing one moves a block at most."""
+
+    def __init__(self) -> None:
+        self._blocks: list[list[_Entry]] = []
+        self._lasts: list[_Entry] = []
+
+    def add(self, entry: _Entry) -> None:
+        if not self._blocks:
+            self._blocks, self._lasts = [[entry]], [entry]
+            return
+        at = min(bisect_left(self._lasts, entry), len(self._blocks) - 1)
+        block = self._blocks[at]
+        insort(block, entry)
+        if len(block) > 2 * _BLOCK:
+            self._blocks.insert(at, block[:_BLOCK])
+            self._lasts.insert(at, block[_BLOCK - 1])
+            del block[:_BLOCK]
+            at += 1
+        self._lasts[at] = block[-1]
+
+    def remove(self, entry: _Entry) -> None:
+        at = bisect_left(self._lasts, entry)
+        block = self._blocks[at]
+        del block[bisect_left(block, entry)]
+        if block:
+            self._lasts[at] = block[-1]
+        else:
+            del self._blocks[at], self._lasts[at]
+
+    def greatest(self, count: int) -> list[_Entry]:
+        """The greatest entries, greatest first."""
+        found: list[_Entry] = []
+        for block in reversed(self._blocks):
+            found += block[: -1 - (count - len(found)) : -1]
+            if len(found) == count:
+                break
+        return found
+
+
+class SetAside:
+    """Segments that cannot go now, and until when; infinity for those that somebody will speak of."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[Resident, float | None] = {}
+        self._heap: list[tuple[float, int, Resident]] = []
+        self._number = 0
+
+    def __len__(self) -> int:
+        return len(self._until_s)
+
+    def __contains__(self, resident: Resident) -> bool:
+        return resident in self._until_s
+
+    def put(self, resident: Resident, until_s: float) -> None:
+        """Set one aside."""
+        self._until_s[resident] = until_s
+        if until_s < math.inf:
+            self._number += 1
+            heapq.heappush(self._heap, (until_s, self._number, resident))
+
+    def take(self, resident: Resident) -> bool:
+        """Take one back; whether it was there."""
+        return self._until_s.pop(resident, None) is not None
+
+    def first(self) -> tuple[float, Resident] | None:
+        """Whose time comes next, and when."""
+        while self._heap:
+            until_s, _, resident = self._heap[0]
+            if self._until_s.get(resident) == until_s:
+                return until_s, resident
+            heapq.heappop(self._heap)
+        return None
+
+    def due(self, now_s: float) -> list[Resident]:
+        """Take back those whose time has come, a bounded number."""
+        found = []
+        for _ in range(BATCH):
+            if not self._heap or self._heap[0][0] > now_s:
+                break
+            until_s, _, resident = heapq.heappop(self._heap)
+            if self._until_s.get(resident) == until_s:
+                del self._until_s[resident]
+                found.append(resident)
+        return found
+
+    def take_all(self) -> dict[Resident, float | None]:
+        """Take back all."""
+        found, self._until_s = self._until_s, {}
+        return found
+
+
+class EvictionOrder:
+    """All residents, each in one place: new (not scored yet), in order, or set aside.
+
+    Attributes
+    ----------
+    graced
+        Set aside: just handed out, their readers may be opening them.
+    aside
+        Set aside: somebody needs or maps them.
+    scored : int
+        How many scores were computed so far.
+    """
+
+    def __init__(self) -> None:
+        self.graced = SetAside()
+        self.aside = SetAside()
+        self.scored = 0
+        self._new: dict[Resident, float | None] = {}
+        self._entries: dict[Resident, _Entry] = {}
+        self._sorted = _Sorted()
+        self._number = 0
+
+    def __len__(self) -> int:
+        return len(self._new) + len(self._entries) + len(self.graced) + len(self.aside)
+
+    def enter(self, resident: Resident) -> None:
+        """A segment is in service now."""
+        self._new[resident] = None
+
+    def leave(self, resident: Resident) -> None:
+        """It is not any more."""
+        entry = self._entries.pop(resident, None)
+        if entry is not None:
+            self._sorted.remove(entry)
+        elif resident in self._new:
+            del self._new[resident]
+        elif not self.graced.take(resident):
+            self.aside.take(resident)
+
+    def again(self, resident: Resident) -> bool:
+        """Somebody who used it says that it does not; whether it had been set aside for that."""
+        entry = self._entries.get(resident)
+        if self.aside.take(resident) or (entry is not None and entry.loose is bool(resident.sessions)):
+            self.leave(resident)
+            self._new[resident] = None
+            return entry is None
+        return False
+
+    def all_again(self) -> None:
+        """Anything that was set aside as mapped or needed may not be any more."""
+        few, many = self._new, self.aside.take_all()
+        if len(few) > len(many):
+            few, many = many, few
+        many.update(few)  # however many there are, few of them are touched
+        self._new = many
+
+    def set_aside(self, resident: Resident, where: SetAside, until_s: float) -> None:
+        """It cannot go now; ``where`` is `graced` or `aside`."""
+        self.leave(resident)
+        where.put(resident, until_s)
+
+    def front(self, score: Score, now_s: float) -> list[Resident]:
+        """Those that should go first, in that order, at most `FRONT`; empty when all are set aside."""
+        for resident in (*self.graced.due(now_s), *self.aside.due(now_s)):
+            self._new[resident] = None
+        if (
+            len(self._entries) < FRONT
+        ):  # else they wait for `score_new`: many at once cost little more than one
+            self.score_new(score)
+        seen: dict[Resident, None] = {}
+        for _ in range(TRIES):
+            front = self._sorted.greatest(FRONT)
+            outdated = [entry.resident for entry in front if entry.is_outdated(score.version)]
+            if not outdated:
+                return [entry.resident for entry in front]
+            self._place(outdated, score)
+            seen.update(dict.fromkeys(outdated))
+        # whatever else there is, these go before most others
+        return [entry.resident for entry in sorted(map(self._entries.__getitem__, seen), reverse=True)]
+
+    @property
+    def settled(self) -> bool:
+        """Whether all have been scored."""
+        return not self._new
+
+    def score_new(self, score: Score) -> None:
+        """Score those that came, a bounded number."""
+        if self._new:
+            self._place([self._new.popitem()[0] for _ in range(min(BATCH, len(self._new)))], score)
+
+    def refresh(self, some: Iterable[Resident], score: Score) -> None:
+        """Bring the scores of some segments up to date."""
+        entries = [entry for one in some if (entry := self._entries.get(one)) is not None]
+        outdated = [entry for entry in entries if entry.is_outdated(score.version)]
+        if not outdated:
+            return
+        scores = self._scores([entry.resident for entry in outdated], score)
+        for entry, now in zip(outdated, scores, strict=True):
+            loose = not entry.resident.sessions
+            if loose is not entry.loose or abs(now - entry.score) > TOLERANCE * abs(entry.score):
+                self._put(entry.resident, now, score.version)
+
+    def _place(self, some: Sequence[Resident], score: Score) -> None:
+        for resident, now in zip(some, self._scores(some, score), strict=True):
+            self._put(resident, now, score.version)
+
+    def _scores(self, some: Sequence[Resident], score: Score) -> list[float]:
+        self.scored += len(some)
+        return list(map(float, score.of(some)))
+
+    def _put(self, resident: Resident, score: float, version: int) -> None:
+        self.leave(resident)
+        self._number += 1
+        entry = _Entry(not resident.sessions, score, -resident.last_use_s, self._number, resident, version)
+        self._entries[resident] = entry
+        self._sorted.add(entry)

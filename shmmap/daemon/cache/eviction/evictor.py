@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Making room: the segments that give way first are retired, unless somebody has them.
+
+One turn of the serving loop looks at a bounded number of segments; what remains is for the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final
+
+from shmmap.daemon.cache.eviction.eviction_order import BATCH, Score
+from shmmap.daemon.cache.eviction.eviction_policy import EvictionPolicy, places_of
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, SHARE_S, Reclaimer
+from shmmap.daemon.records import Resident
+
+__all__ = ["Evictor"]
+
+PIN_MEMO_S: Final = 0.2
+"""How long, at least, a segment found pinned is not considered again."""
+PRESSURE_S: Final = 10.0
+"""Scores are kept up to date for so long after somebody needed room."""
+REFRESH_S: Final = 0.01
+"""How often a few scores are brought up to date."""
+ROUND_S: Final = 2.0
+"""How often, at most, those of all segments, a few at a time."""
+PLACES_S: Final = 0.25
+"""How often the places of clients that move are taken over."""
+
+
+@dataclass(eq=False, slots=True)
+class Evictor:
+    """Retires what the policy says.
+
+    Attributes
+    ----------
+    evicted_count
+        Segments retired to make room.
+    wake_s
+        When `free` is worth calling again although nothing changed: at once, or when a grace ends.
+    refresh_until_s
+        Until when `refresh` has something to do: for a while after somebody needed room.
+    """
+
+    reclaimer: Reclaimer
+    policy: EvictionPolicy
+    evicted_count: int = 0
+    wake_s: float = math.inf
+    refresh_until_s: float = -math.inf
+    _score: Score = field(init=False)
+    _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
+    _round_version: int = 0
+    _round_s: float = -math.inf
+    _placed_s: float = -math.inf
+    _refreshed_s: float = -math.inf
+
+    def __post_init__(self) -> None:
+        self._score = self._score_at(0)
+
+    def free(self, shortage: int, now_s: float) -> bool:
+        """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
+
+        True also means that calling again at ``wake_s`` helps.
+        """
+        ledger = self.reclaimer.ledger
+        self.wake_s = math.inf
+        missing = shortage - ledger.coming_bytes
+        if missing <= 0:
+            return True
+        self.refresh_until_s = now_s + PRESSURE_S
+        order, looks = ledger.order, 0
+        first = order.front(self._scored(now_s), now_s)
+        for resident in first:
+            graced_s = resident.last_use_s + HAND_OUT_GRACE_S
+            if ledger.is_needed(resident.key):
+                order.set_aside(resident, order.aside, math.inf)
+            elif graced_s > now_s:
+                order.set_aside(resident, order.graced, graced_s)
+            elif looks == LOOKS_AT_ONCE:
+                break
+            else:
+                looks += 1
+                if self._found_in_use(resident, now_s):
+                    continue
+                missing -= resident.nbytes
+                self.reclaimer.retire(resident, now_s, "room")
+                self.evicted_count += 1
+                if missing <= 0:
+                    return True
+        if first:
+            self.wake_s = now_s
+            return True
+        return self._is_any_soon_free(now_s) or ledger.coming_bytes >= shortage
+
+    def _is_any_soon_free(self, now_s: float) -> bool:
+        """Whether a grace that will end is worth waiting for: nobody has opened that segment yet."""
+        ledger = self.reclaimer.ledger
+        order = ledger.order
+        for _ in range(LOOKS_AT_ONCE):
+            soon = order.graced.first()
+            if soon is None:
+                return False
+            until_s, resident = soon
+            if ledger.is_needed(resident.key):
+                order.set_aside(resident, order.aside, math.inf)
+            elif not self._found_in_use(resident, now_s):
+                self.wake_s = until_s
+                return True
+        self.wake_s = now_s
+        return True
+
+    def _found_in_use(self, resident: Resident, now_s: float) -> bool:
+        """Whether somebody has this; then it is set aside."""
+        if not self.reclaimer.is_pinned(resident):
+            return False
+        order = self.reclaimer.ledger.order
+        order.set_aside(resident, order.aside, now_s + max(PIN_MEMO_S, SHARE_S * len(order.aside)))
+        self.reclaimer.pins.tell_once(resident.name)
+        return True
+
+    # --- keeping the order up to date -----------------------------------------------------------
+
+    def refresh(self, now_s: float) -> None:
+        """Bring some scores up to date, while memory is short and clients move."""
+        if now_s - self._refreshed_s < REFRESH_S:
+            return
+        self._refreshed_s = now_s
+        ledger, score = self.reclaimer.ledger, self._scored(now_s)
+        ledger.order.score_new(score)
+        some = list(islice(self._round, BATCH))
+        if some:
+            ledger.order.refresh(some, score)
+        elif self._round_version != score.version and now_s - self._round_s >= ROUND_S:
+            self._round_s = now_s
+            self._round, self._round_version = ledger.segments.walk(), score.version
+
+    def _scored(self, now_s: float) -> Score:
+        """How segments are scored, by where clients are (if they move, were a moment ago)."""
+        places = self.reclaimer.sessions.places
+        if places.version != self._score.version and now_s - self._placed_s >= PLACES_S:
+            self._placed_s = now_s
+            self._score = self._score_at(places.version)
+        return self._score
+
+    def _score_at(self, version: int) -> Score:
+        policy, places = self.policy, places_of(self.reclaimer.sessions.places.squares)
+        return Score(lambda some: policy(some, places), version)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The order in which segments give way, against a plain sort; and how little work it takes."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from shmmap.daemon.cache.eviction.eviction_order import BATCH, FRONT, TRIES, EvictionOrder, Score
+from shmmap.daemon.records import Key, Resident
+
+
+def made(number: int, last_use_s: float = 0.0) -> Resident:
+    return Resident(
+        f"/{number}", Key(f"/{number}.pcd", "points"), number, 100, 0, (0.0,) * 4, 0.0, 0.0,
+        last_use_s=last_use_s,
+    )  # fmt: skip
+
+
+class Worth:
+    """Scores as a test says."""
+
+    def __init__(self) -> None:
+        self.of_number: dict[int, float] = {}
+        self.version = 0
+        self.calls = 0
+
+    def __call__(self, some: Sequence[Resident]) -> list[float]:
+        self.calls += 1
+        return [self.of_number[one.version] for one in some]
+
+    @property
+    def score(self) -> Score:
+        return Score(self, self.version)
+
+    def rank(self, one: Resident) -> tuple[bool, float, float]:
+        """The least goes first."""
+        return bool(one.sessions), -self.of_number[one.version], one.last_use_s
+
+
+@settings(max_examples=100, stateful_step_count=60, deadline=None)
+class Machine(RuleBasedStateMachine):
+    """As few segments as are offered at once: always exactly as a sort says, whatever moves or is used."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.order, self.worth = EvictionOrder(), Worth()
+        self.known: dict[Resident, float] = {}  # since when they may go
+        self.now_s = 10.0
+        self.number = 0
+
+    def any(self, draw: int) -> Resident:
+        return list(self.known)[draw % len(self.known)]
+
+    @precondition(lambda self: len(self.known) < FRONT)
+    @rule(score=st.integers(0, 5), last_use_s=st.integers(0, 5))
+    def enter(self, score: int, last_use_s: int) -> None:
+        self.number += 1
+        one = made(self.number, last_use_s)
+        self.worth.of_number[self.number] = score
+        self.known[one] = -math.inf
+        self.order.enter(one)
+
+    @precondition(lambda self: self.known)
+    @rule(draw=st.integers(0, 100))
+    def leave(self, draw: int) -> None:
+        one = self.any(draw)
+        del self.known[one]
+        self.order.leave(one)
+
+    @precondition(lambda self: self.known)
+    @rule(draw=st.integers(0, 100), delay_s=st.sampled_from([0.5, 2.0, math.inf]), graced=st.booleans())
+    def set_aside(self, draw: int, delay_s: float, graced: bool) -> None:
+        one = self.any(draw)
+        self.order.set_aside(one, self.order.graced if graced else self.order.aside, self.now_s + delay_s)
+        self.known[one] = self.now_s + delay_s
+
+    @precondition(lambda self: self.known)
+    @rule(draw=st.integers(0, 100))
+    def again(self, draw: int) -> None:
+        one = self.any(draw)
+        if one not in self.order.graced:
+            self.known[one] = -math.inf
+        self.order.again(one)
+
+    @rule()
+    def all_again(self) -> None:
+        self.order.all_again()
+        for one in self.known:
+            if one not in self.order.graced:
+                self.known[one] = -math.inf
+
+    @precondition(lambda self: self.known)
+    @rule(draw=st.integers(0, 100), held=st.booleans())
+    def use(self, draw: int, held: bool) -> None:
+        one = self.any(draw)
+        one.last_use_s = self.now_s
+        (one.sessions.add if held else one.sessions.discard)(7)
+
+    @precondition(lambda self: self.known)
+    @rule(draw=st.integers(0, 100), score=st.integers(0, 5))
+    def move(self, draw: int, score: int) -> None:
+        self.worth.of_number[self.any(draw).version] = score
+        self.worth.version += 1
+
+    @rule(seconds=st.sampled_from([0.0, 0.4, 3.0]))
+    def tick(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    @invariant()
+    def offered_as_sorted(self) -> None:
+        front = self.order.front(self.worth.score, self.now_s)
+        free = sorted((one for one, since in self.known.items() if since <= self.now_s), key=self.worth.rank)
+        assert set(front) == set(free)
+        assert [self.worth.rank(one) for one in front] == [self.worth.rank(one) for one in free]
+        assert len(self.order) == len(self.known)
+
+
+TestOrder = Machine.TestCase
+
+
+@pytest.mark.parametrize("count", [100, 5000])
+def test_all_of_many_in_order(count: int) -> None:
+    """While nothing moves, exactly as a sort says, also what came in between and was used since."""
+    random.seed(count)
+    order, worth = EvictionOrder(), Worth()
+    some = [made(number, random.random()) for number in range(count)]
+    for one in some:
+        worth.of_number[one.version] = random.random() * 100
+        order.enter(one)
+    while not order.settled:
+        order.score_new(worth.score)
+    for one in random.sample(some, count // 3):
+        one.last_use_s += 1.0
+    gone: list[Resident] = []
+    while front := order.front(worth.score, 0.0):
+        for one in front[:7]:
+            order.leave(one)
+            gone.append(one)
+    assert gone == sorted(some, key=worth.rank)
+
+
+def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
+    order, some = EvictionOrder(), [made(number) for number in range(count)]
+    for one in some:
+        worth.of_number[one.version] = float(one.version)
+        order.enter(one)
+    while not order.settled:
+        order.score_new(worth.score)
+    return order, some
+
+
+def test_when_clients_move_nothing_goes_by_an_old_score() -> None:
+    """What is worth keeping now stays although its score is old; what is worth less now is found later."""
+    worth = Worth()
+    order, some = settled(10_000, worth)
+    near, far = some[-FRONT:], some[:FRONT]
+    worth.version += 1
+    worth.of_number.update({one.version: 0.0 for one in near})
+    worth.of_number.update({one.version: 1e9 for one in far})
+    front = order.front(worth.score, 0.0)
+    assert front == some[-FRONT - 1 : -2 * FRONT - 1 : -1]
+    order.refresh(some[:BATCH], worth.score)
+    assert set(order.front(worth.score, 0.0)) == set(far)
+
+
+@pytest.mark.parametrize("count", [1000, 100_000])
+def test_the_work_for_a_victim_does_not_depend_on_how_many_there_are(count: int) -> None:
+    worth = Worth()
+    order, _ = settled(count, worth)
+    scored, calls = order.scored, worth.calls
+    for _ in range(100):
+        order.leave(order.front(worth.score, 0.0)[0])
+    assert order.scored == scored, "nothing has moved"
+    worth.version += 1  # everything may be elsewhere
+    worth.of_number = dict.fromkeys(worth.of_number, 1.0)
+    for _ in range(100):
+        before = order.scored
+        order.leave(order.front(worth.score, 0.0)[0])
+        assert order.scored - before <= TRIES * FRONT
+    assert worth.calls - calls <= 100 * TRIES
+    assert order.scored - scored <= 100 * TRIES * FRONT
+    assert len(order) == count - 200
+
+
+def test_so_many_come_back_at_a_time() -> None:
+    """Of those whose time has come, and of all that somebody spoke of."""
+    worth = Worth()
+    order, some = settled(4 * BATCH, worth)
+    for one in some:
+        order.set_aside(one, order.aside, 5.0)
+    assert order.front(worth.score, 4.0) == []
+    before = order.scored
+    assert len(order.front(worth.score, 5.0)) == FRONT
+    assert order.scored - before == BATCH
+    assert len(order.aside) == 3 * BATCH
+    order.all_again()
+    assert len(order.aside) == 0
+    order.front(worth.score, 5.0)
+    assert order.scored - before == BATCH, "there are enough"
+    order.score_new(worth.score)
+    assert order.scored - before == 2 * BATCH

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Getting memory back: a few segments at a time, large ones in another thread, every byte counted."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import select
+import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from shmmap.daemon.cache import closer
+from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
+from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, TICK_S, Reclaimer
+from shmmap.daemon.pins.watch import PinWatch
+from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.transport.sessions import Sessions
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.pins import prepare_process
+
+SMALL, LARGE = 4096, 1 << 20
+
+
+class Memory:
+    """The parts that make room, over real files; ``looks`` counts questions to the kernel."""
+
+    def __init__(self, directory: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
+        prepare_process()
+        self.directory = directory
+        self.ledger = Ledger(1 << 40)
+        self.pins = PinWatch(directory, events=True)
+        self.reclaimer = Reclaimer(self.ledger, directory, Sessions(), self.pins)
+        self.reclaimer.on_retired = lambda *_: None
+        self.reclaimer.on_gone = lambda *_: None
+        self.evictor = Evictor(self.reclaimer, POLICIES["lru"])
+        self.looks = 0
+        look = PinWatch.is_used_elsewhere
+
+        def counted(pins: PinWatch, fd: int) -> bool:
+            self.looks += 1
+            return look(pins, fd)
+
+        monkeypatch.setattr(PinWatch, "is_used_elsewhere", counted)
+
+    def publish(self, count: int, nbytes: int = SMALL) -> list[Resident]:
+        made = []
+        for number in range(len(self.ledger.segments), len(self.ledger.segments) + count):
+            name = f"/shmmap.unit.{number:016x}"
+            fd = self.directory.create()
+            os.posix_fallocate(fd, 0, nbytes)
+            self.directory.link(fd, name)
+            os.close(fd)
+            box = (0.0, 0.0, 1.0, 1.0)
+            made.append(Resident(name, Key(f"{number}", "points"), number, nbytes, 1, box, 0.0, 1.0))
+            self.ledger.enter(made[-1])
+        return made
+
+    def map(self, resident: Resident) -> mmap.mmap:
+        with self.directory.opened(self.reclaimer.name_on_disk(resident)) as fd:
+            return mmap.mmap(fd, SMALL, prot=mmap.PROT_READ)
+
+    def wait_for_the_thread(self) -> int:
+        assert select.select([self.reclaimer.closer.fd], [], [], 10.0)[0]
+        return self.reclaimer.collect()
+
+    def looked(self) -> int:
+        looks, self.looks = self.looks, 0
+        return looks
+
+
+@pytest.fixture
+def memory(shm: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Memory]:
+    one = Memory(shm, monkeypatch)
+    yield one
+    one.reclaimer.remove_all()
+    one.reclaimer.close()
+
+
+NOW_S = 100.0
+
+
+def test_a_large_segment_s_memory_counts_until_it_is_free(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is unlinked in the loop, and closed in the thread that is named for it; a small one here."""
+    may_close, closed_in = threading.Event(), list[str]()
+    close = os.close
+
+    def held_up(fd: int) -> None:
+        closed_in.append(threading.current_thread().name)
+        may_close.wait(10.0)
+        close(fd)
+
+    monkeypatch.setattr(closer, "os", SimpleNamespace(**{**vars(os), "close": held_up}))
+    (small,), (large,) = memory.publish(1), memory.publish(1, LARGE)
+    free_bytes = memory.directory.free_bytes()
+    for resident in (small, large):
+        assert memory.reclaimer.retire(resident, NOW_S)
+    ledger = memory.ledger
+    assert ledger.coming_bytes == ledger.used_bytes == SMALL + LARGE
+    assert memory.reclaimer.sweep(NOW_S + TICK_S) == SMALL
+    assert not ledger.retired
+    assert os.listdir(memory.directory.path) == []
+    assert (ledger.used_bytes, ledger.freeing_bytes, ledger.coming_bytes) == (LARGE, LARGE, LARGE)
+    assert memory.reclaimer.collect() == 0
+    assert memory.directory.free_bytes() < free_bytes + LARGE
+    assert memory.evictor.free(LARGE, NOW_S), "it is on its way"
+    may_close.set()
+    assert memory.wait_for_the_thread() == LARGE
+    assert (ledger.used_bytes, ledger.freeing_bytes, ledger.retired_bytes) == (0, 0, 0)
+    assert closed_in == ["shmmap-freeing"]
+    assert memory.directory.free_bytes() >= free_bytes + LARGE
+
+
+def test_so_many_wait_to_be_closed(memory: Memory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others keep their names, and count, until there is room for them."""
+    monkeypatch.setattr(closer, "MOST_WAITING", 3)
+    monkeypatch.setattr(closer.Closer, "_run", lambda _: None)  # nobody closes anything
+    large = memory.publish(5, LARGE)
+    for resident in large:
+        memory.reclaimer.retire(resident, NOW_S)
+    memory.reclaimer.sweep(NOW_S + TICK_S)
+    assert (len(memory.ledger.retired), memory.ledger.freeing_bytes) == (2, 3 * LARGE)
+    assert len(os.listdir(memory.directory.path)) == 2
+    assert memory.ledger.coming_bytes == memory.ledger.used_bytes == 5 * LARGE
+    waiting = memory.reclaimer.closer._to_close
+    while not waiting.empty():
+        item = waiting.get()
+        assert item is not None
+        os.close(item[0])
+
+
+def test_retired_segments_are_looked_at_a_few_at_a_time(memory: Memory) -> None:
+    """All that are due come to their turn."""
+    for resident in memory.publish(5 * LOOKS_AT_ONCE):
+        memory.reclaimer.retire(resident, NOW_S)
+    memory.looked()
+    for left in range(4, -1, -1):
+        assert memory.reclaimer.next_sweep_s() == NOW_S + TICK_S
+        memory.reclaimer.sweep(NOW_S + TICK_S)
+        assert memory.looked() == LOOKS_AT_ONCE
+        assert len(memory.ledger.retired) == left * LOOKS_AT_ONCE
+    assert memory.reclaimer.next_sweep_s() == float("inf")
+
+
+def test_what_a_client_lets_go_of_is_looked_at_a_few_at_a_time(memory: Memory) -> None:
+    """However much that is: by its word, by the kernel's, and when there were too many to tell which."""
+    some = memory.publish(3 * LOOKS_AT_ONCE)
+    mapped = [memory.map(resident) for resident in some]
+    for resident in some:
+        assert not memory.reclaimer.retire(resident, NOW_S)
+    while memory.reclaimer.next_sweep_s() <= NOW_S + TICK_S:
+        memory.reclaimer.sweep(NOW_S + TICK_S)
+    later_s = NOW_S + TICK_S + 1e-4
+    assert memory.reclaimer.next_sweep_s() > later_s
+    memory.looked()
+    for one in mapped[:LOOKS_AT_ONCE]:
+        one.close()
+    memory.reclaimer.let_go(some[: 2 * LOOKS_AT_ONCE], later_s)
+    assert memory.looked() == 0
+    memory.reclaimer.sweep(later_s)
+    assert memory.looked() == LOOKS_AT_ONCE
+    assert len(memory.ledger.retired) == 2 * LOOKS_AT_ONCE
+    for one in mapped:
+        one.close()
+    memory.pins.closed = lambda: None  # type: ignore[method-assign]
+    assert memory.reclaimer.hear(later_s)
+    assert memory.looked() == 0
+    for _ in range(8):
+        memory.reclaimer.sweep(later_s)
+        assert memory.looked() <= LOOKS_AT_ONCE
+    assert not memory.ledger.retired
+
+
+def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
+    """Somebody may be just opening it, whoever lets go of it meanwhile."""
+    (one,) = memory.publish(1)
+    mapped = memory.map(one)
+    assert not memory.reclaimer.retire(one, NOW_S)
+    mapped.close()
+    memory.reclaimer.let_go([one], NOW_S)
+    memory.reclaimer.hear(NOW_S)
+    assert memory.reclaimer.sweep(NOW_S + TICK_S / 2) == 0
+    assert memory.reclaimer.sweep(NOW_S + TICK_S) == SMALL
+
+
+def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
+    """Past whatever is mapped, needed or was just handed out, which is not looked at again and again."""
+    memory.ledger.budget_bytes = 0
+    used = memory.publish(2 * LOOKS_AT_ONCE)
+    mapped = [memory.map(resident) for resident in used]
+    needed, free = memory.publish(3), memory.publish(3)
+    for number, resident in enumerate((*used, *needed, *free)):
+        resident.last_use_s = number / 1e3
+    for resident in needed:
+        memory.ledger.need(resident.key)
+    for _ in range(2):
+        assert memory.evictor.free(SMALL, NOW_S)
+        assert memory.looked() == LOOKS_AT_ONCE
+        assert memory.evictor.wake_s == NOW_S, "it goes on at once"
+    for expected in free:
+        assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+        assert list(memory.ledger.retired) == [one.name for one in free[: free.index(expected) + 1]]
+    memory.looked()
+    assert not memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+    assert memory.looked() == 0, "nothing has changed"
+    memory.ledger.need_no_more(needed[0].key)
+    mapped[0].close()
+    memory.reclaimer.let_go(used[:1], NOW_S)
+    assert memory.evictor.free(memory.ledger.coming_bytes + 2 * SMALL, NOW_S)
+    assert {needed[0].name, used[0].name} <= set(memory.ledger.retired)
+    needed[1].last_use_s = NOW_S
+    memory.ledger.need_no_more(needed[1].key)
+    for _ in range(2):
+        assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+    assert memory.evictor.wake_s == NOW_S + HAND_OUT_GRACE_S
+    assert needed[1].name not in memory.ledger.retired
+    for one in mapped:
+        one.close()
+
+
+def test_the_walk_over_all_takes_changes_in_its_stride(memory: Memory) -> None:
+    """What is there all the time is found, whatever goes meanwhile; larger ones first."""
+    some: list[Any] = [*memory.publish(20), *memory.publish(20, LARGE)]
+    segments, seen = memory.ledger.segments, list[Resident]()
+    for resident in segments.walk():
+        seen.append(resident)
+        for gone in [one for one in some if one not in seen][:1]:
+            segments.remove(gone)
+            some.remove(gone)
+    assert set(some) <= set(seen)
+    assert [one.nbytes for one in seen] == sorted((one.nbytes for one in seen), reverse=True)
+    for resident in some:
+        segments.remove(resident)
+    for resident in [*memory.ledger.residents()]:
+        segments.add(resident)  # as it was
