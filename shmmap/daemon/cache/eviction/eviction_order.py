@@ -21,7 +21,7 @@ from shmmap.daemon.records import Resident
 
 __all__ = ["BATCH", "FRONT", "EvictionOrder", "Score", "SetAside"]
 
-FRONT: Final = 32
+FRONT: Final = 16
 """Segments offered at a time."""
 TRIES: Final = 4
 """How often the front is scored anew for one question, if its scores were outdated."""
