@@ -22,7 +22,6 @@ WORKER_STEPS: Final = (
     "worker.header",
     "worker.pass",
     "worker.passed",
-    "worker.done",
     "worker.check",
 )
 DAEMON_STEPS: Final = (

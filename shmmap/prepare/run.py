@@ -25,7 +25,8 @@ from shmmap.layers.spec import canonical_layers
 from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.origin.catalogue import Catalogue
 from shmmap.prepare import work
-from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
+from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import how_ended, start_child
 
 __all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map"]
 

@@ -25,7 +25,7 @@ from shmmap.layers.sources import CellSource, read_source
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.processes.packets import MAX_PACKET_BYTES
 
 __all__ = ["main"]
 

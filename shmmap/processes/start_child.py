@@ -10,12 +10,10 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from typing import Final
 
-__all__ = ["MAX_PACKET_BYTES", "channel", "how_ended", "start_child"]
+from shmmap.processes.packets import MAX_PACKET_BYTES
 
-MAX_PACKET_BYTES: Final = 1 << 19
-"""A job may name its cell and 65 neighbours by paths of 4095 bytes each."""
+__all__ = ["channel", "how_ended", "start_child"]
 
 
 def channel() -> tuple[socket.socket, socket.socket]:

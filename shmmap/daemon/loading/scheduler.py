@@ -22,7 +22,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Failed, Job, Need, Ready, Segment
+from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
@@ -204,41 +204,36 @@ class Scheduler:
         if received is None:
             return
         message, fd = received
-        if isinstance(message, Segment):
-            step("daemon.received")
-            worker.segment_fd, fd = fd, worker.segment_fd
-        if fd >= 0:
-            os.close(fd)
-        if isinstance(message, Ready):
-            worker.ready = True
-            worker.head_since_s = now_s
-            self.pool.failed_starts = 0
-        elif isinstance(message, Need):
-            self.room.ask(worker, message)
-            self.room.feed(self._jobs, now_s)
-        elif not isinstance(message, Segment):
-            self._on_end(worker, message, now_s)
-
-    def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
-        """A worker is done with a job, in whichever way."""
-        self.pool.finished(worker, message.number, now_s)
-        self.room.hungry.pop(message.number, None)
-        load = self._jobs.pop(message.number, None)
-        fd, worker.segment_fd = worker.segment_fd, -1
         try:
-            if load is None:
-                return
-            if isinstance(message, Checked):
-                self._on_checked(load, message, now_s)
-            elif isinstance(message, Failed):
-                self._fail(load, message.code, message.message, message.stamp, now_s)
-            elif fd >= 0:
-                self._publish(load, message, fd, now_s)
-            else:  # this process had no descriptor left to receive it
-                self._fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
+            if isinstance(message, Ready):
+                worker.ready = True
+                worker.head_since_s = now_s
+                self.pool.failed_starts = 0
+            elif isinstance(message, Need):
+                self.room.ask(worker, message)
+                self.room.feed(self._jobs, now_s)
+            else:
+                self._on_end(worker, message, fd, now_s)
         finally:
             if fd >= 0:
                 os.close(fd)
+
+    def _on_end(self, worker: Worker, message: Done | Checked | Failed, fd: int, now_s: float) -> None:
+        """A worker is done with a job, in whichever way; ``fd`` is the segment, -1 for none."""
+        self.pool.finished(worker, message.number, now_s)
+        self.room.hungry.pop(message.number, None)
+        load = self._jobs.pop(message.number, None)
+        if load is None:
+            return
+        if isinstance(message, Checked):
+            self._on_checked(load, message, now_s)
+        elif isinstance(message, Failed):
+            self._fail(load, message.code, message.message, message.stamp, now_s)
+        elif fd >= 0:
+            step("daemon.received")
+            self._publish(load, message, fd, now_s)
+        else:  # this process had no descriptor left to receive it
+            self._fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
 
     def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
         """Have a finished segment handed out from now on."""

@@ -31,7 +31,7 @@ from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
@@ -55,6 +55,7 @@ class _Worker:
     cache: LayerCache | None
     _waiting: list[worker_messages.Job | worker_messages.Check] = field(default_factory=list)
     _light: bool = False
+    _buffer: bytearray = field(default_factory=packet_buffer)
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
@@ -70,7 +71,7 @@ class _Worker:
                 self._check(job)
 
     def _receive(self) -> worker_messages.ToWorker | None:
-        data = self.channel.recv(MAX_PACKET_BYTES)
+        data, _ = receive_packet(self.channel, self._buffer)
         return worker_messages.decode_to_worker(data) if data else None
 
     def _send(self, message: worker_messages.FromWorker, fd: int | None = None) -> None:
@@ -112,13 +113,12 @@ class _Worker:
                     tuple(warning[:500] for warning in made.warnings[:20]),
                     tuple(stamp.token for stamp in made.neighbours), made.cached,
                 )  # fmt: skip
+                lock_slot(fd, LOADER_SLOT)
                 step("worker.pass")
-                self._send(worker_messages.Segment(), fd)
+                self._send(done, fd)
                 step("worker.passed")
             finally:
                 os.close(fd)
-            self._send(done)
-            step("worker.done")
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except Offline as error:

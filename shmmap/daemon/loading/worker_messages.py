@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the daemon and its loader workers say to each other.
 
-One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Segment`
+One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Done`
 also carries the finished segment's file descriptor.  Both ends are always the same version of shmmap,
 so this is no public protocol.
 """
@@ -25,7 +25,6 @@ __all__ = [
     "Job",
     "Need",
     "Ready",
-    "Segment",
     "ToWorker",
     "decode_from_worker",
     "decode_to_worker",
@@ -82,14 +81,11 @@ class Need(msgspec.Struct, array_like=True, tag="need"):
     bytes: int
 
 
-class Segment(msgspec.Struct, array_like=True, tag="segment"):
-    """A finished segment, as the descriptor that comes with the packet; `Done` follows."""
-
-
 class Done(msgspec.Struct, array_like=True, tag="done"):
-    """The segment sent just before is finished, and the worker has closed its own descriptor of it.
+    """A finished segment: the descriptor that comes with the packet.
 
-    That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
+    The worker closes its own at once.  Until it has, the kernel takes the segment for one in use; whose use
+    that is shows by the lock of `shmmap.segment.pins.LOADER_SLOT`.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
     the disk cache.
@@ -130,7 +126,7 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
 
 
 ToWorker: TypeAlias = Job | Check | Decision
-FromWorker: TypeAlias = Ready | Need | Segment | Done | Checked | Failed
+FromWorker: TypeAlias = Ready | Need | Done | Checked | Failed
 
 encode: Final = msgspec.msgpack.Encoder().encode
 decode_to_worker: Final = msgspec.msgpack.Decoder[ToWorker](ToWorker).decode

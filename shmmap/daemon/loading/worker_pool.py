@@ -19,7 +19,8 @@ from shmmap import __version__
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.logfmt import log
-from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
+from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import how_ended, start_child
 
 __all__ = ["Worker", "WorkerPool"]
 
@@ -49,8 +50,7 @@ def _installed() -> tuple[int, int] | None:
 class Worker:
     """One worker process; ``queue`` holds its jobs, the first is the one it works on.
 
-    ``segment_fd`` is the segment whose `worker_messages.Done` has yet to come, ``foreign`` says that it
-    is of another version of shmmap.
+    ``foreign`` says that it is of another version of shmmap.
     """
 
     process: subprocess.Popen[bytes]
@@ -58,7 +58,6 @@ class Worker:
     queue: OrderedDict[int, worker_messages.Job | worker_messages.Check] = field(default_factory=OrderedDict)
     head_since_s: float = 0.0
     ready: bool = False
-    segment_fd: int = -1
     foreign: bool = False
 
     @property
@@ -103,6 +102,7 @@ class WorkerPool:
     _workers: dict[int, Worker] = field(default_factory=dict)
     _ending: list[subprocess.Popen[bytes]] = field(default_factory=list)
     _program: tuple[int, int] | None = field(default_factory=_installed)
+    _buffer: bytearray = field(default_factory=packet_buffer)
 
     def __len__(self) -> int:
         return len(self._workers)
@@ -171,7 +171,7 @@ class WorkerPool:
         """
         while True:
             try:
-                data, fds, _flags, _address = socket.recv_fds(worker.channel, MAX_PACKET_BYTES, 1)
+                data, fd = receive_packet(worker.channel, self._buffer)
                 break
             except ConnectionResetError:
                 continue  # told once, before what the dead worker had still said
@@ -181,10 +181,7 @@ class WorkerPool:
                 raise EOFError from error
         if not data:
             raise EOFError
-        fd = fds[0] if fds else -1
         try:
-            if fd >= 0:
-                os.set_inheritable(fd, False)
             message = worker_messages.decode_from_worker(data)
         except msgspec.MsgspecError as error:
             log.error("loader ended", reason="its message cannot be read", error=error)
@@ -206,8 +203,6 @@ class WorkerPool:
         self.watched.unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
-        if worker.segment_fd >= 0:
-            os.close(worker.segment_fd)
         worker.process.kill()
         try:
             how = how_ended(worker.process.wait(END_PATIENCE_S))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The daemon's pulse: a few times a second what it keeps is measured and written to the statistics.
 
-It beats from the serving loop itself, so that whoever is hung does not beat.
+It beats from the serving loop itself, so that whoever is hung does not beat.  While cells come and go it
+beats more often, and lightly: only what has changed is written then.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Sampler:
     waiting
         Whose length is the number of requests that wait for loads.
     on_beat
-        Called after each beat.
+        Called after each whole beat.
     """
 
     cache: CellCache
@@ -51,8 +52,8 @@ class Sampler:
     waiting: Sized
     on_beat: Callable[[], None]
     next_s: float = 0.0
+    _whole_s: float = 0.0
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
-    _looked_s: float = float("-inf")
     _told_s: float = float("-inf")
     _last_s: float = 0.0
 
@@ -61,9 +62,13 @@ class Sampler:
         if self.cache.statistics.outdated:
             # whoever asks right after a change sees it, yet a stream of changes costs little
             self.next_s = min(self.next_s, self._last_s + CHANGE_BEAT_S)
-        if now_s >= self.next_s:
-            self._last_s, self.next_s = now_s, now_s + BEAT_S
-            self._beat(now_s)
+        if now_s < self.next_s:
+            return
+        whole = now_s >= self._whole_s
+        if whole:
+            self._whole_s = now_s + BEAT_S
+        self._last_s, self.next_s = now_s, self._whole_s
+        self._beat(now_s, whole=whole)
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
@@ -89,7 +94,6 @@ class Sampler:
 
     def _look_around(self, now_s: float) -> None:
         """What takes longer, and need not be done at each of many beats while cells load."""
-        self._looked_s = now_s
         cache, values = self.cache, self.cache.statistics.values
         if cache.survey.idle:  # else the serving loop is at it
             cache.survey.step()
@@ -112,11 +116,12 @@ class Sampler:
             if cache.ledger.resident_named(resident.name) is resident:
                 cache.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
 
-    def _beat(self, now_s: float) -> None:
+    def _beat(self, now_s: float, *, whole: bool) -> None:
         self.measure()
-        if now_s - self._looked_s >= BEAT_S:
+        if whole:
             self._look_around(now_s)
+            self._show_used()
         self.cache.ledger.overhead_bytes = self.cache.statistics.size_bytes
-        self._show_used()
         self.cache.statistics.beat()
-        self.on_beat()
+        if whole:
+            self.on_beat()

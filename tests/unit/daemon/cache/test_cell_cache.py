@@ -20,7 +20,8 @@ from shmmap.daemon.records import Failure, Key
 from shmmap.layers.derive import CellJob, Neighbour
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
-from shmmap.processes.start_child import MAX_PACKET_BYTES, channel
+from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import channel
 from shmmap.protocol.messages import Area, CircleMessage, Selected
 from shmmap.segment.layout import SourceStamp
 from tests.support.daemon_process import wait_readable
@@ -161,8 +162,7 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     ask(one, 1)
     first, second = puppet.queue(4)[:2]
     fd = puppet.segment()
-    puppet.say(worker_messages.Segment(), fd)
-    puppet.say(puppet.done(first))
+    puppet.say(puppet.done(first), fd)
     os.close(fd)
     puppet.channel.close()
     puppet.worker.process.kill()
@@ -280,8 +280,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
     puppet.say(worker_messages.Need(queue[0].number, -5))
     for job in queue:
         fd = puppet.segment()
-        puppet.say(worker_messages.Segment(), fd)
-        puppet.say(puppet.done(job))
+        puppet.say(puppet.done(job), fd)
         os.close(fd)
     assert len(one.cells_of(1).cells) == 4
     packets = [puppet.channel.recv(65536) for _ in range(5)]

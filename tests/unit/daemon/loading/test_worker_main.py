@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from shmmap.daemon.loading import worker_messages
-from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import in_use, prepare_process
+from shmmap.segment.pins import LOADER_SLOT, holders, in_use, prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.version import cell_version
 from tests.support.daemon_process import wait_ended, wait_readable
@@ -62,16 +62,12 @@ class Loader:
         self.channel.send(worker_messages.encode(message))
 
     def receive(self) -> tuple[worker_messages.FromWorker, int]:
-        """Return the next message; with `worker_messages.Done`, the descriptor that came before it."""
-        kept = -1
-        while True:
-            data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
-            assert data, "the loader closed its channel"
-            message = worker_messages.decode_from_worker(data)
-            assert bool(fds) is isinstance(message, worker_messages.Segment)
-            if not isinstance(message, worker_messages.Segment):
-                return message, kept
-            (kept,) = fds
+        """Return the next message; with `worker_messages.Done`, the descriptor that came with it."""
+        data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
+        assert data, "the loader closed its channel"
+        message = worker_messages.decode_from_worker(data)
+        assert bool(fds) is isinstance(message, worker_messages.Done)
+        return message, fds[0] if fds else -1
 
     def load(self, number: int, path: Path, granted: int = 1 << 30) -> None:
         self.send(worker_messages.Job(number, str(path), str(path), "points", BOX, "map", granted))
@@ -262,15 +258,21 @@ def test_idle_it_is_small_and_polite(loader: Loader) -> None:
 
 
 def test_it_does_not_keep_what_it_passed_on(loader: Loader, tmp_path: Path) -> None:
-    """An open file would look like a reader's pin: once it says "done" ours is the only one."""
+    """An open file would look like a reader's pin: once it says the next word ours is the only one.
+
+    Until then a lock tells whose the file is.
+    """
+    opened = []
     for number in range(20):
         loader.load(number, cell(tmp_path / f"{number}.pcd", 10))
         done, fd = loader.receive()
-        try:
-            assert isinstance(done, worker_messages.Done)
-            again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY)
-        finally:
-            os.close(fd)
+        assert isinstance(done, worker_messages.Done)
+        opened.append(os.open(f"/proc/self/fd/{fd}", os.O_RDONLY))
+        assert holders(opened[-1]) == [LOADER_SLOT]
+        os.close(fd)
+    loader.load(99, tmp_path / "none.pcd")
+    assert isinstance(loader.receive()[0], worker_messages.Failed)
+    for again in opened:
         assert not in_use(again)
         os.close(again)
 

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packets with and without a descriptor, into one buffer."""
+
+from __future__ import annotations
+
+import os
+import socket
+import tracemalloc
+
+import pytest
+
+from shmmap.processes.packets import MAX_PACKET_BYTES, packet_buffer, receive_packet
+from shmmap.processes.start_child import channel
+
+
+def test_a_descriptor_comes_with_its_packet_and_is_not_inherited() -> None:
+    ours, theirs = channel()
+    read, write = os.pipe()
+    buffer = packet_buffer()
+    with ours, theirs:
+        ours.send(b"first")
+        socket.send_fds(ours, [b"second"], [write])
+        data, fd = receive_packet(theirs, buffer)
+        assert (bytes(data), fd) == (b"first", -1)
+        data, fd = receive_packet(theirs, buffer)
+        assert bytes(data) == b"second"
+        assert not os.get_inheritable(fd)
+        os.write(fd, b"x")
+        assert os.read(read, 1) == b"x"
+        ours.close()
+        data, none = receive_packet(theirs, buffer)
+        assert (len(data), none) == (0, -1)
+    for one in (read, write, fd):
+        os.close(one)
+
+
+def test_of_several_descriptors_only_one_comes() -> None:
+    """A loader that has gone mad must not fill the daemon's table."""
+    ours, theirs = channel()
+    with ours, theirs:
+        before = len(os.listdir("/proc/self/fd"))
+        socket.send_fds(ours, [b"x"], [0] * 10)
+        _, fd = receive_packet(theirs, packet_buffer())
+        after = len(os.listdir("/proc/self/fd"))
+        os.close(fd)
+    assert after - before == 1
+
+
+def test_the_longest_packet_arrives_and_short_ones_take_no_memory() -> None:
+    ours, theirs = channel()
+    buffer = packet_buffer()
+    with ours, theirs:
+        longest = bytes(MAX_PACKET_BYTES - 1024)
+        ours.send(longest)
+        assert receive_packet(theirs, buffer)[0] == longest
+        theirs.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            receive_packet(theirs, buffer)
+        ours.send(b"short")
+        tracemalloc.start()
+        receive_packet(theirs, buffer)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 1 << 16
