@@ -16,7 +16,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.host.budget import choose_budget
+from shmmap.daemon.host.budget import choose_budget, loader_bytes
 from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.scheduler import Scheduler
@@ -68,11 +68,12 @@ class MapInMemory:
             map_version=catalogue.map_version, shm_dir=directory.path, id_prefix=catalogue.id_prefix,
             library_version=__version__, started_unix_ns=time.time_ns(), frame_id=catalogue.frame_id,
         )  # fmt: skip
+        group_limit = memory_limit_bytes()
         budget = choose_budget(  # may refuse: before anything has a name
             config.budget_bytes,
             directory,
             ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
-            limit_bytes=memory_limit_bytes(),
+            limit_bytes=group_limit,
         )
         try:
             self.statistics = StatisticsWriter(directory, config.instance, self.identity, mode=mode, gid=gid)
@@ -99,6 +100,7 @@ class MapInMemory:
         self.watched = WatchedDescriptors()
         pool = WorkerPool(
             config.loaders(), directory.path, config.load_timeout_s, self.watched,
+            memory_bytes=loader_bytes(group_limit),
             cache_dir=config.cache_dir, cache_bytes=config.cache_bytes,
         )  # fmt: skip
         self.map_switch = MapSwitch(self.cache)

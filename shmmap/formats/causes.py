@@ -26,6 +26,7 @@ CAUSES: Final[dict[str, str]] = {
     "no_xyz": "no usable x, y and z",
     "unknown_encoding": "a DATA encoding that PCD does not have",
     "too_many_points": "more points than the format can mean",
+    "too_large": "more points than a layer is computed of",
     "changed": "the file changed while it was being read",
     "truncated": "the file ends before its data does",
     "bad_lzf": "the compressed block contradicts its sizes or cannot be decompressed",

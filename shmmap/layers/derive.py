@@ -96,12 +96,12 @@ def derive(
     """
     if source is None:
         source = read_source(job.path, job.box, spec.source_columns)
-    points = source.points
+    points, warnings = source.points, source.warnings
     around: tuple[tuple[SourceStamp, bytes], ...] = ()
     if job.neighbours:
-        points.halo, around = read_halo(
-            [near.path for near in job.neighbours], job.box, spec.halo_m, points.xyz.dtype
-        )
+        paths = [near.path for near in job.neighbours]
+        halo = read_halo(paths, job.box, spec.halo_m, points.xyz.dtype)
+        points.halo, around, warnings = halo.xyz, halo.files, (*warnings, *halo.warnings)
     table = build_spec(spec, points)
     header = write_table(
         fd,
@@ -124,4 +124,4 @@ def derive(
         z_max=source.z_max,
         reserve=reserve,
     )
-    return Derived(header, tuple(stamp for stamp, _ in around), source.warnings)
+    return Derived(header, tuple(stamp for stamp, _ in around), warnings)

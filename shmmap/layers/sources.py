@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,18 @@ from shmmap.errors import MapDataError, SegmentCorrupt
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers.contract import Box, PointTable
+from shmmap.quantities import format_bytes
 from shmmap.segment.layout import NO_SOURCE, SourceStamp
 from shmmap.segment.verify import read_header
 
-__all__ = ["CellSource", "read_halo", "read_segment", "read_source", "state_of"]
+__all__ = ["MOST_SOURCE_BYTES", "CellSource", "Halo", "read_halo", "read_segment", "read_source", "state_of"]
+
+MOST_SOURCE_BYTES: Final = 1 << 30
+"""Points of one cell, uncompressed, that a layer is computed of: all of them are in a process's memory then.
+
+A compressed file of a few megabytes may claim more.  A cloud that is served as one cell has fewer."""
+
+_SMALLER: Final = "divide the map into smaller cells"
 
 
 @dataclass(slots=True)
@@ -41,9 +49,10 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
     Raises
     ------
     MapDataError
-        If the file cannot be read, or changed meanwhile (cause ``changed``).
+        If the file cannot be read, is too large (cause ``too_large``), or changed meanwhile (``changed``).
     """
     with PcdReader(path) as reader:
+        _check_size(reader.header.points * reader.header.point_bytes, path)
         stamp = SourceStamp.of(os.fstat(reader.fileno()))
         wanted = [i for i, spec in enumerate(reader.columns) if needs is None or spec.name in needs]
         specs = [reader.columns[i] for i in wanted]
@@ -82,12 +91,15 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
 
     Raises
     ------
+    MapDataError
+        If it is too large (cause ``too_large``).
     SegmentCorrupt
         If its header is not whole, or it is shorter than that says.
     OSError
         If it cannot be read.
     """
     header, _ = read_header(fd)
+    _check_size(sum(column.nbytes for column in header.columns), header.cell_id)
     columns: dict[str, NDArray[Any]] = {}
     for column in header.columns:
         if needs is None or column.name in needs:
@@ -111,23 +123,52 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
     )
 
 
-def read_halo(
-    paths: Sequence[str], box: Box, halo_m: float, dtype: np.dtype[Any]
-) -> tuple[NDArray[Any], tuple[tuple[SourceStamp, bytes], ...]]:
-    """Read the neighbours' points within ``halo_m`` of a cell's box, (M, 3) of ``dtype``.
+@dataclass(slots=True)
+class Halo:
+    """Points around a cell.
 
-    Also returns each neighbour's stamp and digest.  One that cannot be read has no points, the stamp of
-    before the attempt and a digest of zeros: it must not cost its neighbours their layers.
+    Attributes
+    ----------
+    xyz
+        (M, 3), of the cell's dtype.
+    files
+        Each neighbour's stamp and digest.
+    warnings
+        Which neighbours have no points here, and why.
+    """
+
+    xyz: NDArray[Any]
+    files: tuple[tuple[SourceStamp, bytes], ...]
+    warnings: tuple[str, ...]
+
+
+def read_halo(paths: Sequence[str], box: Box, halo_m: float, dtype: np.dtype[Any]) -> Halo:
+    """Read the neighbours' points within ``halo_m`` of a cell's box, as ``dtype``.
+
+    One that cannot be read has no points, the stamp of before the attempt and a digest of zeros: it must
+    not cost its neighbours their layers.
+
+    Raises
+    ------
+    MapDataError
+        If there is not enough memory for a neighbour: another time there may be, so that no layer is
+        made without it.
     """
     found: list[NDArray[Any]] = [np.empty((0, 3), dtype)]
     seen: list[tuple[SourceStamp, bytes]] = []
+    warnings: list[str] = []
     for path in paths:
         before = state_of(path)  # afterwards it may be that of a file that nobody has read
         try:
             source = read_source(path, box, ("xyz",))
-        except MapDataError:
+        except MapDataError as error:
             seen.append((before, bytes(16)))
+            warnings.append(f"made without a neighbour: {error.message}")
             continue
+        except MemoryError as error:
+            raise refusal(
+                "too_large", "this neighbour takes more memory than there is", path=path, hint=_SMALLER
+            ) from error
         xyz = source.points.xyz
         x, y = xyz[:, 0], xyz[:, 1]
         inside = (
@@ -135,7 +176,18 @@ def read_halo(
         )
         found.append(xyz[inside].astype(dtype))
         seen.append((source.stamp, source.digest))
-    return np.concatenate(found), tuple(seen)
+    return Halo(np.concatenate(found), tuple(seen), tuple(warnings))
+
+
+def _check_size(nbytes: int, name: str) -> None:
+    if nbytes > MOST_SOURCE_BYTES:
+        raise refusal(
+            "too_large",
+            f"a layer is computed of at most {format_bytes(MOST_SOURCE_BYTES)} of points, not of"
+            f" {format_bytes(nbytes)}",
+            path=name,
+            hint=_SMALLER,
+        )
 
 
 def state_of(path: str) -> SourceStamp:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much shared memory the daemon may use."""
+"""How much memory the daemon may use: shared by cells, and private to each of its loaders."""
 
 from __future__ import annotations
 
@@ -9,19 +9,34 @@ from typing import Final
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["choose_budget"]
+__all__ = ["choose_budget", "loader_bytes"]
 
 DEFAULT_CEILING_BYTES: Final = 4 << 30
 RESERVE_BYTES: Final = 256 << 20
 SMALLEST_BYTES: Final = 1 << 20
 LARGEST: Final = 1 << 62
+LOADER_BYTES: Final = (2 << 30, 8 << 30)
+"""Least and most that a loader may use: a layer of the largest cell takes some 3 GiB."""
 
 
-def _available_bytes() -> int:
+def _memory_bytes(which: str) -> int:
     for line in Path("/proc/meminfo").read_text().splitlines():
-        if line.startswith("MemAvailable:"):
+        if line.startswith(f"{which}:"):
             return int(line.split()[1]) * 1024
     return DEFAULT_CEILING_BYTES
+
+
+def loader_bytes(limit_bytes: int | None) -> int:
+    """Return how much private memory each loader may use: a quarter of the machine's, from 2 to 8 GiB.
+
+    Parameters
+    ----------
+    limit_bytes
+        Memory limit of the control group; None for none.
+    """
+    total = _memory_bytes("MemTotal")
+    least, most = LOADER_BYTES
+    return min(max(least, min(total, limit_bytes or total) // 4), most)
 
 
 def choose_budget(
@@ -81,7 +96,7 @@ def choose_budget(
                 f"a budget of {asked_bytes} bytes is too small", key="budget", hint="use at least 1M"
             )
         return asked_bytes
-    budget = min((_available_bytes() + ours_bytes) // 4, DEFAULT_CEILING_BYTES, room)
+    budget = min((_memory_bytes("MemAvailable") + ours_bytes) // 4, DEFAULT_CEILING_BYTES, room)
     if budget < SMALLEST_BYTES:
         raise CannotStart(
             f"{directory.path} has only {free} bytes free",

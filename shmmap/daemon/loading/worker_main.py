@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import resource
 import signal
 import socket
 import sys
@@ -32,6 +33,7 @@ from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
@@ -129,7 +131,9 @@ class _Worker:
             code = "no_space" if is_full(error) else "load_failed"
             self._fail(job, code, f"{job.path}: {error.strerror or error}")
         except MemoryError:
-            self._fail(job, "load_failed", f"{job.path}: loading it ran out of memory")
+            most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])
+            why = f"making {job.layer} takes more than the {most} of memory that a loader may use"
+            self._fail(job, "load_failed", f"{job.path}: {why} (divide the map into smaller cells)")
         except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one cell
             self._fail(job, "load_failed", f"{job.path}: building {job.layer} failed: {error!r}")
 
@@ -200,10 +204,19 @@ def _test_hook(path: str) -> None:
             signal.pause()
 
 
+def _limit_memory(nbytes: int) -> None:
+    """Let what goes beyond it fail in this process, as an error of the cell it works on."""
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard != resource.RLIM_INFINITY:
+        nbytes = min(nbytes, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (nbytes, nbytes))
+
+
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR [CACHE_DIR CACHE_BYTES]``."""
+    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR MEMORY_BYTES [CACHE_DIR CACHE_BYTES]``."""
     channel_fd, parent, shm_dir = int(arguments[0]), int(arguments[1]), arguments[2]
     die_with(parent)
+    _limit_memory(int(arguments[3]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     signal.signal(signal.SIGIO, signal.SIG_IGN)
     os.nice(_NICENESS)
@@ -212,7 +225,7 @@ def main(arguments: list[str]) -> int:
         score.write(_OOM_SCORE)
     channel = socket.socket(fileno=channel_fd)
     try:
-        cache = LayerCache(arguments[3], limit_bytes=int(arguments[4])) if len(arguments) > 4 else None
+        cache = LayerCache(arguments[4], limit_bytes=int(arguments[5])) if len(arguments) > 5 else None
         _Worker(channel, ShmDirectory(shm_dir), cache).run()
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.ECONNRESET):

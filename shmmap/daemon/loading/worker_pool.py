@@ -78,6 +78,8 @@ class WorkerPool:
         Where they make segments.
     deadline_s
         How long one load may take; then its worker is killed.
+    memory_bytes
+        How much private memory each may use.
     cache_dir, cache_bytes
         Where finished layers are kept, and at most how much of them; empty or 0: nowhere.
     watched
@@ -95,6 +97,7 @@ class WorkerPool:
     shm_dir: str
     deadline_s: float
     watched: WatchedDescriptors
+    memory_bytes: int = 2 << 30
     cache_dir: str = ""
     cache_bytes: int = 0
     on_message: Callable[[Worker], None] = field(init=False)
@@ -127,8 +130,9 @@ class WorkerPool:
         """Start a worker process."""
         cache = (self.cache_dir, str(self.cache_bytes)) if self.cache_dir and self.cache_bytes else ()
         process, ours = start_child(
-            "shmmap.daemon.loading.worker_main", self.shm_dir, *cache, new_session=True
-        )
+            "shmmap.daemon.loading.worker_main", self.shm_dir, str(self.memory_bytes), *cache,
+            new_session=True,
+        )  # fmt: skip
         ours.setblocking(False)
         worker = Worker(process, ours)
         self._workers[worker.fd] = worker

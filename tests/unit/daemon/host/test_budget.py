@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.host.budget import choose_budget
+from shmmap.daemon.host.budget import choose_budget, loader_bytes
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
@@ -104,3 +104,14 @@ def test_what_an_earlier_life_left_counts_as_free(shm: str) -> None:
     assert choose(shm, 64 << 20, 64 << 20, 4 << 20, ours=60 << 20) == 64 << 20
     with pytest.raises(CannotStart):
         choose(shm, 64 << 20, 64 << 20, 4 << 20, ours=59 << 20)
+
+
+@pytest.mark.parametrize(
+    ("total_gib", "limit_gib", "expected_gib"),
+    [(4, None, 2), (16, None, 4), (16, 12, 3), (16, 64, 4), (256, None, 8), (256, 1, 2)],
+)
+def test_what_a_loader_may_use(
+    monkeypatch: pytest.MonkeyPatch, total_gib: int, limit_gib: int | None, expected_gib: int
+) -> None:
+    monkeypatch.setattr("shmmap.daemon.host.budget._memory_bytes", lambda _which: total_gib << 30)
+    assert loader_bytes(None if limit_gib is None else limit_gib << 30) == expected_gib << 30

@@ -35,8 +35,8 @@ COMMAND = [sys.executable, "-m", "shmmap.daemon.loading.worker_main"]
 
 PARENT = """
 import os, subprocess, sys
-program, channel, shm_dir = sys.argv[1:]
-command = [program, "-m", "shmmap.daemon.loading.worker_main", channel, str(os.getpid()), shm_dir]
+program, channel, *rest = sys.argv[1:]
+command = [program, "-m", "shmmap.daemon.loading.worker_main", channel, str(os.getpid()), *rest]
 child = subprocess.Popen(command, pass_fds=[int(channel)])
 print(child.pid, flush=True)
 child.wait()
@@ -46,11 +46,11 @@ child.wait()
 class Loader:
     """One loader process and our end of its channel."""
 
-    def __init__(self, shm_dir: str, **environment: str) -> None:
+    def __init__(self, shm_dir: str, memory_bytes: int = 2 << 30, **environment: str) -> None:
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.settimeout(PATIENCE_S)
         self.process = subprocess.Popen(
-            [*COMMAND, str(theirs.fileno()), str(os.getpid()), shm_dir],
+            [*COMMAND, str(theirs.fileno()), str(os.getpid()), shm_dir, str(memory_bytes)],
             pass_fds=(theirs.fileno(),),
             env={**ENVIRONMENT, **environment},
             stderr=subprocess.DEVNULL,
@@ -209,13 +209,45 @@ def test_the_crash_hook(shm_dir: str, tmp_path: Path) -> None:
         one.end()
 
 
+def compressed(path: Path, points: int) -> Path:
+    """Write zeros, packed: LZF makes 264 bytes of three."""
+    runs, rest = divmod((points - 1) * 12, 264)
+    assert not rest
+    body = b"\x0b" + bytes(12) + b"\xe0\xff\0" * runs
+    header = (
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA binary_compressed\n"
+    )
+    path.write_bytes(header.encode() + struct.pack("<II", len(body), points * 12) + body)
+    return path
+
+
+def test_a_cell_that_takes_too_much_memory_fails_alone(shm_dir: str, tmp_path: Path) -> None:
+    one = Loader(shm_dir, 256 << 20)
+    try:
+        large = compressed(tmp_path / "large.pcd", 22 * 1_600_000 + 1)
+        one.load(1, large, 1 << 40)
+        one.load(2, cell(tmp_path / "good.pcd", 10))
+        failed, _ = one.receive()
+        assert isinstance(failed, worker_messages.Failed)
+        assert (failed.number, failed.code) == (1, "load_failed")
+        assert str(large) in failed.message
+        assert "256 MiB of memory that a loader may use (divide the map" in failed.message
+        done, fd = one.receive()
+        os.close(fd)
+        assert isinstance(done, worker_messages.Done)
+        assert one.peak_bytes() < 256 << 20
+    finally:
+        one.end()
+
+
 def test_it_dies_with_its_parent(shm_dir: str) -> None:
     """Killed, the parent can close nothing; and we still hold the other end of the channel open."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.settimeout(PATIENCE_S)
     parent = subprocess.Popen(
         [
-            sys.executable, "-c", PARENT, sys.executable, str(theirs.fileno()), shm_dir,
+            sys.executable, "-c", PARENT, sys.executable, str(theirs.fileno()), shm_dir, str(2 << 30),
         ],
         pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, text=True, env=ENVIRONMENT,
     )  # fmt: skip
@@ -240,7 +272,7 @@ def test_one_that_started_too_late_ends_at_once(shm_dir: str) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         code = subprocess.run(
-            [*COMMAND, str(theirs.fileno()), "1", shm_dir],
+            [*COMMAND, str(theirs.fileno()), "1", shm_dir, str(2 << 30)],
             pass_fds=(theirs.fileno(),),
             env=ENVIRONMENT,
             check=False,
