@@ -19,6 +19,7 @@ from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.budget import choose_budget, loader_bytes
 from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.loading.adoption import Adoption
+from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
@@ -98,11 +99,10 @@ class MapInMemory:
             instance=config.instance, mode=mode, gid=gid,
         )  # fmt: skip
         self.watched = WatchedDescriptors()
-        pool = WorkerPool(
-            config.loaders(), directory.path, config.load_timeout_s, self.watched,
-            memory_bytes=loader_bytes(group_limit),
-            cache_dir=config.cache_dir, cache_bytes=config.cache_bytes,
-        )  # fmt: skip
+        cache = (config.cache_dir, str(config.cache_bytes)) if config.cache_dir else ()
+        parent = PreparedParent((directory.path, str(loader_bytes(group_limit)), *cache), self.watched)
+        parent.start()  # it imports what loaders need while this process gets ready
+        pool = WorkerPool(config.loaders(), parent, config.load_timeout_s, self.watched)
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(self.cache, self.map_switch, pool, clock=time.monotonic)
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())

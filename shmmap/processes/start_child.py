@@ -47,10 +47,12 @@ def start_child(
     ours, theirs = channel()
     try:
         with theirs, _interrupts_blocked():
-            # one worker, one core: Open3D would start a thread for each
+            # one worker, one core: Open3D would start a thread for each, and so would numpy's OpenBLAS, whose
+            # threads spin for a while after they were started
             environment = {
                 "OMP_NUM_THREADS": "1",
                 **os.environ,
+                "OPENBLAS_NUM_THREADS": "1",
                 "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
             }
             process = subprocess.Popen(

@@ -40,7 +40,7 @@ def assert_outcomes(
 ) -> None:
     """Ask for each cell alone, then all at once; None stands for a refusal, else points in the file."""
     client.area(circle(0, 0, 5))
-    (loader,) = one.children()
+    (loader,) = one.loaders()
     idle = peak_bytes(loader)
     for name, points in expected.items():
         reply = client.selected([name])
@@ -55,7 +55,7 @@ def assert_outcomes(
             assert segment.fields["source_points"] == points, name
             assert handle.points == points - segment.fields["dropped_points"]
             assert np.isfinite(segment.columns["xyz"]).all()
-    assert one.children() == [loader]  # none of them cost a loader its life
+    assert one.loaders() == [loader]  # none of them cost a loader its life
     assert peak_bytes(loader) - idle < (100 << 20) + largest
     everything = client.area(circle(0, 0, 1e5))
     assert {f.id.rsplit("/", 1)[-1] for f in everything.failed} == {

@@ -111,11 +111,32 @@ def test_idle_loaders_that_are_killed_are_replaced(
     one = daemon(divided_map.root)
     client = connect(one)
     client.area(circle(0, 0, 25))
-    for pid in one.children():
+    for pid in one.loaders():
         os.kill(pid, signal.SIGKILL)
         assert wait_ended(pid)
     reply = client.area(circle(0, 0, 200))
     assert (len(reply.cells), reply.failed) == (36, [])
+
+
+def test_the_loaders_parent_is_killed(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Its loaders die with it; that is no cell's fault, and another parent makes others."""
+    one = daemon(divided_map.root, "--workers", "1")
+    client = connect(one)
+    client.area(circle(0, 0, 5))
+    (loader,), parent = one.stop_loaders(), one.loaders_parent()
+    started = client.ask("stats")[4]["loads_started"]
+    request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
+    waiting = Patience()
+    while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
+        pass  # the stopped loader has its jobs now
+    os.kill(parent, signal.SIGKILL)
+    reply = client.cells_reply(client.wait_for(request))
+    assert (len(reply.cells), reply.failed) == (4, [])
+    assert wait_ended(loader)
+    assert client.ask("stats")[4]["worker_crashes"] == 1
+    assert one.loaders_parent() != parent
 
 
 def test_a_pipe_instead_of_a_file(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
@@ -178,7 +199,7 @@ def test_a_header_that_promises_the_moon_costs_no_memory(
     one = daemon(divided_map.root, "--workers", "1")
     client = connect(one)
     client.area(circle(0, 0, 5))
-    (loader,) = one.children()
+    (loader,) = one.loaders()
     idle = peak_bytes(loader)
     header = (
         b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 300000000\nHEIGHT 1\n"
@@ -192,7 +213,7 @@ def test_a_header_that_promises_the_moon_costs_no_memory(
         (divided_map.pcd_dir / name).write_bytes(header + tail)
         reply = client.selected([name])
         assert [f.code for f in reply.failed] == ["load_failed"]
-    assert one.children() == [loader]
+    assert one.loaders() == [loader]
     assert peak_bytes(loader) - idle < 100 << 20
 
 

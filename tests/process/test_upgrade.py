@@ -62,9 +62,13 @@ def test_a_loader_that_cannot_start_after_an_upgrade(
     assert len(warm.cells) == 4
     happens(package)
     assert len(client.area(circle(30, 0, 5)).cells) == 2, "the loader that runs goes on"
-    for pid in one.children():
+    for pid in one.loaders():
         os.kill(pid, signal.SIGKILL)
         assert wait_ended(pid)
+    assert len(client.area(circle(-30, 0, 5)).cells) == 2, "another one has the code that its parent had"
+    parent = one.loaders_parent()
+    os.kill(parent, signal.SIGKILL)
+    assert wait_ended(parent)
     reply = client.area(circle(0, 40, 5))
     assert not reply.cells
     assert len(reply.failed) == len(divided_map.in_circle(0, 40, 5))

@@ -21,11 +21,29 @@ __all__ = [
     "DaemonProcess",
     "open_files",
     "processes_marked",
+    "stop",
     "wait_ended",
     "wait_readable",
 ]
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def _stat(pid: int) -> list[str]:
+    """State, parent and more of a process, see proc(5)."""
+    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+
+
+def _parent_of(pid: int) -> int:
+    return int(_stat(pid)[1])
+
+
+def stop(pid: int) -> None:
+    """SIGSTOP a process, and wait until it stands still."""
+    os.kill(pid, signal.SIGSTOP)
+    waiting = Patience()
+    while waiting(_stat(pid)[0] != "T"):
+        os.sched_yield()
 
 
 class DaemonProcess(daemon_process.DaemonProcess):
@@ -52,14 +70,20 @@ class DaemonProcess(daemon_process.DaemonProcess):
             process.kill()
             process.wait()
 
+    def loaders(self) -> list[int]:
+        """Ids of the loaders, without their parent's."""
+        return [pid for pid in self.children() if _parent_of(pid) != self.pid]
+
+    def loaders_parent(self) -> int:
+        """Id of the process that loaders are forked from."""
+        (found,) = set(self.children()) - set(self.loaders())
+        return found
+
     def stop_loaders(self) -> list[int]:
         """SIGSTOP every loader there is, wait until they stand still; returns their ids."""
-        loaders = self.children()
+        loaders = self.loaders()
         for pid in loaders:
-            os.kill(pid, signal.SIGSTOP)
-            waiting = Patience()
-            while waiting(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T"):
-                os.sched_yield()
+            stop(pid)
         return loaders
 
     def until_segments(self, at_most: int, ask: Callable[[], object]) -> None:

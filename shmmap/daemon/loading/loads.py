@@ -2,9 +2,10 @@
 """Absent cells: what is wanted, which load comes next, what is under way, what failed.
 
 Those who ask take turns, and of each one's loads the nearest comes first: however many cells one process
-asks for, another one's cells do not wait for more than a fair share of them.  Turns are by bytes, as
-`shmmap.daemon.transport.inbox` has them by time.  What nobody waits for (checks of adopted segments,
-pinned cells) comes when nothing else is queued.
+asks for, another one's cells do not wait for more than a fair share of them.  Turns are by the time that
+loaders spend, as `shmmap.daemon.transport.inbox` has them by that of the loop; until a load has ended it
+counts by its bytes.  What nobody waits for (checks of adopted segments, pinned cells) comes when nothing else
+is queued.
 """
 
 from __future__ import annotations
@@ -27,17 +28,26 @@ LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
 MOST_FAILURES: Final = 1 << 14
 """Failures of a kind that are remembered: who asks for ever new layers must not fill the memory with them."""
-LOAD_COST_BYTES: Final = 64 << 10
-"""What a load costs besides its bytes: many tiny cells are work, too."""
+LOAD_S: Final = 1e-4
+"""What a load is taken to need besides the time for its bytes: many tiny cells are work, too."""
+BYTE_S: Final = 1e-9
+MOST_REMEMBERED: Final = 1024
+"""Askers whose clocks are remembered; those forgotten when idle lose a debt of loads that have ended."""
+
+_Heap = list[tuple[float, int, Load]]
 
 
 @dataclass(eq=False, slots=True)
 class _Asker:
-    """One asker's loads by priority; ``clock`` is the bytes it has been given."""
+    """One asker's loads by priority, computed layers in the second heap.
 
-    clock: int
-    heap: list[tuple[float, int, Load]] = field(default_factory=list)
+    ``clock_s`` is the time of loaders that it was given, ``running`` how many of its loads are under way.
+    """
+
+    clock_s: float
+    heaps: tuple[_Heap, _Heap] = field(default_factory=lambda: ([], []))
     best: dict[int, float] = field(default_factory=dict)
+    running: int = 0
 
 
 class LoadQueue:
@@ -46,7 +56,7 @@ class LoadQueue:
     def __init__(self) -> None:
         self._loads: dict[int, Load] = {}
         self._askers: dict[Hashable, _Asker] = {}
-        self._clock = 0
+        self._clock_s = 0.0
         self._chosen: Hashable = None
 
     def __len__(self) -> int:
@@ -62,49 +72,69 @@ class LoadQueue:
         self._loads[load.number] = load
         mine = self._askers.get(asker)
         if mine is None:
-            mine = self._askers[asker] = _Asker(self._clock)
+            mine = self._askers[asker] = _Asker(self._clock_s)
         known = mine.best.get(load.number)
         if known is None or priority < known:
             mine.best[load.number] = priority
-            heapq.heappush(mine.heap, (priority, load.number, load))
+            heapq.heappush(mine.heaps[load.computed], (priority, load.number, load))
 
     def discard(self, load: Load) -> None:
         """It does not wait any more."""
         self._loads.pop(load.number, None)
 
     def started(self, load: Load) -> None:
-        """It does not wait any more, and counts for whose turn it was."""
+        """It does not wait any more, and counts for whose turn it was; tell `ended` afterwards."""
         self.discard(load)
+        load.payer, load.charged_s = self._chosen, LOAD_S + load.estimate * BYTE_S
         chosen = self._askers.get(self._chosen)
         if chosen is not None:
-            chosen.clock += load.estimate + LOAD_COST_BYTES
+            chosen.running += 1
+            chosen.clock_s += load.charged_s
 
-    def next(self) -> Load | None:
-        """The load that comes next, or None."""
-        found: tuple[bool, int, float, int] | None = None
+    def ended(self, load: Load) -> None:
+        """A load that was started has ended, or goes back: it counts for what it took."""
+        payer = self._askers.get(load.payer)
+        if payer is not None:
+            payer.running -= 1
+            payer.clock_s += load.spent_s - load.charged_s
+        load.spent_s = 0.0
+
+    def next(self, *, points: bool = True, layers: bool = True) -> Load | None:
+        """The load that comes next, of those that are computed, that are not, or of all; or None."""
+        best: tuple[bool, float, float, int] | None = None
+        found: Load | None = None
         for asker, mine in list(self._askers.items()):
             self._clean(mine)
-            if not mine.heap:
+            if not any(mine.heaps) and self._is_square(mine):
                 del self._askers[asker]
-                continue
-            priority, number, _ = mine.heap[0]
-            rank = (priority >= BACKGROUND, mine.clock, priority, number)
-            if found is None or rank < found:
-                found, self._chosen = rank, asker
-        if found is None:
-            return None
-        chosen = self._askers[self._chosen]
-        self._clock = max(self._clock, chosen.clock)
-        return chosen.heap[0][2]
+            for heap, wanted in zip(mine.heaps, (points, layers), strict=True):
+                if heap and wanted:
+                    priority, number, load = heap[0]
+                    rank = (priority >= BACKGROUND, mine.clock_s, priority, number)
+                    if best is None or rank < best:
+                        best, found, self._chosen = rank, load, asker
+        if found is not None:
+            self._clock_s = max(self._clock_s, self._askers[self._chosen].clock_s)
+        return found
+
+    def _is_square(self, mine: _Asker) -> bool:
+        """Whether an asker that waits for nothing can be forgotten: nobody else does, or it owes no time."""
+        if mine.running:
+            return False
+        return mine.clock_s <= self._clock_s or not self._loads or len(self._askers) > MOST_REMEMBERED
 
     def _clean(self, mine: _Asker) -> None:
         """Drop what does not wait any more from the front, and from everywhere once it is most."""
-        while mine.heap and mine.heap[0][1] not in self._loads:
-            mine.best.pop(heapq.heappop(mine.heap)[1], None)
-        if len(mine.heap) > 2 * len(self._loads) + 64:
+        for heap in mine.heaps:
+            while heap and heap[0][1] not in self._loads:
+                mine.best.pop(heapq.heappop(heap)[1], None)
+        if sum(map(len, mine.heaps)) > 2 * len(self._loads) + 64:
             mine.best = {number: p for number, p in mine.best.items() if number in self._loads}
-            mine.heap = [(p, number, self._loads[number]) for number, p in mine.best.items()]
-            heapq.heapify(mine.heap)
+            for heap in mine.heaps:
+                heap.clear()
+            for number, priority in mine.best.items():
+                load = self._loads[number]
+                heapq.heappush(mine.heaps[load.computed], (priority, number, load))
 
 
 class Loads:
@@ -165,9 +195,9 @@ class Loads:
         load = self.want(resident.key, 0, float("inf"))
         load.adopted, load.wanted = resident, False
 
-    def next_queued(self) -> Load | None:
-        """The queued load nearest to whose turn it is, or None."""
-        while (load := self._queue.next()) is not None:
+    def next_queued(self, *, points: bool = True, layers: bool = True) -> Load | None:
+        """The queued load nearest to whose turn it is, of the kinds that somebody can take; or None."""
+        while (load := self._queue.next(points=points, layers=layers)) is not None:
             if self.by_key.get(load.key) is load and not load.running:
                 return load
             self._queue.discard(load)  # given up meanwhile
@@ -191,12 +221,14 @@ class Loads:
     def requeue(self, load: Load) -> None:
         """Put a running load back (its worker died before its turn, or what it read is outdated)."""
         self._take_back(load)
-        load.running = False
         self._queue.push(load, load.priority, load.asker)
 
     def _take_back(self, load: Load) -> None:
         self._ledger.reserved_bytes -= load.reserved
         load.reserved = 0
+        if load.running:
+            load.running = False
+            self._queue.ended(load)
 
     def finish(self, load: Load, failure: Failure | None = None) -> None:
         """The load ended; ``failure``, if there is one, stands until it succeeds or is cleared."""

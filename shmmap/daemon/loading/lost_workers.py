@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.prepared_parent import RESTART
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_pool import RESTART, Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load
 from shmmap.logfmt import log
 from shmmap.segment.version import Stamp
@@ -19,6 +20,9 @@ __all__ = ["LostWorkers"]
 
 START_ATTEMPTS: Final = 3
 """After this many loaders in a row that could not start, loads fail instead of waiting."""
+
+LOSSES_ALLOWED: Final = 3
+"""So often a load may lose its loader along with the loaders' parent: it may be what ends the parent."""
 
 
 @dataclass(eq=False, slots=True)
@@ -40,45 +44,64 @@ class LostWorkers:
     statistics: StatisticsWriter
     fail: Callable[[Load, str, str, Stamp | None, float], None]
 
-    def ended(self, worker: Worker, now_s: float) -> None:
-        """A worker's process ended."""
+    def ended(self, worker: Worker, how: str, now_s: float) -> None:
+        """A worker's process ended; ``how`` is for people, and empty where its parent took it along."""
         self.statistics.add("worker_crashes")
-        if worker.ready:
-            self._replace(worker, "load_failed", now_s)
-            return
-        self.pool.failed_starts += 1
-        unfinished, how = self.pool.remove(worker)
-        log.error("loader could not start", reason=how)
-        give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
-        for job in unfinished:
-            load = self.jobs.pop(job.number, None)
-            if load is not None and give_up:
-                self.fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
-            elif load is not None:
-                self.loads.requeue(load)
+        if not worker.ready:
+            self._could_not_start(worker, how, now_s)
+        elif how:
+            self._replace(worker, "load_failed", f"the loader died of it ({how})", now_s)
+        else:
+            self._vanished(worker, now_s)
 
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load, or whose start, took too long."""
         for worker in self.pool.overdue(now_s):
             if worker.ready:
                 self.statistics.add("loads_timed_out")
-                self._replace(worker, "load_timeout", now_s)
+                self._replace(worker, "load_timeout", "loading took longer than allowed", now_s)
             else:
-                self.ended(worker, now_s)
+                self.pool.parent.end("its parent was not ready in time")
+                self.ended(worker, "", now_s)
 
-    def _replace(self, worker: Worker, code: str, now_s: float) -> None:
+    def _could_not_start(self, worker: Worker, how: str, now_s: float) -> None:
+        self.pool.failed_starts += 1
+        self.pool.parent.hear()
+        how = how or self.pool.parent.why_not or "its parent has ended"
+        log.error("loader could not start", reason=how)
+        give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
+        for job in self.pool.remove(worker):
+            load = self.jobs.pop(job.number, None)
+            if load is not None and give_up:
+                self.fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
+            elif load is not None:
+                self.loads.requeue(load)
+
+    def _vanished(self, worker: Worker, now_s: float) -> None:
+        """Its parent ended: that is no job's fault, unless it happens again and again."""
+        for position, job in enumerate(self.pool.remove(worker)):
+            self.room.hungry.pop(job.number, None)
+            load = self.jobs.pop(job.number, None)
+            if load is None:
+                continue
+            load.losses += position == 0
+            if load.losses < LOSSES_ALLOWED:
+                self.loads.requeue(load)
+            else:
+                self.fail(load, "load_failed", f"{job.path}: its loaders vanish", None, now_s)
+
+    def _replace(self, worker: Worker, code: str, why: str, now_s: float) -> None:
         """Forget a worker that had begun: the job it worked on fails."""
-        unfinished, how = self.pool.remove(worker)
-        died = code == "load_failed"
-        why = f"the loader died of it ({how})" if died else "loading took longer than allowed"
-        for position, job in enumerate(unfinished):
+        spent_s = now_s - worker.head_since_s
+        for position, job in enumerate(self.pool.remove(worker)):
             self.room.hungry.pop(job.number, None)
             load = self.jobs.pop(job.number, None)
             if position == 0:
                 log.error("loader replaced", path=job.path, reason=why)
                 if load is not None:
+                    load.spent_s = spent_s
                     # where it took too long nobody looks again: the file system may be what hangs
-                    known = load.sources[0] if died and load.sources else None
+                    known = load.sources[0] if code == "load_failed" and load.sources else None
                     self.fail(load, code, f"{job.path}: {why}", known, now_s)
             elif load is not None:
                 self.loads.requeue(load)

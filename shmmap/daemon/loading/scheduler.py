@@ -22,13 +22,14 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Failed, Job, Need, Ready
+from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
+from shmmap.processes.start_child import how_ended
 from shmmap.segment.directory import is_full
 from shmmap.segment.version import Stamp
 
@@ -123,7 +124,9 @@ class Scheduler:
         if self._doubtful:
             self._drop_some()
         for _ in range(LOOKS_A_PUMP):
-            if not self.pool.has_room or (load := self.loads.next_queued()) is None:
+            points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
+            load = self.loads.next_queued(points=points, layers=layers)
+            if load is None:
                 return
             job = self._job(load, self._job_numbers + 1)
             if job is None:
@@ -198,17 +201,21 @@ class Scheduler:
         """Handle one message of a worker."""
         try:
             received = self.pool.receive(worker)
-        except EOFError:
-            self.lost.ended(worker, now_s)
+        except EOFError as error:
+            self.lost.ended(worker, str(error), now_s)
             return
         if received is None:
             return
         message, fd = received
         try:
-            if isinstance(message, Ready):
-                worker.ready = True
-                worker.head_since_s = now_s
-                self.pool.failed_starts = 0
+            if isinstance(message, Ended):
+                self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
+            elif isinstance(message, Ready):
+                if fd < 0:  # this process had no descriptor left to receive it
+                    self.lost.ended(worker, "too many open files", now_s)
+                    return
+                self.pool.begun(worker, message.pid, fd, now_s)
+                fd = -1
             elif isinstance(message, Need):
                 self.room.ask(worker, message)
                 self.room.feed(self._jobs, now_s)
@@ -220,11 +227,12 @@ class Scheduler:
 
     def _on_end(self, worker: Worker, message: Done | Checked | Failed, fd: int, now_s: float) -> None:
         """A worker is done with a job, in whichever way; ``fd`` is the segment, -1 for none."""
-        self.pool.finished(worker, message.number, now_s)
+        spent_s = self.pool.finished(worker, message.number, now_s)
         self.room.hungry.pop(message.number, None)
         load = self._jobs.pop(message.number, None)
         if load is None:
             return
+        load.spent_s = spent_s
         if isinstance(message, Checked):
             self._on_checked(load, message, now_s)
         elif isinstance(message, Failed):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A loader worker: a process of its own that reads files and fills segments, one job after another.
 
+It is forked from one that has imported what is needed (`shmmap.daemon.loading.parent_main`).
+
 It is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish: it passes
 the finished, unnamed segment to the daemon, so that an orphan leaves nothing behind.
 """
@@ -8,19 +10,16 @@ the finished, unnamed segment to the daemon, so that an orphan leaves nothing be
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import resource
 import signal
 import socket
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmmap import __version__
-from shmmap.daemon.host.scheduling import take_slices, weigh_less
+from shmmap.daemon.host.scheduling import weigh_less
 from shmmap.daemon.loading import worker_messages
 from shmmap.errors import MapDataError, Offline, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
@@ -31,7 +30,6 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
-from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory, is_full
@@ -39,15 +37,23 @@ from shmmap.segment.layout import SourceStamp
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.verify import verify_file
 
-__all__ = ["main"]
+__all__ = ["WorkerSettings", "limit_memory", "work"]
 
 _NICENESS: Final = 10  # a warm request never waits for a load
-_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a worker, not the daemon
 _PAGE_BYTES: Final = 4096
 
 
 class _Refused(Exception):
     """The daemon has no room for the segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerSettings:
+    """Where segments are made; where finished layers are kept, and how much of them (empty: nowhere)."""
+
+    shm_dir: str
+    cache_dir: str = ""
+    cache_bytes: int = 0
 
 
 @dataclass(eq=False, slots=True)
@@ -61,7 +67,9 @@ class _Worker:
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
-        self._send(worker_messages.Ready(__version__))
+        pidfd = os.pidfd_open(os.getpid())
+        self._send(worker_messages.Ready(os.getpid()), pidfd)
+        os.close(pidfd)
         while True:
             job = self._waiting.pop(0) if self._waiting else self._receive()
             if job is None:
@@ -91,7 +99,7 @@ class _Worker:
             while True:
                 answer = self._receive()
                 if answer is None:
-                    sys.exit(0)
+                    raise BrokenPipeError
                 if isinstance(answer, worker_messages.Job | worker_messages.Check):
                     self._waiting.append(answer)
                 elif not answer.granted:
@@ -204,7 +212,7 @@ def _test_hook(path: str) -> None:
             signal.pause()
 
 
-def _limit_memory(nbytes: int) -> None:
+def limit_memory(nbytes: int) -> None:
     """Let what goes beyond it fail in this process, as an error of the cell it works on."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard != resource.RLIM_INFINITY:
@@ -212,26 +220,12 @@ def _limit_memory(nbytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (nbytes, nbytes))
 
 
-def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR MEMORY_BYTES [CACHE_DIR CACHE_BYTES]``."""
-    channel_fd, parent, shm_dir = int(arguments[0]), int(arguments[1]), arguments[2]
-    die_with(parent)
-    _limit_memory(int(arguments[3]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
-    signal.signal(signal.SIGIO, signal.SIG_IGN)
+def work(channel: socket.socket, settings: WorkerSettings) -> int:
+    """Work in this process until the daemon closes the channel; returns the exit code."""
     os.nice(_NICENESS)
-    take_slices(0)  # the short ones are for those who serve
-    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
-        score.write(_OOM_SCORE)
-    channel = socket.socket(fileno=channel_fd)
-    try:
-        cache = LayerCache(arguments[4], limit_bytes=int(arguments[5])) if len(arguments) > 5 else None
-        _Worker(channel, ShmDirectory(shm_dir), cache).run()
-    except OSError as error:
-        if error.errno not in (errno.EPIPE, errno.ECONNRESET):
-            raise
+    cache = None
+    if settings.cache_dir and settings.cache_bytes:
+        cache = LayerCache(settings.cache_dir, limit_bytes=settings.cache_bytes)
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+        _Worker(channel, ShmDirectory(settings.shm_dir), cache).run()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -20,6 +20,7 @@ __all__ = [
     "Checked",
     "Decision",
     "Done",
+    "Ended",
     "Failed",
     "FromWorker",
     "Job",
@@ -68,10 +69,10 @@ class Decision(msgspec.Struct, array_like=True, tag="decision"):
 class Ready(msgspec.Struct, array_like=True, tag="ready"):
     """The worker has started: from now on its death is its job's fault.
 
-    ``version`` of shmmap is the daemon's own, unless there is another on the disk by now.
+    Its pidfd comes with the packet; ``pid`` is for operators and tests.
     """
 
-    version: str = ""
+    pid: int
 
 
 class Need(msgspec.Struct, array_like=True, tag="need"):
@@ -125,8 +126,18 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
     stamp: Stamp | None = None
 
 
+class Ended(msgspec.Struct, array_like=True, tag="ended"):
+    """The worker's process has ended: its exit code (a signal's number below zero), or why there was none.
+
+    Its parent says so over the worker's channel, after everything that the worker has said.
+    """
+
+    code: int
+    reason: str = ""
+
+
 ToWorker: TypeAlias = Job | Check | Decision
-FromWorker: TypeAlias = Ready | Need | Done | Checked | Failed
+FromWorker: TypeAlias = Ready | Need | Done | Checked | Failed | Ended
 
 encode: Final = msgspec.msgpack.Encoder().encode
 decode_to_worker: Final = msgspec.msgpack.Decoder[ToWorker](ToWorker).decode

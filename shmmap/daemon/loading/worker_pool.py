@@ -1,87 +1,104 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pool of loader workers: started on demand, fed several jobs ahead, killed at a deadline."""
+"""The pool of loader workers: started on demand, fed several jobs ahead, killed at a deadline.
+
+Computed layers may take seconds each.  So a cell's points never wait behind them: they go to workers that
+compute nothing, and while all compute one more is kept for points alone.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
+import signal
 import socket
-import subprocess
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from shmmap import __version__
 from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.processes.packets import packet_buffer, receive_packet
-from shmmap.processes.start_child import how_ended, start_child
+from shmmap.processes.start_child import channel
 
-__all__ = ["Worker", "WorkerPool"]
+__all__ = ["Work", "Worker", "WorkerPool"]
 
-JOBS_AHEAD = 4
+Work = worker_messages.Job | worker_messages.Check
+
+JOBS_AHEAD: Final = 4
 """Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
 
-END_PATIENCE_S = 0.1
-"""How long the loop waits for a killed worker to end; one that hangs in the kernel may take for ever."""
+LAYERS_AHEAD: Final = 1
+"""Computed layers among them: each may take long, and who asks next waits for all that were given out."""
 
-START_DEADLINE_S = 60.0
-"""How long a worker may take from its first job until it is ready: an interpreter and its imports."""
-
-
-RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
+START_DEADLINE_S: Final = 60.0
+"""How long a worker may take from its first job until it is ready: its parent's imports, and a fork."""
 
 
-def _installed() -> tuple[int, int] | None:
-    """What tells the loader program on the disk from another one; None where there is none any more."""
-    try:
-        status = Path(__file__).with_name("worker_main.py").stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_mtime_ns
+def _has_ended(pidfd: int) -> bool:
+    poller = select.poll()
+    poller.register(pidfd, select.POLLIN)
+    return bool(poller.poll(0))
+
+
+def is_computed(job: Work) -> bool:
+    """Whether a job may take long; a look at a file or a segment does not."""
+    return isinstance(job, worker_messages.Job) and job.layer != LAYER
 
 
 @dataclass(eq=False, slots=True)
 class Worker:
     """One worker process; ``queue`` holds its jobs, the first is the one it works on.
 
-    ``foreign`` says that it is of another version of shmmap.
+    Attributes
+    ----------
+    pid, pidfd
+        Its process, from when it is ``ready``.
+    for_points
+        It is the one more that computes nothing.
     """
 
-    process: subprocess.Popen[bytes]
     channel: socket.socket
-    queue: OrderedDict[int, worker_messages.Job | worker_messages.Check] = field(default_factory=OrderedDict)
+    for_points: bool = False
+    pid: int = 0
+    pidfd: int = -1
+    queue: OrderedDict[int, Work] = field(default_factory=OrderedDict)
     head_since_s: float = 0.0
-    ready: bool = False
-    foreign: bool = False
 
     @property
     def fd(self) -> int:
         """Descriptor to poll."""
         return self.channel.fileno()
 
+    @property
+    def ready(self) -> bool:
+        """Whether it has begun: its death is its job's fault from then on."""
+        return self.pid != 0
+
+    @property
+    def layers(self) -> int:
+        """How many of its jobs are layers to be computed."""
+        return sum(map(is_computed, self.queue.values()))
+
 
 @dataclass(eq=False, slots=True)
 class WorkerPool:
-    """Up to ``limit`` worker processes.
+    """Up to ``limit`` worker processes, and one more for points while all of them compute.
 
     Parameters
     ----------
     limit
         Most workers at a time.
-    shm_dir
-        Where they make segments.
+    parent
+        Makes them.
     deadline_s
         How long one load may take; then its worker is killed.
-    memory_bytes
-        How much private memory each may use.
-    cache_dir, cache_bytes
-        Where finished layers are kept, and at most how much of them; empty or 0: nowhere.
     watched
         Told of the workers' descriptors.
 
@@ -94,17 +111,13 @@ class WorkerPool:
     """
 
     limit: int
-    shm_dir: str
+    parent: PreparedParent
     deadline_s: float
     watched: WatchedDescriptors
-    memory_bytes: int = 2 << 30
-    cache_dir: str = ""
-    cache_bytes: int = 0
     on_message: Callable[[Worker], None] = field(init=False)
     failed_starts: int = 0
     _workers: dict[int, Worker] = field(default_factory=dict)
-    _ending: list[subprocess.Popen[bytes]] = field(default_factory=list)
-    _program: tuple[int, int] | None = field(default_factory=_installed)
+    _ending: set[int] = field(default_factory=set)
     _buffer: bytearray = field(default_factory=packet_buffer)
 
     def __len__(self) -> int:
@@ -113,41 +126,66 @@ class WorkerPool:
     def __iter__(self) -> Iterator[Worker]:
         return iter(list(self._workers.values()))
 
-    @property
-    def has_room(self) -> bool:
-        """Whether a job can be given to somebody.
+    # --- who takes a job ------------------------------------------------------------------------
 
-        Workers that were killed and have not ended count: on a file system that hangs they would pile up.
-        """
-        self._ending = [process for process in self._ending if process.poll() is None]
-        return self._may_start or any(len(worker.queue) <= JOBS_AHEAD for worker in self._workers.values())
+    def has_room(self, *, computed: bool) -> bool:
+        """Whether a job, one that computes a layer or another one, can be given to somebody."""
+        found = self._least_busy(computed=computed) is not None
+        return found or self._may_start or (not computed and self._may_start_one_for_points)
+
+    def _least_busy(self, *, computed: bool) -> Worker | None:
+        """Who should have the next job of a kind; None if nobody has room for it."""
+        able = [
+            worker
+            for worker in self._workers.values()
+            if len(worker.queue) <= JOBS_AHEAD
+            and worker.layers <= LAYERS_AHEAD
+            and not (worker.for_points if computed else worker.layers)
+        ]
+        return min(able, key=lambda worker: (worker.layers, len(worker.queue)), default=None)
 
     @property
     def _may_start(self) -> bool:
-        return len(self._workers) + len(self._ending) < self.limit
+        """Whether there may be one more that does everything.
 
-    def start_one(self) -> Worker:
-        """Start a worker process."""
-        cache = (self.cache_dir, str(self.cache_bytes)) if self.cache_dir and self.cache_bytes else ()
-        process, ours = start_child(
-            "shmmap.daemon.loading.worker_main", self.shm_dir, str(self.memory_bytes), *cache,
-            new_session=True,
-        )  # fmt: skip
+        Workers that were killed and have not ended count: on a file system that hangs they would pile up.
+        """
+        count = sum(not worker.for_points for worker in self._workers.values())
+        return count + len(self._ending) < self.limit
+
+    @property
+    def _may_start_one_for_points(self) -> bool:
+        """Whether all compute, so that there may be one more for what is not computed."""
+        count = len(self._workers) + len(self._ending)
+        return bool(self._workers) and count <= self.limit and all(w.layers for w in self)
+
+    def start_one(self, *, for_points: bool = False) -> Worker:
+        """Have a worker process made; OSError if that cannot be done."""
+        ours, theirs = channel()
+        try:
+            with theirs:
+                self.parent.fork(theirs)
+        except OSError:
+            ours.close()
+            raise
         ours.setblocking(False)
-        worker = Worker(process, ours)
+        worker = Worker(ours, for_points)
         self._workers[worker.fd] = worker
         self.watched.watch(worker.fd, lambda: self.on_message(worker), "loaders")
         return worker
 
-    def submit(self, job: worker_messages.Job | worker_messages.Check, now_s: float) -> bool:
+    def submit(self, job: Work, now_s: float) -> bool:
         """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
-        worker = min(self._workers.values(), key=lambda w: len(w.queue), default=None)
-        if worker is None or (worker.queue and self._may_start):
+        computed = is_computed(job)
+        worker, start = self._least_busy(computed=computed), self._may_start
+        if worker is None and not (start or (not computed and self._may_start_one_for_points)):
+            return False
+        if worker is None or (worker.queue and start):
             try:
-                worker = self.start_one()
+                worker = self.start_one(for_points=not start)
             except OSError as error:  # no more processes, memory or descriptors just now
                 log.error("loader could not start", reason=error)
-                if worker is None or len(worker.queue) > JOBS_AHEAD:
+                if worker is None:
                     return False
         try:
             worker.channel.send(worker_messages.encode(job))
@@ -163,6 +201,8 @@ class WorkerPool:
         with contextlib.suppress(OSError):
             worker.channel.send(worker_messages.encode(message))
 
+    # --- what they say --------------------------------------------------------------------------
+
     def receive(self, worker: Worker) -> tuple[worker_messages.FromWorker, int] | None:
         """Next message of a worker and the descriptor that came with it (-1: none).
 
@@ -171,7 +211,7 @@ class WorkerPool:
         Raises
         ------
         EOFError
-            When the worker is gone, or has lost its mind.
+            When the worker's parent is gone, and it with it, or it has lost its mind.
         """
         while True:
             try:
@@ -186,36 +226,47 @@ class WorkerPool:
         if not data:
             raise EOFError
         try:
-            message = worker_messages.decode_from_worker(data)
+            return worker_messages.decode_from_worker(data), fd
         except msgspec.MsgspecError as error:
             log.error("loader ended", reason="its message cannot be read", error=error)
             if fd >= 0:
                 os.close(fd)
-            raise EOFError from error
-        if isinstance(message, worker_messages.Ready) and message.version != __version__:
-            worker.foreign = True
-            raise EOFError
-        return message, fd
+            raise EOFError("its message could not be read") from error
 
-    def finished(self, worker: Worker, number: int, now_s: float) -> None:
-        """The worker is done with a job; its next one begins now."""
-        worker.queue.pop(number, None)
+    def begun(self, worker: Worker, pid: int, pidfd: int, now_s: float) -> None:
+        """The worker is ready; its pidfd is the pool's now."""
+        worker.pid, worker.pidfd = pid, pidfd
         worker.head_since_s = now_s
+        self.failed_starts = 0
 
-    def remove(self, worker: Worker) -> tuple[list[worker_messages.Job | worker_messages.Check], str]:
-        """Forget a dead worker; returns its unfinished jobs, and how it ended, for people."""
+    def finished(self, worker: Worker, number: int, now_s: float) -> float:
+        """The worker is done with a job; its next one begins now.  Returns how long it took, seconds."""
+        worker.queue.pop(number, None)
+        began_s, worker.head_since_s = worker.head_since_s, now_s
+        return now_s - began_s
+
+    # --- their end ------------------------------------------------------------------------------
+
+    def remove(self, worker: Worker) -> list[Work]:
+        """Forget a worker that is dead, or is to be; returns its unfinished jobs."""
         self.watched.unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
-        worker.process.kill()
-        try:
-            how = how_ended(worker.process.wait(END_PATIENCE_S))
-        except subprocess.TimeoutExpired:
-            self._ending.append(worker.process)
-            how = "killed, and has not ended yet"
-        if not worker.ready and (worker.foreign or _installed() != self._program):
-            how = RESTART
-        return list(worker.queue.values()), how
+        pidfd, worker.pidfd = worker.pidfd, -1
+        if pidfd >= 0:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+            if _has_ended(pidfd):
+                os.close(pidfd)
+            else:
+                self._ending.add(pidfd)
+                self.watched.watch(pidfd, lambda: self._bury(pidfd))
+        return list(worker.queue.values())
+
+    def _bury(self, pidfd: int) -> None:
+        self.watched.unwatch(pidfd)
+        self._ending.discard(pidfd)
+        os.close(pidfd)
 
     def overdue(self, now_s: float) -> list[Worker]:
         """Workers whose current load, or whose start, is past its deadline."""
@@ -229,6 +280,9 @@ class WorkerPool:
         return min((self._due_s(w) for w in self._workers.values() if w.queue), default=float("inf"))
 
     def close(self) -> None:
-        """End every worker."""
+        """End every worker, and their parent."""
         for worker in self:
             self.remove(worker)
+        self.parent.end()
+        for pidfd in list(self._ending):
+            self._bury(pidfd)

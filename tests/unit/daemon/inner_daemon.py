@@ -24,6 +24,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.pins.watch import PinWatch
@@ -43,6 +44,7 @@ from shmmap.segment.pins import prepare_process
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.writer import StatisticsWriter
 from tests.support import connections
+from tests.support.daemon_process import stop
 
 EPOCH = 77
 PATIENCE_S = 30.0
@@ -92,12 +94,8 @@ class InnerDaemon:
         self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory))
         self.evictor = Evictor(self.reclaimer, POLICIES["distance"])
         self.watched = WatchedDescriptors()
-        self.pool = WorkerPool(
-            workers,
-            self.shm_dir,
-            load_timeout_s,
-            self.watched,
-        )
+        self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
+        self.pool = WorkerPool(workers, self.parent, load_timeout_s, self.watched)
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
@@ -210,10 +208,9 @@ class InnerDaemon:
         if not len(self.pool):
             self.pool.start_one()
         self.run_until(lambda: all(worker.ready for worker in self.pool))
-        pids = [worker.process.pid for worker in self.pool]
+        pids = [worker.pid for worker in self.pool]
         for pid in pids:
-            os.kill(pid, signal.SIGSTOP)
-            os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOWAIT)
+            stop(pid)
         try:
             yield pids
         finally:

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 
@@ -105,8 +106,9 @@ class Puppet:
         self.one = one
         ours, self.channel = channel()
         ours.setblocking(False)
-        process = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
-        self.worker = Worker(process, ours, ready=True)
+        self.process = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
+        pid = self.process.pid
+        self.worker = Worker(ours, pid=pid, pidfd=os.pidfd_open(pid))
         one.pool._workers[self.worker.fd] = self.worker
         one.pool.watched.watch(self.worker.fd, lambda: one.pool.on_message(self.worker))
 
@@ -130,8 +132,11 @@ class Puppet:
 
 
 @pytest.fixture
-def puppet(inner: Inner, small_map: DividedMap) -> Puppet:
-    return Puppet(inner(small_map.root))
+def puppet(inner: Inner, small_map: DividedMap) -> Iterator[Puppet]:
+    one = Puppet(inner(small_map.root))
+    yield one
+    one.process.kill()
+    one.process.wait()
 
 
 def ask(one: InnerDaemon, request: int) -> None:
@@ -148,7 +153,7 @@ def test_a_loader_that_sends_nonsense_is_ended(puppet: Puppet, nonsense: bytes) 
     first = puppet.queue(4)[0]
     puppet.channel.send(nonsense)
     reply = one.cells_of(1)
-    assert puppet.worker.process.returncode == -signal.SIGKILL
+    assert puppet.process.wait() == -signal.SIGKILL
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert first.path in reply.failed[0].message
     assert len(reply.cells) == 3
@@ -164,8 +169,9 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     fd = puppet.segment()
     puppet.say(puppet.done(first), fd)
     os.close(fd)
+    puppet.process.kill()
+    puppet.say(worker_messages.Ended(-9))
     puppet.channel.close()
-    puppet.worker.process.kill()
     reply = one.cells_of(1)
     (failure,) = reply.failed
     assert second.path in failure.message, "the second is what it died of"
@@ -191,41 +197,25 @@ def test_a_load_that_took_too_long_is_not_tried_again_at_once(puppet: Puppet) ->
     puppet.channel.close()
 
 
-class Unkillable:
-    """A process that SIGKILL does not end: it waits in the kernel for a disk that never answers."""
+def test_a_loader_that_cannot_be_killed(puppet: Puppet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop goes on without it, and starts no other in its place until it has ended.
 
-    def __init__(self) -> None:
-        self.code: int | None = None
-        self.killed = False
-
-    def kill(self) -> None:
-        self.killed = True
-
-    def poll(self) -> int | None:
-        return self.code
-
-    def wait(self, timeout: float | None = None) -> int:
-        assert timeout is not None, "this would be for ever"
-        raise subprocess.TimeoutExpired("loader", timeout)
-
-
-def test_a_loader_that_cannot_be_killed(puppet: Puppet) -> None:
-    """The loop goes on without it, and starts no other in its place until it has ended."""
-    one, sleeper = puppet.one, puppet.worker.process
-    stuck = Unkillable()
-    puppet.worker.process = stuck  # type: ignore[assignment]
+    It waits in the kernel for a disk that never answers.
+    """
+    one = puppet.one
+    sent: list[tuple[int, int]] = []
+    monkeypatch.setattr(signal, "pidfd_send_signal", lambda *what: sent.append(what))
     session = one.session()
     one.ask(session, Selected(1, ("0_0.pcd",), wait=300.0))
     puppet.queue(1)
     one.offset_s += 31.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
-    assert stuck.killed
-    assert not one.pool.has_room
-    stuck.code = -signal.SIGKILL
+    assert [number for _, number in sent] == [signal.SIGKILL]
+    assert not one.pool.has_room(computed=False)
+    puppet.process.kill()
     one.ask(session, Selected(2, ("20_20.pcd",), wait=300.0))
     assert len(one.cells_of(2).cells) == 1
-    sleeper.kill()
-    sleeper.wait()
+    puppet.process.wait()
     puppet.channel.close()
 
 
@@ -252,8 +242,7 @@ def test_a_signal_without_a_name(puppet: Puppet) -> None:
     one = puppet.one
     ask(one, 1)
     puppet.queue(4)
-    puppet.worker.process.send_signal(signal.SIGRTMIN + 5)
-    puppet.worker.process.wait()
+    puppet.say(worker_messages.Ended(-39))
     puppet.channel.close()
     assert ["signal 39" in failure.message for failure in one.cells_of(1).failed] == [True]
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from itertools import count
 
 from hypothesis import given
@@ -58,6 +59,76 @@ def test_turns_are_by_bytes() -> None:
         queue.push(one, 0.0, "small")
     served = [start(queue) for _ in range(100)]
     assert 3 <= sum(one in large for one in served) <= 5
+
+
+def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
+    """Small files whose layers take seconds; who asked for them waits while the other one is served."""
+    queue = LoadQueue()
+    for _ in range(20):
+        queue.push(load(1 << 10), 0.0, "slow")
+        queue.push(load(1 << 20), 0.0, "quick")
+    served: list[Hashable] = []
+    for _ in range(12):
+        one = start(queue)
+        assert one is not None
+        served.append(one.payer)
+        one.spent_s = 8.0 if one.payer == "slow" else 1.0
+        queue.ended(one)
+    assert served.count("slow") == 2
+    assert served.count("quick") == 10
+
+
+def test_a_debt_is_remembered_while_others_wait() -> None:
+    """Who asks for one slow layer after the other comes back with what the last one took."""
+    queue = LoadQueue()
+    queue.push(load(), 0.0, "slow")
+    for _ in range(10):
+        queue.push(load(), 0.0, "quick")
+    served: list[Hashable] = []
+    while (one := start(queue)) is not None:
+        served.append(one.payer)
+        one.spent_s = 5.0 if one.payer == "slow" else 1.0
+        queue.ended(one)
+        if one.payer == "slow":
+            queue.push(load(), 0.0, "slow")
+        if len(served) == 11:
+            break
+    assert served.count("slow") == 2
+    queue = LoadQueue()
+    for asker in ("slow", "quick"):  # nobody waited in between: nothing is owed
+        queue.push(one := load(), 0.0, asker)
+        assert start(queue) is one
+        one.spent_s = 5.0
+        queue.ended(one)
+        assert queue.next() is None
+    queue.push(load(), 1.0, "slow")
+    queue.push(load(), 2.0, "quick")
+    first = start(queue)
+    assert first is not None
+    assert first.payer == "slow"
+
+
+def test_what_goes_back_costs_nothing() -> None:
+    """Its loader died of another one's job."""
+    queue = LoadQueue()
+    first, second = load(1 << 30), load(1 << 10)
+    queue.push(first, 0.0, "a")
+    queue.push(second, 1.0, "b")
+    assert start(queue) is first
+    queue.ended(first)
+    queue.push(first, 0.0, "a")
+    assert start(queue) is first
+
+
+def test_points_pass_layers_that_nobody_can_take() -> None:
+    queue = LoadQueue()
+    layer, points = load(), Load(Key("", "points"), 1 << 20, 0.0, next(_numbers))
+    queue.push(layer, 0.0, "a")
+    queue.push(points, 9.0, "a")
+    assert queue.next(layers=False) is points
+    assert queue.next(points=False) is layer
+    assert queue.next(points=False, layers=False) is None
+    assert queue.next() is layer
 
 
 def test_wanted_by_two_it_counts_once() -> None:

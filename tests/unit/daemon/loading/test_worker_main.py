@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loader process alone, spoken to over its socket pair."""
+"""Loaders and the process that they are forked from, spoken to over their socket pairs."""
 
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import socket
 import struct
@@ -17,6 +18,7 @@ import msgspec
 import numpy as np
 import pytest
 
+import shmmap
 from shmmap.daemon.loading import worker_messages
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
@@ -30,21 +32,19 @@ from tests.support.pcd_files import write_ascii, write_pcd
 BOX = (0.0, 0.0, 20.0, 20.0)
 PATIENCE_S = 60.0
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
-COMMAND = [sys.executable, "-m", "shmmap.daemon.loading.worker_main"]
-
-
-PARENT = """
+DAEMON = """
 import os, subprocess, sys
 program, channel, *rest = sys.argv[1:]
-command = [program, "-m", "shmmap.daemon.loading.worker_main", channel, str(os.getpid()), *rest]
+command = [program, "-m", "shmmap.daemon.loading.parent_main", channel, str(os.getpid()), *rest]
 child = subprocess.Popen(command, pass_fds=[int(channel)])
 print(child.pid, flush=True)
 child.wait()
 """
+COMMAND = [sys.executable, "-m", "shmmap.daemon.loading.parent_main"]
 
 
-class Loader:
-    """One loader process and our end of its channel."""
+class Parent:
+    """The process that loaders are forked from, and our end of its channel."""
 
     def __init__(self, shm_dir: str, memory_bytes: int = 2 << 30, **environment: str) -> None:
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -52,11 +52,42 @@ class Loader:
         self.process = subprocess.Popen(
             [*COMMAND, str(theirs.fileno()), str(os.getpid()), shm_dir, str(memory_bytes)],
             pass_fds=(theirs.fileno(),),
-            env={**ENVIRONMENT, **environment},
+            env={**ENVIRONMENT, "OPENBLAS_NUM_THREADS": "1", **environment},
             stderr=subprocess.DEVNULL,
         )
         theirs.close()
-        assert isinstance(self.receive()[0], worker_messages.Ready)
+        assert self.channel.recv(100).decode() == shmmap.__version__
+
+    def fork(self) -> Loader:
+        """Have a loader made."""
+        return Loader(self)
+
+    def descriptors(self) -> dict[int, str]:
+        """Return its descriptors, and what they are."""
+        folder = f"/proc/{self.process.pid}/fd"
+        return {int(name): os.readlink(f"{folder}/{name}") for name in os.listdir(folder)}
+
+    def end(self) -> int:
+        """Close its channel, wait for its end."""
+        self.channel.close()
+        try:
+            return self.process.wait(PATIENCE_S)
+        finally:
+            self.process.kill()
+            self.process.wait()
+
+
+class Loader:
+    """One loader process and our end of its channel."""
+
+    def __init__(self, parent: Parent) -> None:
+        self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.channel.settimeout(PATIENCE_S)
+        with theirs:
+            socket.send_fds(parent.channel, [b"loader"], [theirs.fileno()])
+        ready, self.pidfd = self.receive()
+        assert isinstance(ready, worker_messages.Ready)
+        self.pid = ready.pid
 
     def send(self, message: msgspec.Struct) -> None:
         self.channel.send(worker_messages.encode(message))
@@ -66,25 +97,37 @@ class Loader:
         data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
         assert data, "the loader closed its channel"
         message = worker_messages.decode_from_worker(data)
-        assert bool(fds) is isinstance(message, worker_messages.Done)
+        assert bool(fds) is isinstance(message, worker_messages.Done | worker_messages.Ready)
         return message, fds[0] if fds else -1
 
     def load(self, number: int, path: Path, granted: int = 1 << 30) -> None:
         self.send(worker_messages.Job(number, str(path), str(path), "points", BOX, "map", granted))
 
     def peak_bytes(self) -> int:
-        for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
+        for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
         raise AssertionError("no VmHWM")
 
+    def ended(self) -> int:
+        """Receive how it ended; nothing comes after that."""
+        while not isinstance(message := self.receive()[0], worker_messages.Ended):
+            pass
+        assert self.channel.recv(100) == b"", "somebody else holds its end of the channel"
+        return message.code
+
     def end(self) -> int:
-        self.channel.close()
+        """Let it end by itself; returns its exit code."""
+        self.channel.shutdown(socket.SHUT_WR)
         try:
-            return self.process.wait(PATIENCE_S)
+            return self.ended()
         finally:
-            self.process.kill()
-            self.process.wait()
+            self.close()
+
+    def close(self) -> None:
+        """Close our end."""
+        self.channel.close()
+        os.close(self.pidfd)
 
 
 @pytest.fixture
@@ -97,10 +140,17 @@ def shm_dir() -> Iterator[str]:
 
 
 @pytest.fixture
-def loader(shm_dir: str) -> Iterator[Loader]:
-    one = Loader(shm_dir)
+def parent(shm_dir: str) -> Iterator[Parent]:
+    one = Parent(shm_dir)
     yield one
-    one.end()
+    assert one.end() == 0
+
+
+@pytest.fixture
+def loader(parent: Parent) -> Iterator[Loader]:
+    one = parent.fork()
+    yield one
+    one.close()
 
 
 def cell(path: Path, points: int) -> Path:
@@ -180,16 +230,17 @@ def test_more_bytes_than_granted(loader: Loader, tmp_path: Path, granted: bool) 
 def test_the_channel_closes_while_it_waits_for_room(loader: Loader, tmp_path: Path) -> None:
     loader.load(1, write_ascii(tmp_path / "a.pcd", 5000), 8192)
     assert isinstance(loader.receive()[0], worker_messages.Need)
-    assert loader.end() == 0
+    loader.channel.shutdown(socket.SHUT_WR)
+    assert loader.ended() == 0
 
 
-def test_it_ends_with_its_channel(shm_dir: str) -> None:
-    assert Loader(shm_dir).end() == 0
+def test_it_ends_with_its_channel(parent: Parent) -> None:
+    assert parent.fork().end() == 0
 
 
 def test_it_ignores_the_keyboard(loader: Loader, tmp_path: Path) -> None:
     """Ctrl-C reaches the whole foreground group; what to do about it is the daemon's business."""
-    loader.process.send_signal(signal.SIGINT)
+    os.kill(loader.pid, signal.SIGINT)
     loader.load(1, cell(tmp_path / "a.pcd", 10))
     done, fd = loader.receive()
     os.close(fd)
@@ -197,16 +248,18 @@ def test_it_ignores_the_keyboard(loader: Loader, tmp_path: Path) -> None:
 
 
 def test_the_crash_hook(shm_dir: str, tmp_path: Path) -> None:
-    one = Loader(shm_dir, SHMMAP_TEST_WORKER="crash:a.pcd")
+    parent = Parent(shm_dir, SHMMAP_TEST_WORKER="crash:a.pcd")
     try:
+        one = parent.fork()
         one.load(1, cell(tmp_path / "b.pcd", 10))
         done, fd = one.receive()
         os.close(fd)
         assert isinstance(done, worker_messages.Done)
         one.load(2, cell(tmp_path / "a.pcd", 10))
-        assert one.process.wait(PATIENCE_S) == -signal.SIGSEGV
+        assert one.ended() == -signal.SIGSEGV
+        one.close()
     finally:
-        one.end()
+        assert parent.end() == 0
 
 
 def compressed(path: Path, points: int) -> Path:
@@ -223,8 +276,9 @@ def compressed(path: Path, points: int) -> Path:
 
 
 def test_a_cell_that_takes_too_much_memory_fails_alone(shm_dir: str, tmp_path: Path) -> None:
-    one = Loader(shm_dir, 256 << 20)
+    parent = Parent(shm_dir, 256 << 20)
     try:
+        one = parent.fork()
         large = compressed(tmp_path / "large.pcd", 22 * 1_600_000 + 1)
         one.load(1, large, 1 << 40)
         one.load(2, cell(tmp_path / "good.pcd", 10))
@@ -237,38 +291,44 @@ def test_a_cell_that_takes_too_much_memory_fails_alone(shm_dir: str, tmp_path: P
         os.close(fd)
         assert isinstance(done, worker_messages.Done)
         assert one.peak_bytes() < 256 << 20
+        one.close()
     finally:
-        one.end()
+        parent.end()
 
 
-def test_it_dies_with_its_parent(shm_dir: str) -> None:
-    """Killed, the parent can close nothing; and we still hold the other end of the channel open."""
+def test_loaders_die_with_their_parent_and_it_with_the_daemon(shm_dir: str) -> None:
+    """Killed, nobody can close anything; and we still hold our end of the loader's channel open."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.settimeout(PATIENCE_S)
-    parent = subprocess.Popen(
-        [
-            sys.executable, "-c", PARENT, sys.executable, str(theirs.fileno()), shm_dir, str(2 << 30),
-        ],
+    daemon = subprocess.Popen(
+        [sys.executable, "-c", DAEMON, sys.executable, str(theirs.fileno()), shm_dir, str(2 << 30)],
         pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, text=True, env=ENVIRONMENT,
     )  # fmt: skip
     theirs.close()
     try:
-        assert parent.stdout is not None
-        child = int(parent.stdout.readline())
-        assert isinstance(worker_messages.decode_from_worker(ours.recv(1000)), worker_messages.Ready)
-        parent.kill()
-        parent.wait()
-        assert wait_ended(child, PATIENCE_S)
+        assert daemon.stdout is not None
+        parent = int(daemon.stdout.readline())
+        assert ours.recv(100).decode() == shmmap.__version__
+        mine, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with mine, its:
+            mine.settimeout(PATIENCE_S)
+            socket.send_fds(ours, [b"loader"], [its.fileno()])
+            ready = worker_messages.decode_from_worker(mine.recv(1000))
+            assert isinstance(ready, worker_messages.Ready)
+            daemon.kill()
+            daemon.wait()
+            assert wait_ended(parent, PATIENCE_S)
+            assert wait_ended(ready.pid, PATIENCE_S)
     finally:
-        parent.kill()
-        parent.wait()
-        if parent.stdout is not None:
-            parent.stdout.close()
+        daemon.kill()
+        daemon.wait()
+        if daemon.stdout is not None:
+            daemon.stdout.close()
         ours.close()
 
 
-def test_one_that_started_too_late_ends_at_once(shm_dir: str) -> None:
-    """Its parent is not who should be: the daemon died before the kernel knew that the loader cares."""
+def test_a_parent_that_started_too_late_ends_at_once(shm_dir: str) -> None:
+    """Its parent is not who should be: the daemon died before the kernel knew that it cares."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         code = subprocess.run(
@@ -280,13 +340,81 @@ def test_one_that_started_too_late_ends_at_once(shm_dir: str) -> None:
     assert code == 0
 
 
-def test_idle_it_is_small_and_polite(loader: Loader) -> None:
+def private_bytes(pid: int) -> int:
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
+
+
+def mapped(pid: int, *names: str) -> list[str]:
+    maps = Path(f"/proc/{pid}/maps").read_text()
+    return [name for name in names if name in maps]
+
+
+HEAVY = ("/open3d/", "/numba/", "/scipy/", "libzmq")
+
+
+def test_the_parent_can_be_forked_at_any_time(parent: Parent, loader: Loader, shm_dir: str) -> None:
+    """It has one thread and nothing of any segment; what a loader has of its own is little."""
+    pid = parent.process.pid
+    assert os.listdir(f"/proc/{pid}/task") == [str(pid)]
+    assert mapped(pid, shm_dir, *HEAVY) == []
+    assert not [name for name in parent.descriptors().values() if name.startswith("/dev/shm")]
+    assert private_bytes(pid) < 60 << 20
+    assert private_bytes(loader.pid) < 20 << 20
+
+
+def test_idle_a_loader_is_small_and_polite(parent: Parent) -> None:
     """A loader stays for ever once started; numpy alone is some 30 MB."""
-    pid = loader.process.pid
+    (control,) = [name for name in parent.descriptors().values() if name.startswith("socket:")]
+    loader = parent.fork()
+    pid = loader.pid
     assert loader.peak_bytes() < 100 << 20
     assert os.getpriority(os.PRIO_PROCESS, pid) >= os.getpriority(os.PRIO_PROCESS, 0) + 1
-    maps = Path(f"/proc/{pid}/maps").read_text()
-    assert not [name for name in ("/open3d/", "/numba/", "/scipy/", "libzmq") if name in maps]
+    assert os.getsid(pid) == os.getpgid(pid) == pid
+    assert int(Path(f"/proc/{pid}/oom_score_adj").read_text()) >= 500
+    assert mapped(pid, *HEAVY) == []
+    opened = {os.readlink(f"/proc/{pid}/fd/{fd}") for fd in os.listdir(f"/proc/{pid}/fd")}
+    assert control not in opened
+    loader.close()
+
+
+def test_how_a_loader_ended_is_said_after_all_that_it_said(parent: Parent, tmp_path: Path) -> None:
+    """Nobody else holds its channel: neither those that were forked before it, nor those after it."""
+    before, one, after = parent.fork(), parent.fork(), parent.fork()
+    one.load(1, cell(tmp_path / "a.pcd", 10))
+    assert wait_readable([one.channel.fileno()], PATIENCE_S)
+    signal.pidfd_send_signal(one.pidfd, signal.SIGKILL)
+    assert wait_readable([one.pidfd], PATIENCE_S)
+    done, fd = one.receive()
+    os.close(fd)
+    assert isinstance(done, worker_messages.Done)
+    assert one.ended() == -signal.SIGKILL
+    one.close()
+    for other in (before, after):
+        other.load(2, cell(tmp_path / "b.pcd", 10))
+        done, fd = other.receive()
+        os.close(fd)
+        assert isinstance(done, worker_messages.Done)
+        assert other.end() == 0
+
+
+def test_a_loader_that_cannot_be_watched_is_none(parent: Parent) -> None:
+    """Its parent has no descriptor left for its pidfd: it says so, and goes on."""
+    pid = parent.process.pid
+    limits = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    free = min(set(range(64)) - set(parent.descriptors()))
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (free + 1, limits[1]))  # only one more: the channel
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.settimeout(PATIENCE_S)
+    with ours:
+        with theirs:
+            socket.send_fds(parent.channel, [b"loader"], [theirs.fileno()])
+        said = []
+        while data := ours.recv(1000):
+            said.append(worker_messages.decode_from_worker(data))
+    assert said[-1] == worker_messages.Ended(-1, "pidfd_open: Too many open files")
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
+    assert parent.fork().end() == 0
 
 
 def test_it_does_not_keep_what_it_passed_on(loader: Loader, tmp_path: Path) -> None:

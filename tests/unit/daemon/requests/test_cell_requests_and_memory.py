@@ -31,7 +31,7 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
         one.reclaimer.retire(second, one.now_s() - 1.0)
         one.run_until(lambda: first.name not in one.ledger.retired)
         assert second.name in one.ledger.retired, "somebody has it open"
-        os.kill(next(iter(one.pool)).process.pid, signal.SIGCONT)
+        os.kill(next(iter(one.pool)).pid, signal.SIGCONT)
         reply = one.cells_of(2)
     assert names(reply) == list(wanted)
     assert reply.cells[0].segment != first.name.rsplit(".", 1)[1], "loaded once more"
@@ -120,7 +120,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     one.ask(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0))
     one.run_until(lambda: one.scheduler.room.hungry)
     (worker,) = one.pool
-    worker.process.kill()
+    os.kill(worker.pid, signal.SIGKILL)
     one.run_until(lambda: worker not in list(one.pool))
     one.offset_s += 31.0
     reply = one.cells_of(2)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process that loaders are forked from: it has imported what they need, so that one costs milliseconds.
+
+It has a single thread, opens no file of the map and no segment, and only forks: a packet with one end of a
+channel makes a loader, and when that has ended the same end says how (`worker_messages.Ended`), after
+everything that the loader itself has said.  It dies with the daemon, and the loaders die with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from dataclasses import dataclass, field
+from typing import Final, NoReturn
+
+from shmmap import __version__
+from shmmap.daemon.host.scheduling import take_slices
+from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
+from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.packets import receive_packet
+
+__all__ = ["main"]
+
+_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
+
+
+@dataclass(eq=False, slots=True)
+class _Parent:
+    """Forks loaders; ``children`` are their ids and our ends of their channels, by pidfd."""
+
+    channel: socket.socket
+    settings: WorkerSettings
+    _children: dict[int, tuple[int, socket.socket]] = field(default_factory=dict)
+
+    def run(self) -> None:
+        """Fork until the daemon closes the channel."""
+        poller = select.poll()
+        poller.register(self.channel, select.POLLIN)
+        buffer = bytearray(64)
+        while True:
+            for fd, _ in poller.poll():
+                if fd in self._children:
+                    poller.unregister(fd)
+                    self._bury(fd)
+                    continue
+                data, end = receive_packet(self.channel, buffer)
+                if not data:
+                    return
+                if end >= 0:
+                    with contextlib.suppress(OSError):
+                        poller.register(self._fork(socket.socket(fileno=end)), select.POLLIN)
+
+    def _fork(self, end: socket.socket) -> int:
+        """Make a loader; returns its pidfd."""
+        ours = os.getpid()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            _tell(end, worker_messages.Ended(-1, f"fork: {error.strerror}"))
+            raise
+        if not pid:
+            self._become_loader(end, ours)
+        try:
+            pidfd = os.pidfd_open(pid)
+        except OSError as error:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            _tell(end, worker_messages.Ended(-1, f"pidfd_open: {error.strerror}"))
+            raise
+        self._children[pidfd] = pid, end
+        return pidfd
+
+    def _become_loader(self, end: socket.socket, parent: int) -> NoReturn:
+        code = 1
+        try:
+            self.channel.close()
+            for pidfd, (_, other) in self._children.items():
+                os.close(pidfd)
+                other.close()
+            die_with(parent)
+            os.setsid()  # its own turn on the processors, see autogroups in sched(7)
+            code = work(end, self.settings)
+        except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+
+    def _bury(self, pidfd: int) -> None:
+        """A loader has ended: say how."""
+        os.close(pidfd)
+        pid, end = self._children.pop(pidfd)
+        _, status = os.waitpid(pid, 0)
+        _tell(end, worker_messages.Ended(os.waitstatus_to_exitcode(status)))
+
+
+def _tell(end: socket.socket, message: worker_messages.Ended) -> None:
+    """Say a loader's last word and close its channel; where that is full the end itself has to do."""
+    with end, contextlib.suppress(OSError):
+        end.send(worker_messages.encode(message), socket.MSG_DONTWAIT)
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR MEMORY_BYTES [CACHE_DIR CACHE_BYTES]``."""
+    die_with(int(arguments[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    signal.signal(signal.SIGIO, signal.SIG_IGN)
+    take_slices(0)  # the short ones are for those who serve
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
+        score.write(_OOM_SCORE)
+    limit_memory(int(arguments[3]))
+    cache = (arguments[4], int(arguments[5])) if len(arguments) > 5 else ("", 0)
+    with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
+        gc.collect()
+        gc.freeze()  # a collection in a loader would copy what all of them share
+        channel.send(__version__.encode())
+        _Parent(channel, WorkerSettings(arguments[2], *cache)).run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon's side of the process that loaders are forked from (`shmmap.daemon.loading.parent_main`)."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+from pathlib import Path
+from typing import Final
+
+from shmmap import __version__
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.logfmt import log
+from shmmap.processes.packets import receive_packet
+from shmmap.processes.start_child import how_ended, start_child
+
+__all__ = ["RESTART", "PreparedParent"]
+
+END_PATIENCE_S: Final = 0.1
+"""How long the loop waits for a killed parent to end; one that hangs in the kernel may take for ever."""
+
+RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
+
+
+def _installed() -> tuple[int, int] | None:
+    """What tells the loader program on the disk from another one; None where there is none any more."""
+    try:
+        status = Path(__file__).with_name("worker_main.py").stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
+class PreparedParent:
+    """Has loaders forked.  A parent that ends takes its loaders along; another one is started in its place.
+
+    Parameters
+    ----------
+    arguments
+        What it is told, see `shmmap.daemon.loading.parent_main.main`.
+    watched
+        Told of its descriptor.
+
+    Attributes
+    ----------
+    why_not : str
+        Why the last one ended before it was ready; empty if it did not.
+    """
+
+    def __init__(self, arguments: tuple[str, ...], watched: WatchedDescriptors) -> None:
+        self.why_not = ""
+        self._arguments = arguments
+        self._watched = watched
+        self._process: subprocess.Popen[bytes] | None = None
+        self._channel: socket.socket | None = None
+        self._ready = False
+        self._program = _installed()
+        self._buffer = bytearray(64)
+
+    @property
+    def pid(self) -> int:
+        """Its process id; 0 where there is none."""
+        return self._process.pid if self._process is not None else 0
+
+    def start(self) -> None:
+        """Start it where there is none; OSError if that cannot be done."""
+        if self._channel is None:
+            self._process, self._channel = start_child(
+                "shmmap.daemon.loading.parent_main", *self._arguments, new_session=True
+            )
+            self._channel.setblocking(False)
+            self._watched.watch(self._channel.fileno(), self.hear)
+            self._ready = False
+
+    def fork(self, end: socket.socket) -> None:
+        """Have a loader made that speaks over ``end``.
+
+        Raises
+        ------
+        OSError
+            No more processes, memory or descriptors just now.
+        """
+        self.hear()
+        self.start()
+        assert self._channel is not None  # noqa: S101  `start` has seen to it
+        socket.send_fds(self._channel, [b"loader"], [end.fileno()])
+
+    def hear(self) -> None:
+        """Hear whether it is ready, or has ended; one that was ready is replaced at once."""
+        while self._channel is not None:
+            try:
+                data, _ = receive_packet(self._channel, self._buffer)
+            except BlockingIOError:
+                return
+            except ConnectionResetError:
+                continue  # told once, before what it had still said
+            if bytes(data) == __version__.encode():
+                self._ready, self.why_not = True, ""
+                continue
+            was_ready = self._ready
+            self.end(RESTART if data else "")
+            if was_ready:
+                log.error("parent of the loaders replaced")
+                with contextlib.suppress(OSError):
+                    self.start()
+
+    def end(self, why: str = "") -> None:
+        """End it, and with it every loader; ``why`` tells people, else how it ended does."""
+        if self._channel is None or self._process is None:
+            return
+        self._watched.unwatch(self._channel.fileno())
+        self._channel.close()
+        self._channel = None
+        self._process.kill()
+        try:
+            how = how_ended(self._process.wait(END_PATIENCE_S))
+        except subprocess.TimeoutExpired:
+            how = "killed, and has not ended yet"
+        if not self._ready:
+            self.why_not = RESTART if _installed() != self._program else why or how
+        self._process = None

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who gets which job, and what becomes of a pool whose processes vanish."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from typing import Any, cast
+
+import pytest
+
+from shmmap.daemon.loading.prepared_parent import PreparedParent
+from shmmap.daemon.loading.worker_messages import Check, Job
+from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Worker, WorkerPool
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.protocol.messages import Area, Selected
+from shmmap.segment.layout import NO_SOURCE
+from tests.support.daemon_process import stop, wait_ended
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
+
+
+class NoParent:
+    """Makes loaders that never say a word."""
+
+    def __init__(self) -> None:
+        self.ends: list[int] = []
+
+    def fork(self, end: socket.socket) -> None:
+        self.ends.append(os.dup(end.fileno()))
+
+    def end(self) -> None:
+        for fd in self.ends:
+            os.close(fd)
+
+
+class Jobs:
+    """A pool, and jobs for it; ``given`` are their numbers by worker, in the order in which workers came."""
+
+    def __init__(self, limit: int) -> None:
+        self.watched = WatchedDescriptors()
+        parent = cast("PreparedParent", NoParent())
+        self.pool = WorkerPool(limit, parent, 30.0, self.watched)
+        self.number = 0
+
+    def give(self, layer: str) -> bool:
+        self.number += 1
+        job: Work = Job(self.number, "cell", "/cell.pcd", layer, (0.0,) * 4, "map", 0)
+        if layer == "check":
+            job = Check(self.number, "/cell.pcd", "", NO_SOURCE)
+        if not self.pool.has_room(computed=layer == "ndt"):
+            return False
+        return self.pool.submit(job, 0.0)
+
+    @property
+    def given(self) -> list[list[int]]:
+        return [list(worker.queue) for worker in self.pool]
+
+    def done(self, worker: Worker) -> None:
+        self.pool.finished(worker, next(iter(worker.queue)), 1.0)
+
+
+@contextlib.contextmanager
+def jobs(limit: int) -> Iterator[Jobs]:
+    one = Jobs(limit)
+    try:
+        yield one
+    finally:
+        one.pool.close()
+        one.watched.close()
+
+
+@pytest.mark.parametrize("limit", [1, 2, 4])
+def test_points_never_wait_behind_layers(limit: int) -> None:
+    """However many layers were asked for before: one loader more is kept for points."""
+    with jobs(limit) as one:
+        layers = 0
+        while one.give("ndt"):
+            layers += 1
+        assert layers == limit * (1 + LAYERS_AHEAD)
+        assert len(one.pool) == limit
+        assert one.give("points")
+        *computing, last = one.pool
+        assert (len(computing), last.for_points, list(last.queue)) == (limit, True, [one.number])
+        assert not any(worker.for_points for worker in computing)
+        while one.give("points") or one.give("check"):
+            pass
+        assert len(last.queue) == 1 + JOBS_AHEAD
+        assert len(one.pool) == limit + 1, "and no second one"
+        one.done(last)
+        assert not one.give("ndt"), "it computes nothing"
+        assert one.give("check")
+
+
+def test_layers_get_their_share_of_loaders_that_points_keep_busy() -> None:
+    """What is free next is offered to both; points keep a loader without layers as long as there is one."""
+    with jobs(2) as one:
+        while one.give("points"):
+            pass
+        assert one.given == [[1, 3, 5, 7, 9], [2, 4, 6, 8, 10]]
+        assert not one.give("ndt")
+        first, second = one.pool
+        one.done(first)
+        assert one.give("ndt")
+        for _ in range(3):
+            one.done(first)
+        assert list(map(len, one.given)) == [2, 5]
+        assert not one.give("points"), "not behind the layer"
+        assert one.give("ndt")
+        one.done(second)
+        assert one.give("points")
+        assert (first.layers, second.layers) == (2, 0)
+
+
+def test_a_loader_that_computes_is_no_hindrance_to_points(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a single loader, and a layer that is never finished."""
+    monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
+    one = inner(small_map.root, workers=1)
+    slow, quick = one.session(), one.session()
+    one.cells.selected(slow, Selected(1, ("0_0.pcd",), layers=("voxel(leaf=1.0)",), wait=300.0), one.now_s())
+    one.run_until(lambda: [worker.layers for worker in one.pool] == [1])
+    one.cells.selected(quick, Selected(2, ("20_20.pcd",), wait=300.0), one.now_s())
+    assert names(one.cells_of(2)) == ["20_20.pcd"]
+    assert [key.layer for key in one.settled] == ["points"]
+    one.offset_s += 31.0
+    assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
+
+
+def test_a_parent_that_vanishes_again_and_again(inner: Inner, small_map: DividedMap) -> None:
+    """Whose fault that is nobody knows; the load that was under way each time is given up at last."""
+    one = inner(small_map.root)
+    session = one.session()
+    one.everything()
+    small_map.change("0_0.pcd", 7)
+    one.reload()
+    with one.loaders_standing_still():
+        one.cells.selected(session, Selected(2, ("0_0.pcd",), wait=300.0), one.now_s())
+        for _ in range(3):
+            one.run_until(lambda: [worker.ready and bool(worker.queue) for worker in one.pool] == [True])
+            (worker,) = one.pool
+            with contextlib.suppress(ProcessLookupError):
+                stop(worker.pid)
+            os.kill(one.parent.pid, signal.SIGKILL)
+            assert wait_ended(worker.pid)
+            one.run_until(lambda gone=worker: gone not in list(one.pool))  # type: ignore[misc]
+    reply: Any = one.cells_of(2)
+    assert [failure.code for failure in reply.failed] == ["load_failed"]
+    assert "its loaders vanish" in reply.failed[0].message
+    one.cells.area(session, Area(3, EVERYWHERE, wait=30.0), one.now_s())
+    assert len(one.cells_of(3).cells) >= 15
