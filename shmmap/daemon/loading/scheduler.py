@@ -124,6 +124,8 @@ class Scheduler:
         if self._doubtful:
             self._drop_some()
         for _ in range(LOOKS_A_PUMP):
+            if not len(self.loads):
+                return
             points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
             load = self.loads.next_queued(points=points, layers=layers)
             if load is None:

@@ -62,10 +62,13 @@ class Worker:
         Its process, from when it is ``ready``.
     for_points
         It is the one more that computes nothing.
+    layers
+        How many of its jobs are layers to be computed.
     """
 
     channel: socket.socket
     for_points: bool = False
+    layers: int = 0
     pid: int = 0
     pidfd: int = -1
     queue: OrderedDict[int, Work] = field(default_factory=OrderedDict)
@@ -80,11 +83,6 @@ class Worker:
     def ready(self) -> bool:
         """Whether it has begun: its death is its job's fault from then on."""
         return self.pid != 0
-
-    @property
-    def layers(self) -> int:
-        """How many of its jobs are layers to be computed."""
-        return sum(map(is_computed, self.queue.values()))
 
 
 @dataclass(eq=False, slots=True)
@@ -187,6 +185,8 @@ class WorkerPool:
                 log.error("loader could not start", reason=error)
                 if worker is None:
                     return False
+        if worker.ready and _has_ended(worker.pidfd):
+            return False  # its parent is about to say so: the job would be taken for what it died of
         try:
             worker.channel.send(worker_messages.encode(job))
         except OSError:
@@ -194,6 +194,7 @@ class WorkerPool:
         if not worker.queue:
             worker.head_since_s = now_s
         worker.queue[job.number] = job
+        worker.layers += computed
         return True
 
     def answer(self, worker: Worker, message: worker_messages.Decision) -> None:
@@ -241,7 +242,8 @@ class WorkerPool:
 
     def finished(self, worker: Worker, number: int, now_s: float) -> float:
         """The worker is done with a job; its next one begins now.  Returns how long it took, seconds."""
-        worker.queue.pop(number, None)
+        job = worker.queue.pop(number, None)
+        worker.layers -= job is not None and is_computed(job)
         began_s, worker.head_since_s = worker.head_since_s, now_s
         return now_s - began_s
 

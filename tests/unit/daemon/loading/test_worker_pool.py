@@ -16,11 +16,11 @@ from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.loading.worker_messages import Check, Job
 from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Worker, WorkerPool
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.protocol.messages import Area, Selected
+from shmmap.protocol.messages import Selected
 from shmmap.segment.layout import NO_SOURCE
 from tests.support.daemon_process import stop, wait_ended
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
+from tests.unit.daemon.inner_daemon import Inner, names
 
 
 class NoParent:
@@ -122,34 +122,49 @@ def test_a_loader_that_computes_is_no_hindrance_to_points(
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
     one = inner(small_map.root, workers=1)
     slow, quick = one.session(), one.session()
-    one.cells.selected(slow, Selected(1, ("0_0.pcd",), layers=("voxel(leaf=1.0)",), wait=300.0), one.now_s())
+    one.ask(slow, Selected(1, ("0_0.pcd",), layers=("voxel(leaf=1.0)",), wait=300.0))
     one.run_until(lambda: [worker.layers for worker in one.pool] == [1])
-    one.cells.selected(quick, Selected(2, ("20_20.pcd",), wait=300.0), one.now_s())
+    one.ask(quick, Selected(2, ("20_20.pcd",), wait=300.0))
     assert names(one.cells_of(2)) == ["20_20.pcd"]
     assert [key.layer for key in one.settled] == ["points"]
     one.offset_s += 31.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
 
 
-def test_a_parent_that_vanishes_again_and_again(inner: Inner, small_map: DividedMap) -> None:
-    """Whose fault that is nobody knows; the load that was under way each time is given up at last."""
+def test_a_dead_loader_gets_no_job(inner: Inner, small_map: DividedMap) -> None:
+    """Until its parent has said that it ended, and how, nobody else would know that it is dead."""
     one = inner(small_map.root)
-    session = one.session()
     one.everything()
+    (worker,) = one.pool
+    stop(one.parent.pid)
+    os.kill(worker.pid, signal.SIGKILL)
+    assert wait_ended(worker.pid)
     small_map.change("0_0.pcd", 7)
     one.reload()
-    with one.loaders_standing_still():
-        one.cells.selected(session, Selected(2, ("0_0.pcd",), wait=300.0), one.now_s())
-        for _ in range(3):
-            one.run_until(lambda: [worker.ready and bool(worker.queue) for worker in one.pool] == [True])
-            (worker,) = one.pool
-            with contextlib.suppress(ProcessLookupError):
-                stop(worker.pid)
-            os.kill(one.parent.pid, signal.SIGKILL)
-            assert wait_ended(worker.pid)
-            one.run_until(lambda gone=worker: gone not in list(one.pool))  # type: ignore[misc]
-    reply: Any = one.cells_of(2)
+    one.ask(one.session(), Selected(2, ("0_0.pcd",), wait=30.0))
+    for _ in range(3):
+        one.turn()
+    assert list(one.pool) == [worker]
+    assert not worker.queue
+    os.kill(one.parent.pid, signal.SIGCONT)
+    assert names(one.cells_of(2)) == ["0_0.pcd"]
+
+
+def test_a_parent_that_vanishes_again_and_again(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose fault that is nobody knows; the load that was under way each time is given up at last."""
+    monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
+    one = inner(small_map.root)
+    wanted = ("0_0.pcd", "20_20.pcd")
+    one.ask(one.session(), Selected(1, wanted, wait=300.0))
+    for _ in range(3):
+        one.run_until(lambda: [worker.ready and len(worker.queue) for worker in one.pool] == [2])
+        (worker,) = one.pool
+        os.kill(one.parent.pid, signal.SIGKILL)
+        one.run_until(lambda gone=worker: gone not in list(one.pool))  # type: ignore[misc]
+        assert wait_ended(worker.pid)
+    reply: Any = one.cells_of(1)
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert "its loaders vanish" in reply.failed[0].message
-    one.cells.area(session, Area(3, EVERYWHERE, wait=30.0), one.now_s())
-    assert len(one.cells_of(3).cells) >= 15
+    assert names(reply) == ["20_20.pcd"]

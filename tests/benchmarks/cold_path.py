@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells that are not in memory yet: how long clients wait for them.
+
+    python -m tests.benchmarks.cold_path [cell window] [--against ../other] [--pairs 20]
+
+- ``cell``: one cold cell of 1 MB, from the request to its attached view; the loaders run already.
+- ``window``: four consumers need the same 120 MB as soon as a daemon is READY, until the last one has read
+  all points; against four that read the files into memory of their own.  Shown twice: as it is, and with the
+  processor time that the loaders' processes had used before READY added.
+
+With ``--against``, another checkout (see `tests.benchmarks.two_versions`) takes turns.  Printed are medians,
+and medians of the paired ratios.  Limits: the window in 0.65 of private copies on 4 KiB pages; a cell in
+3.5 ms, and in 0.8 of the time of version 0.2.0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import tempfile
+from pathlib import Path
+
+from tests.benchmarks.two_versions import python
+from tests.support.daemon_process import ROOT
+from tests.support.divided_map import make_map
+
+__all__ = ["main"]
+
+POINTS = 62_500  # of 16 bytes each
+
+_CELL = """
+import sys, time
+import shmmap
+from tests.support.daemon_process import DaemonProcess
+one = DaemonProcess(sys.argv[1], "--budget", "1G").start()
+client = shmmap.connect(one.endpoint)
+names = [cell.id for cell in client.around(0, 0, radius=500)]
+print("up", flush=True)
+for line in sys.stdin:
+    client.evict()
+    while client.stats().counters["zombies"]:
+        pass
+    took = []
+    for name in names[:20]:
+        before = time.perf_counter()
+        found = client.selected([name])
+        xyz = found[0].xyz
+        took.append(time.perf_counter() - before)
+        assert xyz.shape == (62500, 3)
+        del found, xyz
+    print(sorted(took)[len(took) // 2] * 1e3, flush=True)
+client.close()
+one.stop()
+one.dispose()
+"""
+
+_CONSUMER = """
+import os, sys
+from pathlib import Path
+import numpy as np
+import shmmap
+from shmmap.layers.contract import BUILT_ANYWHERE
+from shmmap.layers.sources import read_source
+paths = sorted(str(path) for path in Path(sys.argv[1]).glob("**/*.pcd") if path.is_file())
+print("up", flush=True)
+for line in sys.stdin:
+    what = line.strip()
+    if what == "private":
+        kept = [read_source(path, BUILT_ANYWHERE, None).points.columns for path in paths]
+        clouds = [columns["xyz"] for columns in kept]
+    else:
+        client = shmmap.connect(what)
+        kept = client.around(0, 0, radius=500, wait=60.0).raise_for_failures()
+        clouds = [cell.xyz for cell in kept]
+    total = sum(float(cloud.sum(dtype=np.float64)) for cloud in clouds)
+    print(len(clouds), sum(map(len, clouds)), flush=True)
+"""
+
+_WINDOW = """
+import json, os, subprocess, sys, time
+from tests.support.daemon_process import DaemonProcess
+ticks = os.sysconf("SC_CLK_TCK")
+def cpu_s(pid):
+    words = open(f"/proc/{pid}/stat").read().rsplit(")", 1)[1].split()
+    return (int(words[11]) + int(words[12])) / ticks
+def consumers():
+    started = [
+        subprocess.Popen([sys.executable, "-c", sys.argv[2], sys.argv[1]],
+                         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for _ in range(4)
+    ]
+    for one in started:
+        assert one.stdout.readline().strip() == "up"
+    return started
+def served(started, what):
+    before = time.perf_counter()
+    for one in started:
+        one.stdin.write(what + "\\n")
+        one.stdin.flush()
+    said = {one.stdout.readline() for one in started}
+    took = time.perf_counter() - before
+    assert said == {"120 7500000\\n"}, said
+    for one in started:
+        one.communicate()
+    return took
+print("up", flush=True)
+for line in sys.stdin:
+    waiting = consumers()
+    if line.strip() == "private":
+        print(json.dumps([served(waiting, "private"), 0.0]), flush=True)
+        continue
+    one = DaemonProcess(sys.argv[1], "--budget", "1G").start()
+    before_s = sum(map(cpu_s, one.children()))
+    took = served(waiting, one.endpoint)
+    one.stop()
+    one.dispose()
+    print(json.dumps([took, before_s]), flush=True)
+"""
+
+
+class Measuring:
+    """A program of one checkout that measures whenever it is told to."""
+
+    def __init__(self, checkout: Path, program: str, *arguments: str) -> None:
+        self._process = subprocess.Popen(
+            [python(checkout), "-c", program, *arguments],
+            cwd=checkout, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+        assert self._say() == "up"
+
+    def _say(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    def measure(self, what: str = "") -> str:
+        """Return what it found."""
+        assert self._process.stdin is not None
+        print(what, file=self._process.stdin, flush=True)
+        return self._say()
+
+    def close(self) -> None:
+        """End it."""
+        self._process.communicate()
+
+
+def ratio(some: list[float], others: list[float]) -> float:
+    """Return the median of the paired ratios."""
+    return statistics.median(mine / other for mine, other in zip(some, others, strict=True))
+
+
+def cold_cell(folder: Path, checkouts: list[Path], pairs: int) -> None:
+    """Measure and print how long one cold cell takes."""
+    made = make_map(folder / "cells", columns=8, rows=8, points=POINTS)
+    programs = [Measuring(checkout, _CELL, str(made.root)) for checkout in checkouts]
+    times: list[list[float]] = [[] for _ in checkouts]
+    for number in range(pairs + 1):
+        for at in range(len(programs))[:: -1 if number % 2 else 1]:
+            found = float(programs[at].measure())
+            if number:  # the first one warms up
+                times[at].append(found)
+    for program in programs:
+        program.close()
+    print(f"one cold cell of 1 MB, medians of {pairs} times 20 (limit 3.5 ms, 0.8 of 0.2.0)")
+    for checkout, values in zip(checkouts, times, strict=True):
+        line = f"  {statistics.median(values):6.2f} ms  least {min(values):5.2f}"
+        line += f"  {ratio(times[0], values):5.2f} of it here" if checkout != ROOT else "  here"
+        print(f"{line}  {checkout}")
+
+
+def first_window(folder: Path, checkouts: list[Path], pairs: int) -> None:
+    """Measure and print how long the first window of four consumers takes."""
+    made = make_map(folder / "window", columns=12, rows=10, points=POINTS)
+    programs = [Measuring(checkout, _WINDOW, str(made.root), _CONSUMER) for checkout in checkouts]
+    shared: list[list[tuple[float, float]]] = [[] for _ in checkouts]
+    private: list[float] = []
+    for number in range(pairs + 1):
+        found = [json.loads(program.measure("shared")) for program in programs]
+        alone = json.loads(programs[0].measure("private"))[0]
+        if number:
+            private.append(alone)
+            for values, (took, before) in zip(shared, found, strict=True):
+                values.append((took, took + before))
+    for program in programs:
+        program.close()
+    print(f"first window of 120 MB, four consumers, medians of {pairs} (limit 0.65)")
+    print(f"  {statistics.median(private):6.3f} s  private copies")
+    for checkout, found in zip(checkouts, shared, strict=True):
+        took, whole = [list(values) for values in zip(*found, strict=True)]
+        print(
+            f"  {statistics.median(took):6.3f} s  {ratio(took, private):5.2f} of that;"
+            f" with processor time before READY {ratio(whole, private):5.2f}  {checkout}"
+        )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("what", nargs="*", default=["cell", "window"], metavar="cell window")
+    parser.add_argument("--against", type=Path, help="another checkout")
+    parser.add_argument("--pairs", type=int, default=20)
+    args = parser.parse_args()
+    checkouts = [ROOT, *([args.against.resolve()] if args.against else [])]
+    print(f"load {os.getloadavg()[0]:.1f}")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if "cell" in args.what:
+            cold_cell(folder, checkouts, args.pairs)
+        if "window" in args.what:
+            first_window(folder, checkouts, max(3, args.pairs // 3))
+
+
+if __name__ == "__main__":
+    main()
