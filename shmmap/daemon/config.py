@@ -73,7 +73,8 @@ class DaemonConfig:
         What one client may keep for itself alone: a part of the budget (up to 1), or bytes (above 1).
     workers
         Most loader processes at a time; 0: one less than there are processors, from 1 to 4, so that
-        one is left for who is being served while cells load.
+        one is left for who is being served while cells load.  While all of them compute layers there is one
+        more, for points alone.
     load_timeout_s
         How long loading one cell may take.
     strict

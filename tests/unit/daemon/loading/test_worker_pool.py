@@ -17,7 +17,6 @@ from shmmap.daemon.loading.worker_messages import Check, Job
 from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Worker, WorkerPool
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.protocol.messages import Selected
-from shmmap.segment.layout import NO_SOURCE
 from tests.support.daemon_process import stop, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, names
@@ -50,7 +49,7 @@ class Jobs:
         self.number += 1
         job: Work = Job(self.number, "cell", "/cell.pcd", layer, (0.0,) * 4, "map", 0)
         if layer == "check":
-            job = Check(self.number, "/cell.pcd", "", NO_SOURCE)
+            job = Check(self.number, "/cell.pcd", "", b"")
         if not self.pool.has_room(computed=layer == "ndt"):
             return False
         return self.pool.submit(job, 0.0)
