@@ -102,7 +102,7 @@ class MapInMemory:
         cache = (config.cache_dir, str(config.cache_bytes)) if config.cache_dir else ()
         parent = PreparedParent((directory.path, str(loader_bytes(group_limit)), *cache), self.watched)
         parent.start()  # it imports what loaders need while this process gets ready
-        pool = WorkerPool(config.loaders(), parent, config.load_timeout_s, self.watched)
+        pool = WorkerPool(config.loaders(), directory, parent, config.load_timeout_s, self.watched)
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(self.cache, self.map_switch, pool, clock=time.monotonic)
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())

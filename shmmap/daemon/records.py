@@ -7,7 +7,6 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from shmmap.layers.points import LAYER
 from shmmap.segment.version import Stamp
 
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired"]
@@ -72,9 +71,9 @@ class Load:
     ``adopted`` is a segment of an earlier life that only has to be checked, ``unless`` the state of a file
     that could not be loaded: in that state it is not tried again.  ``wanted`` says that somebody asked for
     it, ``sources`` and ``version`` what the catalogue knew of its file and its neighbours', and which version
-    that makes, when a worker was given the job.
-    ``payer`` is whose turn was used for it, ``charged_s`` the loader's time that it was taken to need, and
-    ``spent_s`` the time that it did; ``losses`` counts loaders that were lost without its doing.
+    that makes, when a worker was given the job.  ``computed`` says that it is a layer that is computed, which
+    may take long.  ``payer`` is whose turn was used for it, ``charged_s`` the loader's time that it was taken
+    to need, and ``spent_s`` the time that it did; ``losses`` counts loaders that were lost without its doing.
     """
 
     key: Key
@@ -94,11 +93,7 @@ class Load:
     charged_s: float = 0.0
     spent_s: float = 0.0
     losses: int = 0
-
-    @property
-    def computed(self) -> bool:
-        """Whether it is a layer that is computed, which may take long."""
-        return self.key.layer != LAYER
+    computed: bool = False
 
 
 @dataclass(slots=True)

@@ -17,6 +17,7 @@ from typing import Final
 
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
+from shmmap.layers.points import LAYER
 from shmmap.segment.version import Stamp
 
 __all__ = ["BACKGROUND", "LoadQueue", "Loads"]
@@ -177,7 +178,9 @@ class Loads:
         load = self.by_key.get(key)
         if load is None:
             self._numbers += 1
-            load = self.by_key[key] = Load(key, estimate, priority, self._numbers, asker=asker)
+            load = self.by_key[key] = Load(
+                key, estimate, priority, self._numbers, asker=asker, computed=key.layer != LAYER
+            )
         elif load.running:
             load.wanted = True
             return load

@@ -209,41 +209,42 @@ class Scheduler:
         if received is None:
             return
         message, fd = received
+        if isinstance(message, Ready) and fd >= 0:
+            self.pool.begun(worker, message.pid, fd, now_s)
+            return
+        if fd >= 0:
+            os.close(fd)
+        if isinstance(message, Ended):
+            self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
+        elif isinstance(message, Ready):  # this process had no descriptor left to receive it
+            self.lost.ended(worker, "too many open files", now_s)
+        elif isinstance(message, Need):
+            self.room.ask(worker, message)
+            self.room.feed(self._jobs, now_s)
+        else:
+            self._on_end(worker, message, now_s)
+
+    def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
+        """A worker is done with a job, in whichever way."""
+        fd, spent_s = self.pool.finished(worker, message.number, now_s)
+        self.room.hungry.pop(message.number, None)
+        load = self._jobs.pop(message.number, None)
         try:
-            if isinstance(message, Ended):
-                self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
-            elif isinstance(message, Ready):
-                if fd < 0:  # this process had no descriptor left to receive it
-                    self.lost.ended(worker, "too many open files", now_s)
-                    return
-                self.pool.begun(worker, message.pid, fd, now_s)
-                fd = -1
-            elif isinstance(message, Need):
-                self.room.ask(worker, message)
-                self.room.feed(self._jobs, now_s)
-            else:
-                self._on_end(worker, message, fd, now_s)
+            if load is None:
+                return
+            load.spent_s = spent_s
+            if isinstance(message, Checked):
+                self._on_checked(load, message, now_s)
+            elif isinstance(message, Failed):
+                self._fail(load, message.code, message.message, message.stamp, now_s)
+            elif fd >= 0:
+                step("daemon.received")
+                self._publish(load, message, fd, now_s)
+            else:  # it was only to be checked
+                self._fail(load, "load_failed", "the loader says it has a segment", None, now_s)
         finally:
             if fd >= 0:
                 os.close(fd)
-
-    def _on_end(self, worker: Worker, message: Done | Checked | Failed, fd: int, now_s: float) -> None:
-        """A worker is done with a job, in whichever way; ``fd`` is the segment, -1 for none."""
-        spent_s = self.pool.finished(worker, message.number, now_s)
-        self.room.hungry.pop(message.number, None)
-        load = self._jobs.pop(message.number, None)
-        if load is None:
-            return
-        load.spent_s = spent_s
-        if isinstance(message, Checked):
-            self._on_checked(load, message, now_s)
-        elif isinstance(message, Failed):
-            self._fail(load, message.code, message.message, message.stamp, now_s)
-        elif fd >= 0:
-            step("daemon.received")
-            self._publish(load, message, fd, now_s)
-        else:  # this process had no descriptor left to receive it
-            self._fail(load, "load_failed", "the finished segment did not arrive", None, now_s)
 
     def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
         """Have a finished segment handed out from now on."""

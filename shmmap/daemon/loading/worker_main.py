@@ -3,8 +3,8 @@
 
 It is forked from one that has imported what is needed (`shmmap.daemon.loading.parent_main`).
 
-It is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish: it passes
-the finished, unnamed segment to the daemon, so that an orphan leaves nothing behind.
+It is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish: it fills a file
+without a name that the daemon has made, so that an orphan leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class _Worker:
     channel: socket.socket
     directory: ShmDirectory
     cache: LayerCache | None
-    _waiting: list[worker_messages.Job | worker_messages.Check] = field(default_factory=list)
+    _waiting: list[tuple[worker_messages.ToWorker, int]] = field(default_factory=list)
     _light: bool = False
     _buffer: bytearray = field(default_factory=packet_buffer)
 
@@ -71,18 +71,19 @@ class _Worker:
         self._send(worker_messages.Ready(os.getpid()), pidfd)
         os.close(pidfd)
         while True:
-            job = self._waiting.pop(0) if self._waiting else self._receive()
+            job, fd = self._waiting.pop(0) if self._waiting else self._receive()
             if job is None:
                 return
             self._light = self._light or weigh_less()
             if isinstance(job, worker_messages.Job):
-                self._load(job)
+                self._load(job, fd)
             elif isinstance(job, worker_messages.Check):
                 self._check(job)
 
-    def _receive(self) -> worker_messages.ToWorker | None:
-        data, _ = receive_packet(self.channel, self._buffer)
-        return worker_messages.decode_to_worker(data) if data else None
+    def _receive(self) -> tuple[worker_messages.ToWorker | None, int]:
+        """Return the next message and the descriptor that came with it; None when the channel is closed."""
+        data, fd = receive_packet(self.channel, self._buffer)
+        return (worker_messages.decode_to_worker(data) if data else None), fd
 
     def _send(self, message: worker_messages.FromWorker, fd: int | None = None) -> None:
         packet = worker_messages.encode(message)
@@ -97,38 +98,37 @@ class _Worker:
         if nbytes > job.granted:
             self._send(worker_messages.Need(job.number, nbytes))
             while True:
-                answer = self._receive()
+                answer, fd = self._receive()
                 if answer is None:
                     raise BrokenPipeError
                 if isinstance(answer, worker_messages.Job | worker_messages.Check):
-                    self._waiting.append(answer)
+                    self._waiting.append((answer, fd))
                 elif not answer.granted:
                     raise _Refused
                 else:
                     job.granted = nbytes
                     return
 
-    def _load(self, job: worker_messages.Job) -> None:
+    def _load(self, job: worker_messages.Job, fd: int) -> None:
+        """Fill the file that came with a job, and close it before anything is said of it."""
         started_ns = time.monotonic_ns()
         try:
-            _test_hook(job.path)
-            fd = self.directory.create()
             try:
+                _test_hook(job.path)
                 step("worker.alloc")
                 made = self._make(job, fd)
-                header = made.header
-                done = worker_messages.Done(
-                    job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
-                    header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
-                    tuple(warning[:500] for warning in made.warnings[:20]),
-                    tuple(stamp.token for stamp in made.neighbours), made.cached,
-                )  # fmt: skip
-                lock_slot(fd, LOADER_SLOT)
-                step("worker.pass")
-                self._send(done, fd)
-                step("worker.passed")
             finally:
                 os.close(fd)
+            header = made.header
+            done = worker_messages.Done(
+                job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
+                header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
+                tuple(warning[:500] for warning in made.warnings[:20]),
+                tuple(stamp.token for stamp in made.neighbours), made.cached,
+            )  # fmt: skip
+            step("worker.pass")
+            self._send(done)
+            step("worker.passed")
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except Offline as error:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the daemon and its loader workers say to each other.
 
-One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Done`
-also carries the finished segment's file descriptor.  Both ends are always the same version of shmmap,
-so this is no public protocol.
+One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Job` also carries the
+descriptor of the file that the segment goes into, which has no name.  Both ends are always the same version
+of shmmap, so this is no public protocol.
 """
 
 from __future__ import annotations
@@ -83,10 +83,9 @@ class Need(msgspec.Struct, array_like=True, tag="need"):
 
 
 class Done(msgspec.Struct, array_like=True, tag="done"):
-    """A finished segment: the descriptor that comes with the packet.
+    """The segment is finished, and the worker has closed its own descriptor of it.
 
-    The worker closes its own at once.  Until it has, the kernel takes the segment for one in use; whose use
-    that is shows by the lock of `shmmap.segment.pins.LOADER_SLOT`.
+    That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
     the disk cache.

@@ -8,6 +8,7 @@ compute nothing, and while all compute one more is kept for points alone.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import signal
@@ -26,6 +27,7 @@ from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import channel
+from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["Work", "Worker", "WorkerPool"]
 
@@ -64,6 +66,8 @@ class Worker:
         It is the one more that computes nothing.
     layers
         How many of its jobs are layers to be computed.
+    segments
+        Files without names that its jobs' segments go into, by job.
     """
 
     channel: socket.socket
@@ -72,6 +76,7 @@ class Worker:
     pid: int = 0
     pidfd: int = -1
     queue: OrderedDict[int, Work] = field(default_factory=OrderedDict)
+    segments: dict[int, int] = field(default_factory=dict)
     head_since_s: float = 0.0
 
     @property
@@ -93,6 +98,8 @@ class WorkerPool:
     ----------
     limit
         Most workers at a time.
+    directory
+        Where segments are made.
     parent
         Makes them.
     deadline_s
@@ -109,6 +116,7 @@ class WorkerPool:
     """
 
     limit: int
+    directory: ShmDirectory
     parent: PreparedParent
     deadline_s: float
     watched: WatchedDescriptors
@@ -188,14 +196,30 @@ class WorkerPool:
         if worker.ready and _has_ended(worker.pidfd):
             return False  # its parent is about to say so: the job would be taken for what it died of
         try:
-            worker.channel.send(worker_messages.encode(job))
-        except OSError:
+            self._send(worker, job)
+        except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EPIPE, errno.ECONNRESET):
+                log.error("no file for a segment", reason=error)
             return False  # full or dying: its end is reported by its channel
         if not worker.queue:
             worker.head_since_s = now_s
         worker.queue[job.number] = job
         worker.layers += computed
         return True
+
+    def _send(self, worker: Worker, job: Work) -> None:
+        """Send a job, and an empty file with one that makes a segment."""
+        packet = worker_messages.encode(job)
+        if isinstance(job, worker_messages.Check):
+            worker.channel.send(packet)
+            return
+        fd = self.directory.create()
+        try:
+            socket.send_fds(worker.channel, [packet], [fd])
+        except BaseException:
+            os.close(fd)
+            raise
+        worker.segments[job.number] = fd
 
     def answer(self, worker: Worker, message: worker_messages.Decision) -> None:
         """Answer a worker's `worker_messages.Need`."""
@@ -240,12 +264,20 @@ class WorkerPool:
         worker.head_since_s = now_s
         self.failed_starts = 0
 
-    def finished(self, worker: Worker, number: int, now_s: float) -> float:
-        """The worker is done with a job; its next one begins now.  Returns how long it took, seconds."""
+    def finished(self, worker: Worker, number: int, now_s: float) -> tuple[int, float]:
+        """The worker is done with a job; its next one begins now.
+
+        Returns
+        -------
+        fd
+            The file that its segment is in, the caller's to close; -1 for none.
+        spent_s
+            How long it took, seconds.
+        """
         job = worker.queue.pop(number, None)
         worker.layers -= job is not None and is_computed(job)
         began_s, worker.head_since_s = worker.head_since_s, now_s
-        return now_s - began_s
+        return worker.segments.pop(number, -1), now_s - began_s
 
     # --- their end ------------------------------------------------------------------------------
 
@@ -254,6 +286,9 @@ class WorkerPool:
         self.watched.unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
+        for fd in worker.segments.values():
+            os.close(fd)
+        worker.segments.clear()
         pidfd, worker.pidfd = worker.pidfd, -1
         if pidfd >= 0:
             with contextlib.suppress(ProcessLookupError):

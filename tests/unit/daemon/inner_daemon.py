@@ -95,7 +95,7 @@ class InnerDaemon:
         self.evictor = Evictor(self.reclaimer, POLICIES["distance"])
         self.watched = WatchedDescriptors()
         self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
-        self.pool = WorkerPool(workers, self.parent, load_timeout_s, self.watched)
+        self.pool = WorkerPool(workers, self.directory, self.parent, load_timeout_s, self.watched)
         self.settled: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -117,18 +116,16 @@ class Puppet:
         self.one.run_until(lambda: len(self.worker.queue) == count)
         return [job for job in self.worker.queue.values() if isinstance(job, worker_messages.Job)]
 
-    def say(self, message: object, fd: int | None = None) -> None:
-        socket.send_fds(self.channel, [worker_messages.encode(message)], [] if fd is None else [fd])
+    def say(self, message: object) -> None:
+        self.channel.send(worker_messages.encode(message))
 
     def done(self, job: worker_messages.Job) -> worker_messages.Done:
+        """What to say of a job, whose file is filled."""
+        if job.number in self.worker.segments:
+            os.posix_fallocate(self.worker.segments[job.number], 0, 4096)
         state = SourceStamp.of(os.stat(job.path))
         version = CellJob(job.cell_id, job.path, job.box).version(layer_spec(job.layer), state, ())
         return worker_messages.Done(job.number, 4096, 1, 0, 0.0, 1.0, version, state.token, 1)
-
-    def segment(self) -> int:
-        fd = self.one.directory.create()
-        os.posix_fallocate(fd, 0, 4096)
-        return fd
 
 
 @pytest.fixture
@@ -166,9 +163,7 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     one = puppet.one
     ask(one, 1)
     first, second = puppet.queue(4)[:2]
-    fd = puppet.segment()
-    puppet.say(puppet.done(first), fd)
-    os.close(fd)
+    puppet.say(puppet.done(first))
     puppet.process.kill()
     puppet.say(worker_messages.Ended(-9))
     puppet.channel.close()
@@ -248,10 +243,11 @@ def test_a_signal_without_a_name(puppet: Puppet) -> None:
 
 
 def test_done_without_a_segment(puppet: Puppet) -> None:
-    """As when this process has no descriptor left: the load fails, nothing stays reserved for it."""
+    """The job had no file to fill: the load fails, nothing stays reserved for it."""
     one = puppet.one
     one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=30.0))
     (job,) = puppet.queue(1)
+    os.close(puppet.worker.segments.pop(job.number))
     puppet.say(puppet.done(job))
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_failed"]
     assert one.ledger.reserved_bytes == 0
@@ -268,9 +264,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
     puppet.say(worker_messages.Need(12346, 1 << 20))
     puppet.say(worker_messages.Need(queue[0].number, -5))
     for job in queue:
-        fd = puppet.segment()
-        puppet.say(puppet.done(job), fd)
-        os.close(fd)
+        puppet.say(puppet.done(job))
     assert len(one.cells_of(1).cells) == 4
     packets = [puppet.channel.recv(65536) for _ in range(5)]
     *jobs, decision = map(worker_messages.decode_to_worker, packets)

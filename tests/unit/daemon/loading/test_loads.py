@@ -122,7 +122,8 @@ def test_what_goes_back_costs_nothing() -> None:
 
 def test_points_pass_layers_that_nobody_can_take() -> None:
     queue = LoadQueue()
-    layer, points = load(), Load(Key("", "points"), 1 << 20, 0.0, next(_numbers))
+    layer, points = load(), load()
+    layer.computed = True
     queue.push(layer, 0.0, "a")
     queue.push(points, 9.0, "a")
     assert queue.next(layers=False) is points

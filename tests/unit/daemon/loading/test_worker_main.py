@@ -22,7 +22,7 @@ import shmmap
 from shmmap.daemon.loading import worker_messages
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.pins import LOADER_SLOT, holders, in_use, prepare_process
+from shmmap.segment.pins import in_use, prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.version import cell_version
 from tests.support.daemon_process import wait_ended, wait_readable
@@ -47,6 +47,7 @@ class Parent:
     """The process that loaders are forked from, and our end of its channel."""
 
     def __init__(self, shm_dir: str, memory_bytes: int = 2 << 30, **environment: str) -> None:
+        self.shm_dir = shm_dir
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.settimeout(PATIENCE_S)
         self.process = subprocess.Popen(
@@ -81,6 +82,7 @@ class Loader:
     """One loader process and our end of its channel."""
 
     def __init__(self, parent: Parent) -> None:
+        self.shm_dir, self.segments = parent.shm_dir, dict[int, int]()
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.settimeout(PATIENCE_S)
         with theirs:
@@ -90,14 +92,24 @@ class Loader:
         self.pid = ready.pid
 
     def send(self, message: msgspec.Struct) -> None:
-        self.channel.send(worker_messages.encode(message))
+        """Send a message, and a file with a job."""
+        packet = worker_messages.encode(message)
+        if isinstance(message, worker_messages.Job):
+            fd = self.segments[message.number] = os.open(self.shm_dir, os.O_TMPFILE | os.O_RDWR, 0o400)
+            socket.send_fds(self.channel, [packet], [fd])
+        else:
+            self.channel.send(packet)
 
     def receive(self) -> tuple[worker_messages.FromWorker, int]:
-        """Return the next message; with `worker_messages.Done`, the descriptor that came with it."""
+        """Return the next message; with `worker_messages.Done` the segment, the caller's to close."""
         data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
         assert data, "the loader closed its channel"
         message = worker_messages.decode_from_worker(data)
-        assert bool(fds) is isinstance(message, worker_messages.Done | worker_messages.Ready)
+        assert bool(fds) is isinstance(message, worker_messages.Ready)
+        if isinstance(message, worker_messages.Failed):
+            os.close(self.segments.pop(message.number))
+        if isinstance(message, worker_messages.Done):
+            return message, self.segments.pop(message.number)
         return message, fds[0] if fds else -1
 
     def load(self, number: int, path: Path, granted: int = 1 << 30) -> None:
@@ -127,7 +139,8 @@ class Loader:
     def close(self) -> None:
         """Close our end."""
         self.channel.close()
-        os.close(self.pidfd)
+        for fd in (self.pidfd, *self.segments.values()):
+            os.close(fd)
 
 
 @pytest.fixture
@@ -417,22 +430,16 @@ def test_a_loader_that_cannot_be_watched_is_none(parent: Parent) -> None:
     assert parent.fork().end() == 0
 
 
-def test_it_does_not_keep_what_it_passed_on(loader: Loader, tmp_path: Path) -> None:
-    """An open file would look like a reader's pin: once it says the next word ours is the only one.
-
-    Until then a lock tells whose the file is.
-    """
-    opened = []
+def test_it_does_not_keep_what_it_filled(loader: Loader, tmp_path: Path) -> None:
+    """An open file would look like a reader's pin: once it says "done" ours is the only one."""
     for number in range(20):
         loader.load(number, cell(tmp_path / f"{number}.pcd", 10))
         done, fd = loader.receive()
-        assert isinstance(done, worker_messages.Done)
-        opened.append(os.open(f"/proc/self/fd/{fd}", os.O_RDONLY))
-        assert holders(opened[-1]) == [LOADER_SLOT]
-        os.close(fd)
-    loader.load(99, tmp_path / "none.pcd")
-    assert isinstance(loader.receive()[0], worker_messages.Failed)
-    for again in opened:
+        try:
+            assert isinstance(done, worker_messages.Done)
+            again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY)
+        finally:
+            os.close(fd)
         assert not in_use(again)
         os.close(again)
 

@@ -17,6 +17,7 @@ from shmmap.daemon.loading.worker_messages import Check, Job
 from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Worker, WorkerPool
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.protocol.messages import Selected
+from shmmap.segment.directory import ShmDirectory
 from tests.support.daemon_process import stop, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, names
@@ -42,7 +43,8 @@ class Jobs:
     def __init__(self, limit: int) -> None:
         self.watched = WatchedDescriptors()
         parent = cast("PreparedParent", NoParent())
-        self.pool = WorkerPool(limit, parent, 30.0, self.watched)
+        self.directory = ShmDirectory("/dev/shm")
+        self.pool = WorkerPool(limit, self.directory, parent, 30.0, self.watched)
         self.number = 0
 
     def give(self, layer: str) -> bool:
@@ -59,7 +61,10 @@ class Jobs:
         return [list(worker.queue) for worker in self.pool]
 
     def done(self, worker: Worker) -> None:
-        self.pool.finished(worker, next(iter(worker.queue)), 1.0)
+        fd, spent_s = self.pool.finished(worker, next(iter(worker.queue)), 1.0)
+        assert spent_s >= 0.0
+        if fd >= 0:  # a check has none
+            os.close(fd)
 
 
 @contextlib.contextmanager
@@ -70,6 +75,7 @@ def jobs(limit: int) -> Iterator[Jobs]:
     finally:
         one.pool.close()
         one.watched.close()
+        one.directory.close()
 
 
 @pytest.mark.parametrize("limit", [1, 2, 4])
@@ -126,6 +132,7 @@ def test_a_loader_that_computes_is_no_hindrance_to_points(
     one.ask(quick, Selected(2, ("20_20.pcd",), wait=300.0))
     assert names(one.cells_of(2)) == ["20_20.pcd"]
     assert [key.layer for key in one.settled] == ["points"]
+    one.run_until(lambda: all(worker.ready for worker in one.pool))
     one.offset_s += 31.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
 
