@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from shmmap.errors import NoSocket
 from shmmap.protocol.endpoint import DEFAULT_INSTANCE, endpoint_path, runtime_dirs, socket_path
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
 
+ANSWER_S: Final = 5.0
+"""How long a verb waits for a daemon that is there, to connect and for each answer."""
 
 def _setting(args: argparse.Namespace, name: str) -> str:
     flag: str | None = getattr(args, name)
@@ -97,7 +99,7 @@ def _instances(directory: str) -> list[str]:
 
 
 def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
-    """Connect to the daemon; without ``--timeout`` the library's own deadlines hold.
+    """Connect to the daemon, and give up sooner than programs do: who types a verb waits for it.
 
     Parameters
     ----------
@@ -108,5 +110,8 @@ def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
     """
     import shmmap
 
-    deadlines = {} if args.timeout is None else {"timeout": args.timeout, "connect_timeout": args.timeout}
-    return shmmap.connect(endpoint(args), **deadlines, name=name, shm_dir=_setting(args, "shm_dir") or None)
+    timeout_s = ANSWER_S if args.timeout is None else args.timeout
+    return shmmap.connect(
+        endpoint(args), timeout=timeout_s, connect_timeout=timeout_s, name=name,
+        shm_dir=_setting(args, "shm_dir") or None,
+    )  # fmt: skip

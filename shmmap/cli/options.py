@@ -179,7 +179,7 @@ def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) ->
         "--timeout",
         metavar="SECONDS",
         type=seconds,
-        help="how long to wait for the daemon (default: 0.9 to connect, 5 for an answer)",
+        help="how long to wait for the daemon (default: 5)",
     )
 
 

@@ -5,78 +5,67 @@ from __future__ import annotations
 
 import contextlib
 import os
-from functools import partial
+import weakref
+from collections import deque
 from queue import Empty, SimpleQueue
-from typing import Final, TypeAlias
+from typing import Final
 from weakref import WeakValueDictionary
 
 from shmmap.client.cell import Cell
 from shmmap.protocol.messages import Handle
-from shmmap.segment.attach import attach, unmap
+from shmmap.segment.attach import attach
+from shmmap.segment.owned import Owned
 
-__all__ = ["Attacher", "Mapping", "Unmapper"]
-
-Mapping: TypeAlias = tuple[int, int, int]
-"""Version of the cell it was, address, bytes."""
+__all__ = ["Attacher", "Unmapper"]
 
 
 class Unmapper:
-    """Where mappings go when their last view is gone: to the kernel at once, or to a thread.
+    """Where mapped memory goes when its last view is gone: nowhere, which unmaps it, or to a thread.
 
     Views end wherever the last reference to them is dropped, in any thread and in the middle of
     anything, so nothing here takes a lock; `queue.SimpleQueue` is made for that.
-
-    Attributes
-    ----------
-    unmapped : SimpleQueue of int
-        Versions whose mappings are gone, not yet told to the daemon.
     """
 
     def __init__(self) -> None:
         self._pid = os.getpid()
-        self._sinks: tuple[SimpleQueue[Mapping | None], ...] = ()
-        self.unmapped: SimpleQueue[int] = SimpleQueue()
-        # kept here, for mappings that end while the interpreter shuts down
-        self._getpid: Final = os.getpid
-        self._unmap: Final = unmap
+        self._sinks: tuple[SimpleQueue[Owned | None], ...] = ()
+        self._getpid: Final = os.getpid  # kept here, for memory that ends while the interpreter shuts down
 
-    def __call__(self, version: int, address: int, nbytes: int) -> None:
-        """Take a mapping that nobody looks at any more."""
+    def __call__(self, memory: Owned) -> None:
+        """Take memory that nobody looks at any more."""
         sinks = self._sinks
         if sinks and self._getpid() == self._pid:
-            sinks[0].put((version, address, nbytes))
+            sinks[0].put(memory)
             if sinks[0] not in self._sinks:  # its thread ended meanwhile
-                self._drain(sinks[0])
-        else:
-            self.finish((version, address, nbytes))
+                _drain(sinks[0])
 
-    def finish(self, mapping: Mapping) -> None:
-        """Unmap now."""
-        version, address, nbytes = mapping
-        self._unmap(address, nbytes)
-        self.unmapped.put(version)
-
-    def defer_to(self, queue: SimpleQueue[Mapping | None]) -> None:
-        """From now on hand mappings to a queue, whose thread calls `finish` with each."""
+    def defer_to(self, queue: SimpleQueue[Owned | None]) -> None:
+        """From now on hand memory to a queue, whose thread drops it: that unmaps it."""
         self._sinks = (*self._sinks, queue)
 
-    def stop_deferring(self, queue: SimpleQueue[Mapping | None]) -> None:
+    def stop_deferring(self, queue: SimpleQueue[Owned | None]) -> None:
         """End `defer_to`: the queue's thread ended."""
         self._sinks = tuple(other for other in self._sinks if other is not queue)
-        self._drain(queue)
-
-    def _drain(self, queue: SimpleQueue[Mapping | None]) -> None:
-        with contextlib.suppress(Empty):
-            while True:
-                mapping = queue.get_nowait()
-                if mapping is not None:
-                    self.finish(mapping)
+        _drain(queue)
 
     def restart_in_child(self) -> None:
-        """After a fork: the threads that mappings were handed to stayed in the parent."""
+        """After a fork: the threads that memory was handed to stayed in the parent."""
         self._pid = os.getpid()
         self._sinks = ()
-        self.unmapped = SimpleQueue()
+
+
+def _drain(queue: SimpleQueue[Owned | None]) -> None:
+    with contextlib.suppress(Empty):
+        while True:
+            queue.get_nowait()
+
+
+class _Mapped(weakref.ref[Owned]):
+    """Mapped memory that its version is known of, also when it is mapped no more."""
+
+    __slots__ = ("version",)
+
+    version: int
 
 
 class Attacher:
@@ -91,7 +80,9 @@ class Attacher:
     def __init__(self) -> None:
         self.unmapper = Unmapper()
         self._cells: WeakValueDictionary[tuple[int, str], Cell] = WeakValueDictionary()
-        self._mapped: dict[int, int] = {}
+        self._mapped: dict[int, set[_Mapped]] = {}
+        self._ended: deque[_Mapped] = deque()
+        self._unmapped: list[int] = []
 
     def attach(
         self,
@@ -126,28 +117,37 @@ class Attacher:
             slot=slot,
             owner=owner,
             populate=populate,
-            on_unmap=partial(self.unmapper, handle.version),
+            on_unmap=self.unmapper,
+            on_mapped=lambda memory: self._note(memory, handle.version),
         )
-        self._mapped[handle.version] = self._mapped.get(handle.version, 0) + 1
         cell = self._cells[key] = Cell(cell_id, segment, handle, attached)
         return cell
 
+    def _note(self, memory: Owned, version: int) -> None:
+        """Memory is mapped for a version; when and wherever it is unmapped, that is noted by itself."""
+        mapped = _Mapped(memory, self._ended.append)
+        mapped.version = version
+        self._mapped.setdefault(version, set()).add(mapped)
+
     @property
     def any_mapped(self) -> bool:
-        """Whether this client still has anything mapped, as far as `take_unmapped` was told."""
+        """Whether this client still has anything mapped, as of the last `unmapped`."""
         return bool(self._mapped)
 
-    def take_unmapped(self) -> list[int]:
-        """Versions of which nothing is mapped any more, each told once."""
-        if self.unmapper.unmapped.empty():
-            return []
-        gone: list[int] = []
-        with contextlib.suppress(Empty):
-            while True:
-                version = self.unmapper.unmapped.get_nowait()
-                left = self._mapped.get(version, 0) - 1
-                if left > 0:
-                    self._mapped[version] = left
-                elif self._mapped.pop(version, None) is not None:
-                    gone.append(version)
-        return gone
+    def unmapped(self) -> list[int]:
+        """Versions of which nothing is mapped any more; to be emptied by whoever has told the daemon."""
+        while self._ended:
+            mapped = self._ended[0]  # it stays until all is done: an exception may come anywhere
+            others = self._mapped.get(mapped.version)
+            if others is not None:
+                others.discard(mapped)
+                if not others:
+                    self._unmapped.append(mapped.version)
+                    del self._mapped[mapped.version]
+            self._ended.popleft()
+        return self._unmapped
+
+    def restart_in_child(self) -> None:
+        """After a fork: what is unmapped here, the parent's session still has."""
+        self._ended = deque()
+        self.unmapper.restart_in_child()

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
 
 DEFAULT_WAIT_S: Final = 5.0
+CONNECT_S: Final = 60.0
 
 
 class Client(OperatorRequests):
@@ -256,7 +257,7 @@ def connect(
     endpoint: str | os.PathLike[str] | None = None,
     *,
     timeout: float = 5.0,
-    connect_timeout: float = 0.9,
+    connect_timeout: float = CONNECT_S,
     name: str = "",
     shm_dir: str | None = None,
 ) -> Client:
@@ -271,8 +272,8 @@ def connect(
     timeout
         Seconds a reply may take; what a request lets the daemon wait comes on top.
     connect_timeout
-        Seconds until the daemon must have said welcome.  Short, since a daemon always answers at once:
-        whoever does not is stopped, hung or overloaded.
+        Seconds until the daemon must have said welcome, where there is one: where nobody listens, that is
+        said at once.  Long, since when a machine starts many programs at once everybody waits for processors.
     name
         How this program appears in ``shmmap clients``, at most 64 characters; empty: by the name of its
         script, or of the module it was started as (``python -m``).

@@ -21,6 +21,7 @@ import zmq
 
 from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import find_socket
+from shmmap.client.orphans import stop_orphans
 from shmmap.client.program_name import program_name
 from shmmap.errors import NoAnswer, ProtocolMismatch, error_from_wire
 from shmmap.protocol.codec import decode_reply, encode
@@ -34,8 +35,15 @@ _SLICE_MS: Final = 100  # how often silence is looked at: did the connection bre
 _RESEND_S: Final = 1.0  # first repetition on silence; the interval then doubles
 _RECONNECT_MS: Final = 20
 _RECONNECT_MAX_MS: Final = 500
-_LAST_WORDS_MS: Final = 100  # closing may take this long to deliver a last message
 _QUEUE: Final = 64  # messages that may wait for a slow daemon
+_OPTIONS: Final = (
+    (zmq.LINGER, 0),
+    (zmq.IMMEDIATE, 1),  # nothing queues up for a daemon that is away
+    (zmq.SNDHWM, _QUEUE),
+    (zmq.RCVTIMEO, _SLICE_MS),
+    (zmq.RECONNECT_IVL, _RECONNECT_MS),
+    (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
+)
 _SILENT_HINT: Final = "the daemon is stopped, hung, overloaded or gone: see `shmmap health`"
 _UPDATE_HINT: Final = "update the older of client and daemon"
 
@@ -72,7 +80,7 @@ class Connection:
         paths: Sequence[str],
         *,
         name: str = "",
-        timeout_s: float = 0.9,
+        timeout_s: float,
         waiting: Sequence[SimpleQueue[Any]] = (),
     ) -> None:
         deadline_s = time.monotonic() + timeout_s
@@ -81,24 +89,24 @@ class Connection:
         self._next_request = int.from_bytes(os.urandom(6), "little")
         self._hung_up = False
         self._slot = 0  # kept over restarts of the daemon: what is mapped is locked under it
-        # a context of our own: no other library's sockets can hold up its end
-        context = zmq.Context()
-        self._socket = context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # nothing queues up for a daemon that is away
-        self._socket.setsockopt(zmq.SNDHWM, _QUEUE)
-        self._socket.setsockopt(zmq.RCVTIMEO, _SLICE_MS)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
-        self._watch = ConnectionWatch(self._socket, waiting)
+        self._greeting = True
+        stop_orphans()
+        self._watch = ConnectionWatch(self, f"ipc://{self.path}", _OPTIONS, waiting)
         # also when nobody calls close(), and at the end of the program
-        self._finalizer = weakref.finalize(self, _shut, self._watch, self._socket, context, os.getpid())
-        self._socket.connect(f"ipc://{self.path}")
-        self.welcome = self._greet(deadline_s)
+        self._finalizer = weakref.finalize(self, self._watch.stop)
+        self._socket = self._watch.socket
+        self._greet(deadline_s)
+
+    @property
+    def handshakes(self) -> int:
+        """How often the connection was made."""
+        return self._watch.handshakes
 
     def close(self) -> None:
         """End the connection; messages just sent get a short moment to leave."""
-        self._finalizer()
+        self._watch.stop()
+        self._finalizer.detach()
+        stop_orphans()
 
     @property
     def lost_since(self) -> float | None:
@@ -136,6 +144,8 @@ class Connection:
         data = encode(message)
         deadline_s = time.monotonic() + timeout_s
         while True:
+            if self._greeting:
+                self._greet(deadline_s)
             reply = self._exchange(message.request, data, deadline_s, quiet_s)
             if isinstance(reply, kind):
                 return reply
@@ -148,10 +158,12 @@ class Connection:
                 )
             if reply.code != "no_session":
                 raise error_from_wire(reply.code, reply.message, reply.hint)
-            self.welcome = self._greet(deadline_s)
+            self._greet(deadline_s)
 
-    def _greet(self, deadline_s: float) -> Welcome:
+    def _greet(self, deadline_s: float) -> None:
+        """Begin a session; where that is interrupted, nobody knows how far it came, and it is begun again."""
         started_s = time.monotonic()
+        self._greeting = True
         hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name, self._slot)
         reply = self._exchange(hello.request, encode(hello), deadline_s, 0.0)
         if reply is None:
@@ -172,8 +184,9 @@ class Connection:
                 hint=_UPDATE_HINT,
             )
         self._slot = reply.session
+        self.welcome: Welcome = reply
         self._watch.wait_until_connected(deadline_s - time.monotonic())  # else it looks like a second time
-        return reply
+        self._greeting = False
 
     def _exchange(self, request: int, data: bytes, deadline_s: float, quiet_s: float) -> Reply | None:
         """Send until something comes back under this request id; None at the deadline."""
@@ -236,16 +249,3 @@ class Connection:
 
 def _slice_ms(deadline_s: float) -> int:
     return max(0, min(_SLICE_MS, math.ceil((deadline_s - time.monotonic()) * 1000)))
-
-
-def _shut(
-    watch: ConnectionWatch,
-    socket: zmq.Socket[bytes],
-    context: zmq.Context[zmq.Socket[bytes]],
-    pid: int,
-) -> None:
-    if os.getpid() != pid:
-        return  # in a forked child the sockets are the parent's
-    watch.stop(socket)
-    socket.close(linger=_LAST_WORDS_MS)
-    context.term()

@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a connection comes and goes: libzmq says so, and a thread that does nothing else hears it at once."""
+"""A connection's socket, and the thread that makes it, hears when the connection comes and goes, and ends it.
+
+The thread is where libzmq's parts belong because signal handlers run in the main thread alone: no handler's
+exception can leave a part behind that nobody knows of.  For the same reason it is started by one function
+that is built in, and whoever waits for it does so in queues.
+"""
 
 from __future__ import annotations
 
+import _thread
+import contextlib
+import os
 import struct
-import threading
 import time
+import weakref
 from collections.abc import Sequence
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, Final
 
 import zmq
+
+from shmmap.client.orphans import running
 
 __all__ = ["ConnectionWatch"]
 
@@ -22,15 +32,22 @@ _EVENTS: Final = (
     | zmq.EVENT_CONNECT_RETRIED
     | zmq.EVENT_MONITOR_STOPPED
 )
+_LAST_WORDS_MS: Final = 100  # closing may take this long to deliver a last message
+_MADE_S: Final = 0.001
+_OVER_S: Final = 0.5  # who waits for the end looks again after this long, should another have waited, too
 
 
 class ConnectionWatch:
-    """What libzmq said of one socket's connection; read it from any thread.
+    """One socket, made and ended by a thread, and what libzmq said of its connection.
 
     Parameters
     ----------
-    socket
-        Not connected yet.
+    owner
+        Who uses the socket; see `shmmap.client.orphans`.
+    endpoint
+        What the socket connects to.
+    options
+        Of the socket.
     waiting
         Gets a None in each of these queues when the connection breaks; may change at any time.
 
@@ -44,41 +61,111 @@ class ConnectionWatch:
         The other side hung up before any handshake, and libzmq did not try again yet.
     foreign : bool
         Who listens speaks something else.
+
+    Raises
+    ------
+    zmq.ZMQError
+        There can be no socket, for lack of descriptors, say.
     """
 
-    def __init__(self, socket: zmq.Socket[bytes], waiting: Sequence[SimpleQueue[Any]] = ()) -> None:
-        self._waiting = waiting
+    def __init__(
+        self,
+        owner: object,
+        endpoint: str,
+        options: Sequence[tuple[int, int]],
+        waiting: Sequence[SimpleQueue[Any]] = (),
+    ) -> None:
+        self.owner = weakref.ref(owner)
         self.handshakes = 0
         self.lost_since: float | None = None
         self.hung_up = False
         self.foreign = False
-        self._connected = threading.Event()
-        self._monitor = socket.get_monitor_socket(_EVENTS)
-        self._thread = threading.Thread(target=self._listen, name="shmmap-connection", daemon=True)
-        self._thread.start()
+        self._waiting = waiting
+        self._pid = os.getpid()
+        self._made: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._connected: SimpleQueue[None] = SimpleQueue()
+        self._over: SimpleQueue[None] = SimpleQueue()
+        self._ended = False
+        self._thread = 0
+        self._socket: zmq.Socket[bytes] | None = None
+        _thread.start_new_thread(self._run, (endpoint, options))
+        failure = self._made.get()
+        if failure is not None:
+            raise failure
+
+    @property
+    def socket(self) -> zmq.Socket[bytes]:
+        """For one thread at a time to send and receive."""
+        assert self._socket is not None  # noqa: S101  there is one where the constructor has returned
+        return self._socket
 
     def wait_until_connected(self, timeout_s: float) -> None:
         """Wait for the first handshake."""
-        self._connected.wait(max(timeout_s, 0.0))
+        if not self.handshakes:
+            with contextlib.suppress(Empty):
+                self._connected.get(timeout=max(timeout_s, 0.0))
 
-    def stop(self, socket: zmq.Socket[bytes]) -> None:
-        """End the thread; ``socket`` is the one that was given."""
-        socket.disable_monitor()  # tells the thread
-        if threading.current_thread() is self._thread:  # garbage is being collected in it
-            self._monitor.close(linger=0)
-        else:
-            self._thread.join()
+    def stop(self) -> None:
+        """Have the thread close the socket and end, and wait for it, unless this is that thread itself."""
+        self.tell_to_stop()
+        while not self._elsewhere and _thread.get_ident() != self._thread and not self._ended:
+            with contextlib.suppress(Empty):
+                self._over.get(timeout=_OVER_S)
 
-    def _listen(self) -> None:
-        while not self._monitor.closed:
+    @property
+    def _elsewhere(self) -> bool:
+        """Whether this is a forked child: the socket is the parent's."""
+        return os.getpid() != self._pid
+
+    def tell_to_stop(self) -> None:
+        """Have the thread close the socket and end."""
+        while not self._ended and not self._elsewhere:
+            if self._socket is None:  # an exception came while it was being made
+                time.sleep(_MADE_S)
+                continue
+            try:
+                self._socket.disable_monitor()
+            except zmq.error.InterruptedSystemCall:
+                continue
+            except zmq.ZMQError:  # the thread is at its end already
+                return
+            return
+
+    def _run(self, endpoint: str, options: Sequence[tuple[int, int]]) -> None:
+        self._thread = _thread.get_ident()
+        try:
+            with contextlib.ExitStack() as ends:
+                running.add(self)
+                ends.callback(running.discard, self)
+                # a context of our own: no other library's sockets can hold up its end
+                context = zmq.Context()
+                ends.callback(context.term)
+                socket = context.socket(zmq.DEALER)
+                ends.callback(socket.close, linger=_LAST_WORDS_MS)
+                for option, value in options:
+                    socket.setsockopt(option, value)
+                monitor = socket.get_monitor_socket(_EVENTS)
+                ends.callback(monitor.close, linger=0)
+                socket.connect(endpoint)
+                self._socket = socket
+                self._made.put(None)
+                self._listen(monitor)
+        except BaseException as error:  # noqa: BLE001  it is raised where the socket is waited for
+            self._made.put(error)
+        finally:
+            self._ended = True
+            self._over.put(None)
+
+    def _listen(self, monitor: zmq.Socket[bytes]) -> None:
+        while True:
             # zmq.utils.monitor would do this, but loads asyncio (20 ms)
-            event, _value = _EVENT.unpack(self._monitor.recv_multipart()[0])
+            event, _value = _EVENT.unpack(monitor.recv_multipart()[0])
             if event == zmq.EVENT_MONITOR_STOPPED:
-                self._monitor.close(linger=0)
-            elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                return
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self.handshakes += 1
                 self.lost_since = None
-                self._connected.set()
+                self._connected.put(None)
             elif event == zmq.EVENT_CONNECT_RETRIED:
                 self.hung_up = False
             elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:

@@ -29,6 +29,7 @@ from shmmap.protocol.endpoint import (
 __all__ = ["candidates", "check_socket", "find_socket"]
 
 _SIGNATURE_BYTES: Final = 10
+_FULL_S: Final = 0.005
 _START_HINT: Final = (
     "start one with `shmmap serve MAP`, or say which: --endpoint (SHMMAP_ENDPOINT), or --instance with"
     " --runtime-dir"
@@ -62,7 +63,7 @@ def candidates(endpoint: str | None = None, environ: Mapping[str, str] = os.envi
 def find_socket(paths: Sequence[str], deadline_s: float) -> str:
     """Return the first path at which a ZeroMQ peer answers.
 
-    A path that nobody listens at is passed over.  A daemon that is there but silent ends the
+    A path that nobody listens at is passed over at once.  A daemon that is there but silent ends the
     search: the next one might serve another map.
 
     Parameters
@@ -115,12 +116,16 @@ def check_socket(path: str, deadline_s: float) -> None:
     with socket.socket(
         socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
     ) as probe:
-        try:
-            probe.connect(path)
-        except BlockingIOError as error:  # its queue of connections is full: it accepts none
-            raise _no_answer(path) from error
-        except OSError as error:
-            raise _refusal(path, error) from error
+        while True:
+            try:
+                probe.connect(path)
+                break
+            except BlockingIOError as error:  # its queue of connections is full; the kernel tells no more
+                if time.monotonic() >= deadline_s:
+                    raise _no_answer(path) from error
+                time.sleep(_FULL_S)
+            except OSError as error:
+                raise _refusal(path, error) from error
         # Every ZMTP peer speaks first: 0xff, eight bytes, 0x7f (https://rfc.zeromq.org/spec/23/)
         heard = b""
         while len(heard) < _SIGNATURE_BYTES:

@@ -29,7 +29,6 @@ from shmmap.protocol.events import Beat, Event, EventPage, Recent, decode_event
 __all__ = ["EventStream", "Missed"]
 
 _TIMEOUT_S: Final = 5.0
-_CONNECT_S: Final = 0.9
 _QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
 _RECONNECT_MS: Final = 20
 _RECONNECT_MAX_MS: Final = 500
@@ -90,7 +89,7 @@ class EventStream:
         if since is not None and not since >= 0:
             raise BadRequest(f"since must be seconds, not negative, it is {since!r}")
         self._timeout_s = timeout
-        self._connection = Connection(candidates(endpoint), name=name, timeout_s=min(timeout, _CONNECT_S))
+        self._connection = Connection(candidates(endpoint), name=name, timeout_s=timeout)
         try:
             path = _events_path(self._connection)
         except ProtocolMismatch:

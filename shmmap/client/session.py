@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from queue import SimpleQueue
 from typing import Any, Final, TypeVar
 
@@ -20,8 +19,9 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
+from shmmap.client.turn import Turn, check_not_within, out_of_time
 from shmmap.client.visible import check_visible, owner_of_segments
-from shmmap.errors import BadRequest, NoAnswer
+from shmmap.errors import BadRequest
 from shmmap.failpoints import step
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
@@ -106,35 +106,42 @@ class Session:
         self._waiting.remove(queue)
 
     def close(self) -> None:
-        """End the session; attached cells stay readable."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            connection = self._connection
-            if connection is None:
-                return
-            self._tell_unmapped(connection)
-            if not self.attacher.any_mapped:  # else the daemon should still know who holds them
-                connection.tell(messages.Bye(connection.new_request()))
-            connection.close()
+        """End the session; attached cells stay readable.
 
-    @contextlib.contextmanager
-    def _turn(self, timeout_s: float) -> Iterator[Connection]:
-        """Take the connection for one request."""
-        if not self._lock.acquire(timeout=timeout_s):
-            raise NoAnswer(
-                f"another thread's request was under way for {timeout_s:.3g} s",
-                hint="give each thread that waits long a client of its own",
-            )
+        Raises
+        ------
+        BadRequest
+            This is a signal handler that has interrupted a request.
+        """
+        if self._lock.locked():
+            check_not_within(_TURNS, self)
+        with self._lock:
+            connection = self._connection
+            if not self._closed and connection is not None:
+                self._tell_unmapped(connection)
+                if not self.attacher.any_mapped:  # else the daemon should still know who holds them
+                    connection.tell(messages.Bye(connection.new_request()))
+            self._closed = True
+            if connection is not None:
+                connection.close()
+
+    def _in_turn(self, timeout_s: float, work: Callable[[Connection], R]) -> R:
+        """Use the connection for one request, when no other thread does any more."""
+        if self._lock.locked():
+            check_not_within(_TURNS, self)
+        entered = False
         try:
-            if self._closed:
-                raise BadRequest("this client is closed", hint="connect again")
-            connection = self._connection or self._connect()
-            self._tell_unmapped(connection)
-            yield connection
-        finally:
-            self._lock.release()
+            with Turn(self._lock, timeout_s):  # type: ignore[misc]
+                entered = True
+                if self._closed:
+                    raise BadRequest("this client is closed", hint="connect again")
+                connection = self._connection or self._connect()
+                self._tell_unmapped(connection)
+                return work(connection)
+        except StopIteration:
+            if entered:
+                raise
+        raise out_of_time(timeout_s)
 
     def ask(self, make: Callable[[int], messages.Request], kind: type[R], *, quiet_s: float = 0.0) -> R:
         """Send the request that ``make`` builds for a request id; returns its reply.
@@ -142,11 +149,14 @@ class Session:
         ``quiet_s`` is how long the daemon may be busy with it, during which silence means nothing.
         """
         timeout_s = self.timeout_s + quiet_s
-        with self._turn(timeout_s) as connection:
+
+        def work(connection: Connection) -> R:
             message = make(connection.new_request())
             reply = connection.ask(message, kind, timeout_s=timeout_s, quiet_s=quiet_s)
             self.welcome = connection.welcome
             return reply
+
+        return self._in_turn(timeout_s, work)
 
     def ask_cells(
         self,
@@ -173,11 +183,12 @@ class Session:
         if wait_s is not None and not 0 <= wait_s < math.inf:
             raise BadRequest(f"wait must be a number of seconds, not {wait_s!r}")
         quiet_s = wait_s or 0.0
-        timeout_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
-        deadline_s = time.monotonic() + timeout_s
-        with self._turn(timeout_s) as connection:
+        all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
+        deadline_s = time.monotonic() + all_s
+
+        def work(connection: Connection) -> CellSet:
             message = make(connection.new_request())
-            reply = connection.ask(message, messages.Cells, timeout_s=timeout_s, quiet_s=quiet_s)
+            reply = connection.ask(message, messages.Cells, timeout_s=all_s, quiet_s=quiet_s)
             self.map_version = reply.map_version
             self.welcome = connection.welcome
             step("client.answer")
@@ -194,9 +205,12 @@ class Session:
             self.welcome = connection.welcome
             return answer.result(reply, removed)
 
+        return self._in_turn(all_s, work)
+
     def tell_unmapped(self) -> int:
         """Tell the daemon what was unmapped since the last request; returns how many versions."""
-        with self._turn(self.timeout_s) as connection:
+
+        def work(connection: Connection) -> int:
             told = self._told
             # the reply to this one means that the telling before it has arrived
             connection.ask(
@@ -204,11 +218,14 @@ class Session:
             )
             return told
 
+        return self._in_turn(self.timeout_s, work)
+
     def _tell_unmapped(self, connection: Connection) -> None:
-        versions = self.attacher.take_unmapped()
+        versions = self.attacher.unmapped()
         self._told = len(versions)
         if versions:
             connection.tell(messages.Release(connection.new_request(), _pack(versions)))
+            versions.clear()
 
     def whole_id(self, cell_id: str) -> str:
         """Return the cell id of what a reply carries."""
@@ -236,8 +253,10 @@ class Session:
             self._connection = None
         self._lock = threading.Lock()
         self._waiting = []
-        self.attacher.unmapper.restart_in_child()
+        self.attacher.restart_in_child()
 
+
+_TURNS: Final = (Session._in_turn.__code__, Session.close.__code__)
 
 _sessions: weakref.WeakSet[Session] = weakref.WeakSet()
 

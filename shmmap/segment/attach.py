@@ -5,7 +5,8 @@ A mapping lives exactly as long as any array over it: every view's ``base`` chai
 mapping object, whose end unmaps.  Nothing is ever unmapped under a live view.  No file descriptor
 is kept (Python's own ``mmap`` keeps one each, which ends at RLIMIT_NOFILE), so the mapping is made
 with the C library's ``mmap``; the kernel keeps the open file, and the session's lock on it, for as
-long as the mapping lives.
+long as the mapping lives.  Neither is lost to an exception that comes at the wrong moment
+(`shmmap.segment.owned`).
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import ctypes
 import os
 import stat
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterable
+from functools import partial
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import posix_ipc
@@ -27,15 +30,16 @@ from shmmap.optional_packages import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import read_columns, unpack_header
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
+from shmmap.segment.owned import Owned
 from shmmap.segment.pins import lock_slot
 from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["AttachedSegment", "Unmap", "attach", "unmap"]
+__all__ = ["AttachedSegment", "OnUnmap", "attach"]
 
-Unmap = Callable[[int, int], object]
+OnUnmap = Callable[[Owned], object]
 
 LEASE_S: Final = 0.2
 """How long a lease may keep an open waiting; the daemon holds one for microseconds."""
@@ -61,39 +65,39 @@ _MAP_POPULATE: Final = 0x8000
 _MAP_FAILED: Final = ctypes.c_void_p(-1).value
 
 
-def unmap(address: int, nbytes: int) -> None:
-    """Give a mapping back to the kernel."""
-    _munmap(address, nbytes)
+def _map(fd: int, nbytes: int, populate: bool) -> Owned:
+    """Map a file's first bytes; they are unmapped when the result ends, whose value is their address."""
+    flags = _MAP_SHARED | (_MAP_POPULATE if populate else 0)
+    memory = Owned(map(_mmap, (None,), (nbytes,), (_PROT_READ,), (flags,), (fd,), (0,)), _munmap, nbytes)
+    if memory.value == _MAP_FAILED or memory.value is None:
+        number = ctypes.get_errno()
+        raise SegmentError(
+            f"cannot map {nbytes} bytes: {os.strerror(number)}",
+            hint="vm.max_map_count, or the limit of address space (ulimit -v), may be too low",
+        )
+    return memory
 
 
 class _Mapping:
-    """Owns one read-only mapping; the root of the base chain of every array over it."""
+    """Has mapped memory as long as any array over it lives: the root of the base chain of all of them."""
 
-    __slots__ = ("__array_interface__", "_address", "_nbytes", "_unmap")
+    __slots__ = ("__array_interface__", "_memory", "_on_unmap")
 
-    def __init__(self, fd: int, nbytes: int, populate: bool, on_unmap: Unmap) -> None:
-        self._nbytes = 0
-        address = _mmap(None, nbytes, _PROT_READ, _MAP_SHARED | (_MAP_POPULATE if populate else 0), fd, 0)
-        if address == _MAP_FAILED or address is None:
-            number = ctypes.get_errno()
-            raise SegmentError(
-                f"cannot map {nbytes} bytes: {os.strerror(number)}",
-                hint="vm.max_map_count, or the limit of address space (ulimit -v), may be too low",
-            )
-        self._address = address
-        self._nbytes = nbytes
-        self._unmap = on_unmap
+    def __init__(self, memory: Owned, nbytes: int, on_unmap: OnUnmap | None) -> None:
+        self._memory = memory
+        self._on_unmap = on_unmap
         # True: read-only; numpy then refuses to make any view of it writeable
         self.__array_interface__ = {
-            "data": (address, True),
+            "data": (memory.value, True),
             "shape": (nbytes,),
             "typestr": "|u1",
             "version": 3,
         }
 
     def __del__(self) -> None:
-        if self._nbytes:
-            self._unmap(self._address, self._nbytes)
+        on_unmap = getattr(self, "_on_unmap", None)
+        if on_unmap is not None:
+            on_unmap(self._memory)
 
 
 class AttachedSegment:
@@ -154,16 +158,23 @@ class AttachedSegment:
                 )
 
 
-def _open(name: str, shm_dir: str) -> int:
+_open_shared: Final = partial(posix_ipc.SharedMemory, flags=os.O_NONBLOCK, read_only=True)
+"""No size=: passing one would resize the segment under everybody's feet."""
+_fd_of: Final = attrgetter("fd")
+_FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+
+
+def _open(name: str, shm_dir: str) -> Owned:
     """Open a segment, never waiting: a pipe that has its name by now would make the opener wait for ever."""
+    fds: Iterable[Any]
     if shm_dir == DEFAULT_SHM_DIR:
-        # no size=: passing one would resize the segment under everybody's feet
-        return int(posix_ipc.SharedMemory(name, flags=os.O_NONBLOCK, read_only=True).fd)
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    return os.open(f"{shm_dir}/{name.lstrip('/')}", flags)
+        fds = map(_fd_of, map(_open_shared, (name,)))
+    else:
+        fds = map(os.open, (f"{shm_dir}/{name.lstrip('/')}",), (_FLAGS,))
+    return Owned(fds, os.close)
 
 
-def _open_soon(name: str, shm_dir: str) -> int:
+def _open_soon(name: str, shm_dir: str) -> Owned:
     """Open a segment on which the daemon has a lease, held for a moment to see whether anybody uses it."""
     end_s = time.monotonic() + LEASE_S
     while True:
@@ -184,7 +195,8 @@ def attach(
     slot: int | None = None,
     owner: int | None = None,
     populate: bool = False,
-    on_unmap: Unmap = unmap,
+    on_unmap: OnUnmap | None = None,
+    on_mapped: Callable[[Owned], object] | None = None,
 ) -> AttachedSegment:
     """Map a segment read-only and verify its header.
 
@@ -204,8 +216,10 @@ def attach(
     populate
         Let the kernel map every page now (``MAP_POPULATE``) instead of at first touch.
     on_unmap
-        Called with address and bytes when the last array over the mapping is gone; the default
-        unmaps on the spot.
+        Is given the memory when the last array over it is gone; it is unmapped when nobody has it any
+        more, on the spot as a rule.
+    on_mapped
+        Is given the memory as soon as it is mapped; not to be kept.
 
     Raises
     ------
@@ -218,9 +232,9 @@ def attach(
     """
     try:
         try:
-            fd = _open(name, shm_dir)
+            file = _open(name, shm_dir)
         except BlockingIOError:
-            fd = _open_soon(name, shm_dir)
+            file = _open_soon(name, shm_dir)
     except (FileNotFoundError, posix_ipc.ExistentialError) as error:
         raise StaleHandle(f"segment {name} is gone", hint="ask the daemon again") from error
     except (PermissionError, posix_ipc.PermissionsError) as error:
@@ -234,6 +248,7 @@ def attach(
         ) from error
     except OSError as error:
         raise SegmentError(f"segment {name}: {error.strerror}") from error
+    fd = file.value
     try:
         step("client.open")
         status = os.fstat(fd)
@@ -257,12 +272,15 @@ def attach(
         if PAGE_BYTES < header_bytes <= size:
             page = os.pread(fd, header_bytes, offset)
         _, columns = read_columns(memoryview(page), size)
-        mapping = _Mapping(fd, end, populate, on_unmap)
+        memory = _map(fd, end, populate)
+        if on_mapped is not None:
+            on_mapped(memory)
         step("client.map")
     except OSError as error:
         raise SegmentError(f"segment {name} cannot be read: {error.strerror}") from error
     finally:
-        os.close(fd)
+        file.give_back()
+    mapping = _Mapping(memory, end, on_unmap)
     raw: NDArray[np.uint8] = np.asarray(mapping)
     del mapping.__array_interface__  # it has done its work, and windows have hundreds of mappings
     if offset:

@@ -110,8 +110,7 @@ def test_a_window_that_stands_still_learns_of_a_reload(daemon: Factory, divided_
 def wait_for(window: shmmap.MapWindow, reached: Callable[[], bool]) -> None:
     """Wait until the window's thread has published a state that fits."""
     assert isinstance(window._follower, WindowFollower)
-    with window._follower._changed:
-        assert window._follower._changed.wait_for(reached, LONG_S)
+    assert window._follower.wait_for(lambda _: reached(), LONG_S)
 
 
 def test_small_moves_ask_nothing(daemon: Factory, divided_map: DividedMap) -> None:
@@ -420,7 +419,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
         window = shmmap.MapWindow(client, 30, retention=Collects())
         window.move_to(0, 0, wait=LONG_S)
         view = window.cells[0].xyz
-        thread = window._follower._thread  # type: ignore[union-attr]
+        over = window._follower._over  # type: ignore[union-attr]
         gc.collect()
         gc.disable()
         try:
@@ -432,8 +431,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
             assert collected.wait(LONG_S)
         finally:
             gc.enable()
-        thread.join(LONG_S)
-        assert not thread.is_alive()
+        over.get(timeout=LONG_S)
         client.release()
         assert np.isfinite(view).all()
         del view
@@ -445,7 +443,7 @@ def test_a_window_whose_thread_ended(
 ) -> None:
     """A policy of the user's that fails: the window says so, and what is dropped is unmapped."""
     one = daemon(divided_map.root)
-    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
 
     class Fails:
         def keep(self, departed: Sequence[Departed]) -> list[bool]:
@@ -454,9 +452,10 @@ def test_a_window_whose_thread_ended(
     with shmmap.connect(one.endpoint) as client:
         window = shmmap.MapWindow(client, 30, retention=Fails())
         window.move_to(0, 0, wait=LONG_S)
-        thread = window._follower._thread  # type: ignore[union-attr]
+        assert isinstance(window._follower, WindowFollower)
+        over = window._follower._over
         window.move_to(60, 60)
-        thread.join(LONG_S)
+        over.get(timeout=LONG_S)
         assert "ZeroDivisionError" in str(window.error)
         cells = client.around(-50, -50, 5)
         client.release()

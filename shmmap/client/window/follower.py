@@ -3,19 +3,24 @@
 
 from __future__ import annotations
 
+import _thread
+import contextlib
 import math
 import os
 import threading
 import time
+import weakref
+from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from shmmap.client.attaching import Mapping
+from shmmap.client.orphans import running
 from shmmap.client.session import Session
 from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.state import EMPTY, WindowState, moved
 from shmmap.errors import BadRequest, InternalError, ShmmapError
 from shmmap.protocol.messages import Intent
+from shmmap.segment.owned import Owned
 
 __all__ = ["PENDING_WAIT_S", "WindowFollower"]
 
@@ -24,14 +29,21 @@ PENDING_WAIT_S: Final = 0.25
 
 _RETRY_S: Final = 0.05  # first pause after an answer that brought nothing although something is missing
 _RETRY_MAX_S: Final = 1.0  # pauses double up to this
+_OVER_S: Final = 0.5  # who waits for the thread's end looks again after this long
 
 
 class WindowFollower:
     """Keeps a window current in a thread of its own.
 
-    Everything reaches the thread through one queue: new poses, mappings to give back, that the connection
+    Everything reaches the thread through one queue: new poses, memory to unmap, that the connection
     broke, the end.
-    Everything leaves it by replacing one attribute.
+    Everything leaves it by replacing one attribute; who waits for that has a queue, and no lock that a
+    signal handler's exception could leave taken.
+
+    Parameters
+    ----------
+    owner
+        Whose thread it is, see `shmmap.client.orphans`.
 
     Attributes
     ----------
@@ -48,28 +60,32 @@ class WindowFollower:
         refresher: WindowRefresher,
         session: Session,
         *,
+        owner: object,
         update_distance: float,
         refresh_interval_s: float,
     ) -> None:
+        self.owner = weakref.ref(owner)
         self._refresher = refresher
         self._session = session
         self._unmapper = session.attacher.unmapper
         self._update_distance = update_distance
         self._refresh_interval_s = refresh_interval_s
-        self._mailbox: SimpleQueue[Mapping | None] = SimpleQueue()
+        self._mailbox: SimpleQueue[Owned | None] = SimpleQueue()
         self._pose: Intent | None = None
         self._called = False
         self._stopping = False
         self._pause_s = 0.0
-        self._changed = threading.Condition()
+        self._waiters: list[weakref.ref[SimpleQueue[None]]] = []
+        self._over: SimpleQueue[None] = SimpleQueue()
+        self._ended = False
         self._pid = os.getpid()
         self.state = EMPTY
         self.error: ShmmapError | None = None
         self.stale_since: float | None = None
         self._unmapper.defer_to(self._mailbox)
         session.tell_when_lost(self._mailbox)
-        self._thread = threading.Thread(target=self._run, name="shmmap-window", daemon=True)
-        self._thread.start()
+        self._thread = 0
+        _thread.start_new_thread(self._run, ())
 
     @property
     def _elsewhere(self) -> bool:
@@ -104,30 +120,43 @@ class WindowFollower:
 
         The state is that one, even if a later one has replaced it meanwhile.
         """
-        with self._changed:
-            current = self._changed.wait_for(self._is_current, min(timeout_s, threading.TIMEOUT_MAX))
-            return self.state if current else None
+        return self.wait_for(self._is_current, timeout_s)
 
-    def _is_current(self) -> bool:
-        return (
-            self.answers(self.state)
-            and self.error is None
-            and self.state.settled
-            and not self._refresher.lost
-        )
+    def wait_for(self, fits: Callable[[WindowState], bool], timeout_s: float) -> WindowState | None:
+        """Wait for a state that fits and return it; None at the deadline."""
+        deadline_s = time.monotonic() + min(timeout_s, threading.TIMEOUT_MAX)
+        changed: SimpleQueue[None] = SimpleQueue()
+        self._waiters.append(weakref.ref(changed))  # it ends with this call, however that ends
+        while not fits(state := self.state):
+            left_s = min(max(deadline_s - time.monotonic(), 0.0), threading.TIMEOUT_MAX)
+            try:
+                changed.get(timeout=left_s)
+            except Empty:
+                return None
+        return state
+
+    def _is_current(self, state: WindowState) -> bool:
+        return self.answers(state) and self.error is None and state.settled and not self._refresher.lost
 
     def stop(self) -> None:
         """End the thread; what is attached stays so."""
-        if self._elsewhere or self._stopping:
+        if self._elsewhere:
             return
+        self.tell_to_stop()
+        while not self._ended and _thread.get_ident() != self._thread:  # it may be where garbage ends
+            with contextlib.suppress(Empty):
+                self._over.get(timeout=_OVER_S)
+
+    def tell_to_stop(self) -> None:
+        """Have the thread end."""
         self._stopping = True
         self._mailbox.put(None)
-        if threading.current_thread() is not self._thread:  # else garbage is being collected in it
-            self._thread.join()
 
     # --- the thread -----------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        self._thread = _thread.get_ident()
+        running.add(self)
         try:
             due_s = math.inf  # nothing to ask before there is a pose
             while self._wait(due_s):
@@ -144,6 +173,9 @@ class WindowFollower:
         finally:
             self._session.stop_telling(self._mailbox)
             self._unmapper.stop_deferring(self._mailbox)
+            running.discard(self)
+            self._ended = True
+            self._over.put(None)
 
     def _wait(self, until_s: float) -> bool:
         """Unmap what arrives, until it is time to ask or there is a new pose; False at the end."""
@@ -151,13 +183,13 @@ class WindowFollower:
             remaining_s = until_s - time.monotonic()
             try:
                 if remaining_s <= 0:
-                    mapping = self._mailbox.get_nowait()
+                    memory = self._mailbox.get_nowait()
                 else:
-                    mapping = self._mailbox.get(timeout=min(remaining_s, threading.TIMEOUT_MAX))
+                    memory = self._mailbox.get(timeout=min(remaining_s, threading.TIMEOUT_MAX))
             except Empty:
                 return not self._stopping
-            if mapping is not None:
-                self._unmapper.finish(mapping)
+            if memory is not None:
+                del memory
                 continue
             self._called = False  # before the pose is read: the next one calls again
             if remaining_s > 0 or self._stopping:
@@ -187,11 +219,15 @@ class WindowFollower:
         return self._pause_s
 
     def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
-        with self._changed:
-            self.state = state
-            self.error = error
-            if error is None:
-                self.stale_since = None
-            elif self.stale_since is None:
-                self.stale_since = time.monotonic()
-            self._changed.notify_all()
+        self.state = state  # before the error: who finds none finds the state that came with it
+        if error is None:
+            self.stale_since = None
+        elif self.stale_since is None:
+            self.stale_since = time.monotonic()
+        self.error = error
+        for waiter in tuple(self._waiters):
+            queue = waiter()
+            if queue is None:
+                self._waiters.remove(waiter)
+            else:
+                queue.put(None)

@@ -126,6 +126,7 @@ class MapWindow:
             self._follower = WindowFollower(
                 self._refresher,
                 self._client.session,
+                owner=self,
                 update_distance=update_distance,
                 refresh_interval_s=refresh_interval,
             )

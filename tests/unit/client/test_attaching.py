@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shmmap.client.attaching import Mapping
 from shmmap.client.cell import Cell
+from shmmap.segment.owned import Owned
 from tests.support.process_costs import mappings_under
 
 if TYPE_CHECKING:
@@ -45,38 +45,39 @@ def test_a_version_is_told_when_its_last_layer_is_unmapped(segments: Segments) -
     other = segments.cell("/b", XYZ, version=6)
     attacher = segments.attacher
     del points
-    assert attacher.take_unmapped() == []
+    assert attacher.unmapped() == []
     del voxel
-    assert attacher.take_unmapped() == [5]
-    assert attacher.take_unmapped() == []
+    assert attacher.unmapped() == [5]
+    attacher.unmapped().clear()
+    assert attacher.unmapped() == []
     assert attacher.any_mapped
     del other
-    assert attacher.take_unmapped() == [6]
+    assert attacher.unmapped() == [6]
+    assert attacher.unmapped() == [6], "until it was told"
     assert not attacher.any_mapped
 
 
 def test_deferred_mappings_stay_until_their_thread_unmaps_them(segments: Segments) -> None:
-    queue: SimpleQueue[Mapping | None] = SimpleQueue()
+    queue: SimpleQueue[Owned | None] = SimpleQueue()
     unmapper = segments.attacher.unmapper
     unmapper.defer_to(queue)
     cell = segments.cell("/a", XYZ, version=5)
     address = cell.xyz.ctypes.data
     del cell
     assert mappings_under(segments.path) == 1
-    assert segments.attacher.take_unmapped() == []
-    mapping = queue.get_nowait()
-    assert mapping is not None
-    assert mapping[0] == 5
-    assert mapping[1] <= address < mapping[1] + mapping[2]
-    unmapper.finish(mapping)
+    assert segments.attacher.unmapped() == []
+    memory = queue.get_nowait()
+    assert memory is not None
+    assert memory.value <= address < memory.value + 65536
+    del memory
     assert mappings_under(segments.path) == 0
-    assert segments.attacher.take_unmapped() == [5]
+    assert segments.attacher.unmapped() == [5]
     unmapper.stop_deferring(queue)
 
 
 def test_what_is_queued_when_the_thread_ends_is_unmapped_too(segments: Segments) -> None:
-    first: SimpleQueue[Mapping | None] = SimpleQueue()
-    second: SimpleQueue[Mapping | None] = SimpleQueue()
+    first: SimpleQueue[Owned | None] = SimpleQueue()
+    second: SimpleQueue[Owned | None] = SimpleQueue()
     unmapper = segments.attacher.unmapper
     unmapper.defer_to(first)
     unmapper.defer_to(second)
@@ -98,7 +99,7 @@ def drop_when_all_are_there(cells: list[Cell], barrier: threading.Barrier) -> No
 
 
 def test_dropping_cells_in_many_threads_while_the_thread_ends_loses_none(segments: Segments) -> None:
-    queue: SimpleQueue[Mapping | None] = SimpleQueue()
+    queue: SimpleQueue[Owned | None] = SimpleQueue()
     unmapper = segments.attacher.unmapper
     for round_ in range(20):
         unmapper.defer_to(queue)

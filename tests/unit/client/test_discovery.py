@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -122,6 +123,23 @@ def test_a_full_queue_of_connections_is_no_answer(place: Path) -> None:
             connect(place / "s.sock")
         for one in others:
             one.close()
+
+
+def test_a_full_queue_of_connections_is_waited_for(place: Path) -> None:
+    """Sixty programs that start together fill it."""
+    with listening(place / "s.sock") as server, ThreadPoolExecutor(1) as pool:
+        server.listen(0)
+        first = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        first.connect(str(place / "s.sock"))
+        found = pool.submit(find_socket, [str(place / "s.sock")], time.monotonic() + 60)
+        with pytest.raises(TimeoutError):
+            found.result(0.1)
+        server.accept()[0].close()
+        accepted, _ = server.accept()
+        accepted.sendall(b"\xff\0\0\0\0\0\0\0\1\x7f")
+        assert found.result(60) == str(place / "s.sock")
+        accepted.close()
+        first.close()
 
 
 @pytest.mark.parametrize("words", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff\0\0\0\0\0\0\0\x01\x01"])

@@ -17,8 +17,9 @@ import pytest
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment import attach as attach_module
-from shmmap.segment.attach import attach, unmap
+from shmmap.segment.attach import attach
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
+from shmmap.segment.owned import Owned
 from shmmap.segment.pins import prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from tests.support.process_costs import mappings_under
@@ -58,11 +59,10 @@ def test_views_cannot_be_written_nor_made_writable(shm: ShmDirectory, publish: P
 def test_the_mapping_lives_as_long_as_any_view(shm: ShmDirectory, publish: Publish, kind: str) -> None:
     """Also when the name is gone, and the segment object."""
     name = publish(5000)
-    calls: list[tuple[int, int]] = []
+    calls: list[int] = []
 
-    def on_unmap(address: int, nbytes: int) -> None:
-        calls.append((address, nbytes))
-        unmap(address, nbytes)
+    def on_unmap(memory: Owned) -> None:
+        calls.append(memory.value)
 
     segment = attach(name, shm_dir=shm.path, on_unmap=on_unmap)
     xyz = segment.column(0)

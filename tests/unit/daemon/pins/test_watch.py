@@ -10,7 +10,7 @@ import pytest
 
 from shmmap.daemon.pins.probe import PinSource, PinSupport, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.segment.attach import attach, unmap
+from shmmap.segment.attach import attach
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from tests.support.segment_reader import map_segment
@@ -120,7 +120,7 @@ def test_an_attached_segment_and_its_last_view(directory: ShmDirectory) -> None:
     assert reported(pins.fd)
     pins.closed()
     with pytest.raises(Exception, match="not a shmmap segment"):
-        attach(NAME, shm_dir=directory.path, slot=3, on_unmap=unmap)
+        attach(NAME, shm_dir=directory.path, slot=3)
     assert reported(pins.fd)
     assert pins.closed() == {NAME}
     assert pins.is_used(NAME) is False

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An exception from a signal handler, at every place of a request at which Python runs handlers.
+
+Python runs them when a function begins, after a call, and at a jump back.  Here tracing raises at each of
+these places in turn, one in each run of the same request, in all code of ours and of what we use; random
+instants are for ``tests/benchmarks/interrupts.py``.
+"""
+
+from __future__ import annotations
+
+import dis
+import gc
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import pytest
+
+import shmmap
+from shmmap.errors import BadRequest
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap
+
+Factory = Callable[..., DaemonProcess]
+LONG_S = 60.0
+
+_BEFORE = ("CALL", "RESUME", "JUMP_BACKWARD", "JUMP_ABSOLUTE")
+"""Instructions after which Python runs handlers, by how their names begin."""
+
+
+@pytest.fixture(autouse=True)
+def nothing_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where Python ignores exceptions it says so, and pytest keeps them, with all that they refer to."""
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
+
+
+class Interrupt(BaseException):
+    """What a handler raises."""
+
+
+@cache
+def places_in(code: CodeType) -> frozenset[int]:
+    """Where handlers may run in some code, by the offset of what comes next.
+
+    An exception of theirs comes from the instruction before, one of tracing from the next: where these two
+    are not in the same block, tracing cannot do the same, and the place is left out.
+    """
+    steps = [step for step in dis.get_instructions(code) if step.opname not in ("CACHE", "PRECALL")]
+    blocks = getattr(dis.Bytecode(code), "exception_entries", ())  # since Python 3.11
+
+    def block(offset: int) -> object:
+        return next((one for one in blocks if one.start <= offset < one.end), None)
+
+    return frozenset(
+        after.offset
+        for before, after in pairwise(steps)
+        if before.opname.startswith(_BEFORE) and block(before.offset) == block(after.offset)
+    )
+
+
+class AtPlace:
+    """Raises at the Nth place at which a handler may run."""
+
+    def __init__(self, number: int) -> None:
+        self.left = number
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> Any:
+        del argument
+        frame.f_trace_opcodes = True
+        frame.f_trace_lines = False
+        if event == "call" or (event == "opcode" and frame.f_lasti in places_in(frame.f_code)):
+            self.left -= 1
+            if not self.left:
+                sys.settrace(None)
+                raise Interrupt
+        return self
+
+
+def holdings(one: DaemonProcess) -> tuple[int, int, int]:
+    """Descriptors, mappings of segments, and threads of this process."""
+    gc.collect()
+    maps = Path("/proc/self/maps").read_text()
+    return len(os.listdir("/proc/self/fd")), maps.count(one.shm_dir), len(os.listdir("/proc/self/task"))
+
+
+def interrupted_everywhere(work: Callable[[], object], check: Callable[[int], None]) -> int:
+    """Do the work again and again, interrupted at one place more each time; returns how many there are."""
+    number, tracing = 0, sys.gettrace()
+    done = False
+    while not done:
+        number += 1
+        place = AtPlace(number)
+        try:
+            sys.settrace(place)
+            work()
+            done = place.left > 0
+        except Interrupt:
+            pass
+        finally:
+            sys.settrace(tracing)
+        check(number)
+    return number
+
+
+def test_a_request_that_attaches(daemon: Factory, divided_map: DividedMap) -> None:
+    """Nothing stays open or mapped, the next request is answered, and answered rightly."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, timeout=LONG_S) as client:
+        expected = {cell.version for cell in client.around(10, 10, 1, wait=LONG_S)}
+        assert len(expected) == 1
+        client.release()
+        before = holdings(one)
+
+        def check(number: int) -> None:
+            assert not client.session._lock.locked(), number
+            if number % 8 == 0:
+                assert holdings(one) == before, number
+            assert {cell.version for cell in client.around(10, 10, 1)} == expected, number
+
+        places = interrupted_everywhere(lambda: client.around(10, 10, 1), check)
+        assert places > 100, "is anything traced?"
+        assert holdings(one) == before
+        assert client.release() == 1
+
+
+def test_what_a_window_does_in_the_calling_thread(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint, timeout=LONG_S) as client, shmmap.MapWindow(client, 15) as window:
+        window.move_to(0, 0, wait=LONG_S)
+        places = [5.0, 0.0]
+
+        def move() -> None:
+            window.move_to(places[0] * 10, 0, wait=LONG_S)
+
+        def check(number: int) -> None:
+            places.reverse()
+            assert window.wait_until_current(LONG_S), number
+
+        assert interrupted_everywhere(move, check) > 30
+
+
+def test_closing(daemon: Factory, divided_map: DividedMap) -> None:
+    """A close that was interrupted can be repeated, and the next connection ends what was left."""
+    one = daemon(divided_map.root)
+    shmmap.connect(one.endpoint).close()
+    before = holdings(one)
+    number, done = 0, False
+    while not done:
+        number += 1
+        client = shmmap.connect(one.endpoint, timeout=LONG_S)
+        place = AtPlace(number)
+        try:
+            sys.settrace(place)
+            client.close()
+            done = place.left > 0
+        except Interrupt:
+            pass
+        finally:
+            sys.settrace(None)
+        client.close()
+        del client
+        if number % 8 == 0 or done:
+            shmmap.connect(one.endpoint).close()
+            assert holdings(one) == before, number
+    assert number > 20
+
+
+def test_connecting(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    shmmap.connect(one.endpoint).close()
+    before = holdings(one)
+
+    def check(number: int) -> None:
+        if number % 16 == 0:
+            gc.collect()
+            shmmap.connect(one.endpoint).close()
+            assert holdings(one) == before, number
+
+    assert interrupted_everywhere(lambda: shmmap.connect(one.endpoint, name="x").close(), check) > 100
+
+
+# --- a client used in a handler -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("use", ["ask", "close"])
+def test_a_client_in_a_handler_that_interrupted_it(
+    daemon: Factory, divided_map: DividedMap, use: str
+) -> None:
+    """It says so at once, and the request that was interrupted goes on."""
+    one = daemon(divided_map.root)
+    seen: list[BadRequest] = []
+    with shmmap.connect(one.endpoint, timeout=LONG_S) as client:
+        client.around(0, 0, 30, wait=LONG_S)
+        waiting = threading.Event()
+
+        def handle(number: int, frame: FrameType | None) -> None:
+            del number, frame
+            with pytest.raises(BadRequest, match="signal handler") as raised:
+                client.stats() if use == "ask" else client.close()
+            seen.append(raised.value)
+            one.send(signal.SIGCONT)
+
+        before = signal.signal(signal.SIGUSR1, handle)
+        try:
+            one.send(signal.SIGSTOP)
+
+            def interrupt() -> None:
+                while not client.session._lock.locked():
+                    pass
+                os.kill(os.getpid(), signal.SIGUSR1)
+                waiting.set()
+
+            thread = threading.Thread(target=interrupt)
+            thread.start()
+            assert client.around(0, 0, 30, wait=LONG_S).complete
+            thread.join()
+        finally:
+            one.send(signal.SIGCONT)
+            signal.signal(signal.SIGUSR1, before)
+        assert waiting.is_set()
+        assert "flag" in seen[0].hint
+        assert client.stats().epoch == client.epoch
+
+
+def test_a_handler_may_use_the_client_between_requests(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    answers = []
+    with shmmap.connect(one.endpoint, timeout=LONG_S) as client:
+        before = signal.signal(signal.SIGUSR1, lambda *_: answers.append(client.stats()))
+        try:
+            signal.raise_signal(signal.SIGUSR1)
+        finally:
+            signal.signal(signal.SIGUSR1, before)
+    assert answers
