@@ -20,6 +20,7 @@ __all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
 ANSWER_S: Final = 5.0
 """How long a verb waits for a daemon that is there, to connect and for each answer."""
 
+
 def _setting(args: argparse.Namespace, name: str) -> str:
     flag: str | None = getattr(args, name)
     return flag if flag is not None else os.environ.get(f"SHMMAP_{name.upper()}", "")

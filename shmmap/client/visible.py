@@ -7,13 +7,18 @@ import os
 
 from shmmap.errors import SegmentError
 
-__all__ = ["check_visible", "owner_of_segments"]
+__all__ = ["check_visible", "owner_of_segments", "statistics_path"]
+
+
+def statistics_path(shm_dir: str, segment_prefix: str) -> str:
+    """Path of the statistics segment of the daemon whose segments' names begin so."""
+    return f"{shm_dir}/{segment_prefix.lstrip('/')}statistics"
 
 
 def owner_of_segments(shm_dir: str, segment_prefix: str) -> int | None:
     """User whose segments they are, as this process sees it; None where it sees none."""
     try:
-        return os.lstat(f"{shm_dir}/{segment_prefix.lstrip('/')}statistics").st_uid
+        return os.lstat(statistics_path(shm_dir, segment_prefix)).st_uid
     except OSError:
         return None
 

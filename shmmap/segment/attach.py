@@ -37,7 +37,7 @@ from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["AttachedSegment", "OnUnmap", "attach"]
+__all__ = ["AttachedSegment", "OnUnmap", "attach", "map_file"]
 
 OnUnmap = Callable[[Owned], object]
 
@@ -65,8 +65,14 @@ _MAP_POPULATE: Final = 0x8000
 _MAP_FAILED: Final = ctypes.c_void_p(-1).value
 
 
-def _map(fd: int, nbytes: int, populate: bool) -> Owned:
-    """Map a file's first bytes; they are unmapped when the result ends, whose value is their address."""
+def map_file(fd: int, nbytes: int, *, populate: bool = False) -> Owned:
+    """Map a file's first bytes; they are unmapped when the result ends, whose value is their address.
+
+    Raises
+    ------
+    SegmentError
+        The kernel refuses.
+    """
     flags = _MAP_SHARED | (_MAP_POPULATE if populate else 0)
     memory = Owned(map(_mmap, (None,), (nbytes,), (_PROT_READ,), (flags,), (fd,), (0,)), _munmap, nbytes)
     if memory.value == _MAP_FAILED or memory.value is None:
@@ -272,7 +278,7 @@ def attach(
         if PAGE_BYTES < header_bytes <= size:
             page = os.pread(fd, header_bytes, offset)
         _, columns = read_columns(memoryview(page), size)
-        memory = _map(fd, end, populate)
+        memory = map_file(fd, end, populate=populate)
         if on_mapped is not None:
             on_mapped(memory)
         step("client.map")

@@ -31,12 +31,12 @@ __all__ = [
 ]
 
 MAGIC: Final = b"SHMSTAT\x01"
-LAYOUT_VERSION: Final = (1, 1)
+LAYOUT_VERSION: Final = (1, 2)
 BYTE_ORDER: Final = 0x01020304
 PAGE_BYTES: Final = 4096
 
 START: Final = struct.Struct("<8sHHI12I")
-EXTENSION: Final = struct.Struct("<5I40xI")
+EXTENSION: Final = struct.Struct("<6I36xI")
 DESCRIPTIONS_OFFSET: Final = START.size + EXTENSION.size
 DESCRIPTION: Final = struct.Struct("<32s16sB111s")
 IDENTITY: Final = struct.Struct("<QII")
@@ -46,6 +46,7 @@ CRC_BYTES: Final = 4
 CRC: Final = struct.Struct("<I4x")
 TAIL: Final = struct.Struct("<II")
 TABLE: Final = struct.Struct("<Q")
+CHANGES: Final = struct.Struct("<QQ")
 
 KINDS: Final[tuple[Literal["counter", "gauge", "histogram"], ...]] = ("counter", "gauge", "histogram")
 
@@ -67,6 +68,7 @@ class Header(NamedTuple):
     clients_offset: int = 0
     client_row_bytes: int = 0
     max_clients: int = 0
+    changes_offset: int = 0
 
     @property
     def descriptions_end(self) -> int:
@@ -99,7 +101,8 @@ def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Hea
     counters_end = STATE.size + 8 * len(counters) + CRC.size
     state_bytes = _up(counters_end + TAIL.size + 8 * len(histograms) * (1 + BUCKETS) + CRC.size, 64)
     table_offset = state_offset + 2 * state_bytes
-    clients_offset = _up(table_offset + 64, PAGE_BYTES)
+    changes_offset = table_offset + 64
+    clients_offset = _up(changes_offset + 64, PAGE_BYTES)
     return Header(
         counters=tuple(counters),
         identity_offset=identity_offset,
@@ -115,6 +118,7 @@ def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Hea
         clients_offset=clients_offset,
         client_row_bytes=CLIENT_ROW_BYTES,
         max_clients=MAX_CLIENTS,
+        changes_offset=changes_offset,
     )
 
 
@@ -174,7 +178,7 @@ def unpack_header(data: bytes) -> Header:
     header = Header(counters, *places)
     if at < START.size + EXTENSION.size:  # layout 1.0
         return header
-    histogram_count, buckets, clients_at, client_row, max_clients, crc = EXTENSION.unpack_from(
+    histogram_count, buckets, clients_at, client_row, max_clients, changes_at, crc = EXTENSION.unpack_from(
         data, START.size
     )
     last = end + histogram_count * row
@@ -190,6 +194,7 @@ def unpack_header(data: bytes) -> Header:
         clients_offset=clients_at,
         client_row_bytes=client_row,
         max_clients=max_clients,
+        changes_offset=changes_at,
     )
 
 

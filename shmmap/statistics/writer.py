@@ -27,6 +27,7 @@ from shmmap.statistics.exclusive_name import hold, take_name
 from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
+    CHANGES,
     TABLE,
     State,
     pack_header,
@@ -99,6 +100,8 @@ class StatisticsWriter:
         self._identity_sequence = 0
         self._identity_due: tuple[bytes, int] | None = None
         self._table_sequence = 0  # odd while rows change
+        self._changes = CHANGES.pack(identity.epoch, 0)
+        self._changes_due = True
         self._slots: dict[Hashable, int] = {}
         self._free: list[int] = []
         self._used = 0
@@ -119,6 +122,7 @@ class StatisticsWriter:
             self._allocated = _GROWTH_ROWS
             os.pwrite(self._fd, pack_header(self._layout), 0)
             self.update_identity(identity)
+            self.map_changed()
             self.beat()
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
@@ -149,6 +153,15 @@ class StatisticsWriter:
         name = _LONGEST[kind]
         if duration_ns > self.values[name]:
             self.values[name] = duration_ns
+
+    def map_changed(self) -> None:
+        """Have clients see at once that the map has other cells, or a cell another version, than before.
+
+        To be called before any reply or event tells of it.
+        """
+        epoch, count = CHANGES.unpack(self._changes)
+        self._changes = CHANGES.pack(epoch, count + 1)
+        self._changes_due = not self._write(self._changes, self._layout.changes_offset)
 
     def show_clients(self, rows: Sequence[ClientRow]) -> None:
         """Show these clients, from the next beat on; at most 256, and as many as there is room for."""
@@ -210,6 +223,8 @@ class StatisticsWriter:
     def beat(self, *, max_rows: int = 256) -> None:
         """Write the time, all counters and at most ``max_rows`` changed rows (the rest at later beats)."""
         self._write_identity()
+        if self._changes_due:
+            self._changes_due = not self._write(self._changes, self._layout.changes_offset)
         if self._changed or self._removed or self._missing or self._table_sequence % 2:
             self._write_rows(max_rows)
         sequence = self._sequence + 1

@@ -15,6 +15,7 @@ from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client
 from shmmap.client.window.failed_boxes import FailedBoxes
+from shmmap.client.window.nothing_new import NothingNew
 from shmmap.client.window.retention import Departed, RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
@@ -88,6 +89,7 @@ class WindowRefresher:
         self._populate = populate
         self._timeout_s = timeout_s
         self._failed_boxes = FailedBoxes(client)
+        self._nothing_new = NothingNew(client)
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
 
@@ -97,7 +99,7 @@ class WindowRefresher:
         return self._client.disconnected_since is not None
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
-        """Ask the daemon once.
+        """Ask the daemon once, unless it is certain that nothing would come (`NothingNew`).
 
         Returns
         -------
@@ -112,6 +114,11 @@ class WindowRefresher:
             As `Client.differential`; the old state stays true.
         """
         area = self._make_area(pose.x, pose.y, self._radius, self._z)
+        news, asked_s = self._nothing_new, self._clock()
+        if news.certain(state, pose, area, asked_s):
+            self._retain(pose, asked_s)
+            return msgspec.structs.replace(state, asked=pose, area=area), False
+        changes = news.changes()
         answer = self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
             # Another life of the daemon cannot know what versions of an earlier one belonged to, and takes
@@ -141,6 +148,7 @@ class WindowRefresher:
             boxes = self._failed_boxes.of(answer.failed, area, answer.map_version)
             after = msgspec.structs.replace(after, failed_boxes=boxes)
         self._retain(pose, now_s)
+        news.answered(changes, after, pose, asked_s)
         return after, progress
 
     def _ask(

@@ -84,6 +84,7 @@ class MapSwitch:
             return
         cell_id = cache.catalogue.id(index)
         self._remember({cell_id}, ())
+        cache.statistics.map_changed()
         cache.catalogue.set_stamp(index, stamp)
         cache.chill(index)
         cache.tell(cache.events.changed, cell_id, cache.catalogue.version(index))
@@ -99,6 +100,7 @@ class MapSwitch:
             self._history.clear()
             self._remembered = 0
         changed = np.union1d(change.changed, change.moved)
+        cache.statistics.map_changed()
         self._leftovers += cache.serve(new, changed if change.same_cells else None)
         self._residents = deque(cache.ledger.residents())
         cache.unentered = len(self._residents)

@@ -20,15 +20,14 @@ TWO = (
 )
 LOAD = (Counter("load", "histogram", "ns", "How long"),)
 GOLDEN_START = (
-    "53484d5354415401 0100 0100 04030201"  # magic, 1.1, byte order
+    "53484d5354415401 0100 0200 04030201"  # magic, 1.2, byte order
     "80000000 02000000 a0000000"  # descriptions at 128: 2 of 160 bytes
     "80020000 00400000"  # identity at 640, 16384 bytes each
     "80820000 80040000"  # state at 33408, 1152 bytes each
     "808b0000 00900100 00010000 00000200"  # table 35712, rows at 102400 of 256, at most 131072
-    "d79bbe15"
+    "83f415ef"
     "01000000 82000000 00900000 00010000 00010000"  # 1 histogram of 130; clients at 36864, 256 of 256
-    + "00" * 40
-    + "9787d479"
+    "c08b0000" + "00" * 36 + "2fc80a3d"  # changes at 35776
 )
 GOLDEN_FIRST = "7265717565737473" + "00" * 40 + "00" + "5265717565737473207265636569766564" + "00" * 94
 GOLDEN_SECOND = (
