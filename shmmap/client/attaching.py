@@ -61,10 +61,11 @@ def _drain(queue: SimpleQueue[Owned | None]) -> None:
 
 
 class _Mapped(weakref.ref[Owned]):
-    """Mapped memory that its version is known of, also when it is mapped no more."""
+    """Mapped memory, whose version is known also when it is mapped no more."""
 
-    __slots__ = ("version",)
+    __slots__ = ("before", "version")
 
+    before: _Mapped | None
     version: int
 
 
@@ -80,7 +81,7 @@ class Attacher:
     def __init__(self) -> None:
         self.unmapper = Unmapper()
         self._cells: WeakValueDictionary[tuple[int, str], Cell] = WeakValueDictionary()
-        self._mapped: dict[int, set[_Mapped]] = {}
+        self._mapped: dict[int, _Mapped] = {}  # the last one of each version, which knows the one before
         self._ended: deque[_Mapped] = deque()
         self._unmapped: list[int] = []
 
@@ -127,7 +128,8 @@ class Attacher:
         """Memory is mapped for a version; when and wherever it is unmapped, that is noted by itself."""
         mapped = _Mapped(memory, self._ended.append)
         mapped.version = version
-        self._mapped.setdefault(version, set()).add(mapped)
+        mapped.before = self._mapped.get(version)
+        self._mapped[version] = mapped
 
     @property
     def any_mapped(self) -> bool:
@@ -137,13 +139,15 @@ class Attacher:
     def unmapped(self) -> list[int]:
         """Versions of which nothing is mapped any more; to be emptied by whoever has told the daemon."""
         while self._ended:
-            mapped = self._ended[0]  # it stays until all is done: an exception may come anywhere
-            others = self._mapped.get(mapped.version)
-            if others is not None:
-                others.discard(mapped)
-                if not others:
-                    self._unmapped.append(mapped.version)
-                    del self._mapped[mapped.version]
+            version = self._ended[0].version  # it stays until all is done: an exception may come anywhere
+            known = left = self._mapped.get(version)
+            while left is not None and left() is None:
+                left = left.before
+            if left is not None:
+                self._mapped[version] = left
+            elif known is not None:
+                self._unmapped.append(version)
+                del self._mapped[version]
             self._ended.popleft()
         return self._unmapped
 

@@ -74,13 +74,15 @@ def map_file(fd: int, nbytes: int, *, populate: bool = False) -> Owned:
         The kernel refuses.
     """
     flags = _MAP_SHARED | (_MAP_POPULATE if populate else 0)
-    memory = Owned(map(_mmap, (None,), (nbytes,), (_PROT_READ,), (flags,), (fd,), (0,)), _munmap, nbytes)
+    given = map(_mmap, (None,), (nbytes,), (_PROT_READ,), (flags,), (fd,), (0,))
+    memory = Owned(zip(given, (nbytes,), strict=True), _munmap)
     if memory.value == _MAP_FAILED or memory.value is None:
         number = ctypes.get_errno()
         raise SegmentError(
             f"cannot map {nbytes} bytes: {os.strerror(number)}",
             hint="vm.max_map_count, or the limit of address space (ulimit -v), may be too low",
         )
+    memory.keep(partial(_munmap, memory.value, nbytes))
     return memory
 
 
@@ -177,7 +179,7 @@ def _open(name: str, shm_dir: str) -> Owned:
         fds = map(_fd_of, map(_open_shared, (name,)))
     else:
         fds = map(os.open, (f"{shm_dir}/{name.lstrip('/')}",), (_FLAGS,))
-    return Owned(fds, os.close)
+    return Owned(zip(fds), os.close)
 
 
 def _open_soon(name: str, shm_dir: str) -> Owned:

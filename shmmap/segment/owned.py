@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import starmap
 from typing import Any
 
 __all__ = ["Owned"]
@@ -22,11 +23,9 @@ class Owned:
     Parameters
     ----------
     given
-        Yields the thing: a `map` of the built-in function that gives it.
+        Yields one tuple, whose first is the thing: a `zip` of a `map` of the built-in function that gives it.
     take_back
-        Built in, too; is called with the thing, once, and then returns None or 0.
-    more
-        Further arguments of ``take_back``.
+        Built in, too; is called with what is in the tuple, once, and then returns None or 0.
 
     Attributes
     ----------
@@ -43,12 +42,16 @@ class Owned:
 
     __del__: Callable[[], object]  # in a slot: what Python calls is built in, and no function of ours
 
-    def __init__(self, given: Iterable[Any], take_back: Callable[..., Any], *more: Any) -> None:
-        kept: list[Any] = []
-        # each thing in the list is taken back once, since a map is at an end after that
-        self.__del__ = partial(any, map(take_back, kept, *((one,) for one in more)))
+    def __init__(self, given: Iterable[tuple[Any, ...]], take_back: Callable[..., Any]) -> None:
+        kept: list[tuple[Any, ...]] = []
+        # each in the list is taken back once, since an iterator is at an end after that
+        self.__del__ = partial(any, starmap(take_back, kept))
         kept.extend(given)
-        self.value = kept[0]
+        self.value = kept[0][0]
+
+    def keep(self, take_back: Callable[[], object]) -> None:
+        """Need less memory from now on: ``take_back``, built in, does all when this object ends."""
+        self.__del__ = take_back
 
     def give_back(self) -> None:
         """Give it back now, not only when this object ends."""

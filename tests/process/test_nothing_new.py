@@ -35,9 +35,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[type]:
     kinds: list[type] = []
     ask = Connection.ask
 
-    def ask_and_tell(
-        connection: Connection, message: object, *arguments: object, **options: object
-    ) -> object:
+    def ask_and_tell(connection: Connection, message: Any, kind: Any, **options: Any) -> Any:
         kinds.append(type(message))
         return ask(connection, message, kind, **options)
 

@@ -40,7 +40,7 @@ class ChangeCounter:
     def __init__(self, path: str) -> None:
         from shmmap.statistics.layout import CHANGES, unpack_header  # windows alone, and once a daemon
 
-        file = Owned(map(os.open, (path,), (_FLAGS,)), os.close)
+        file = Owned(zip(map(os.open, (path,), (_FLAGS,))), os.close)
         try:
             status = os.fstat(file.value)
             if not stat.S_ISREG(status.st_mode):

@@ -117,7 +117,9 @@ class WindowRefresher:
         news, asked_s = self._nothing_new, self._clock()
         if news.certain(state, pose, area, asked_s):
             self._retain(pose, asked_s)
-            return msgspec.structs.replace(state, asked=pose, area=area), False
+            return (
+                state if area == state.area else msgspec.structs.replace(state, asked=pose, area=area)
+            ), False
         changes = news.changes()
         answer = self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
