@@ -11,7 +11,7 @@ import pytest
 
 import shmmap
 from shmmap.client.connection import Connection
-from shmmap.client.window import nothing_new
+from shmmap.client.window import change_counter, nothing_new
 from shmmap.client.window.blocking import BlockingFollower
 from shmmap.client.window.map_window import MapWindow
 from shmmap.protocol.messages import Differential, Metadata
@@ -201,7 +201,7 @@ def test_without_the_counter_it_asks(
     def refuse(path: str) -> NoReturn:
         raise PermissionError(13, "Permission denied", path)
 
-    monkeypatch.setattr(nothing_new, "ChangeCounter", refuse)
+    monkeypatch.setattr(change_counter, "ChangeCounter", refuse)
     one = daemon(divided_map.root)
     with window_of(one, 30) as window:
         window.move_to(0, 0, wait=LONG_S)

@@ -11,6 +11,7 @@ from typing import Final
 from shmmap.errors import SegmentError
 from shmmap.segment.attach import map_file
 from shmmap.segment.owned import Owned
+from shmmap.statistics.layout import CHANGES, unpack_header
 
 __all__ = ["ChangeCounter"]
 
@@ -38,8 +39,6 @@ class ChangeCounter:
     """
 
     def __init__(self, path: str) -> None:
-        from shmmap.statistics.layout import CHANGES, unpack_header  # windows alone, and once a daemon
-
         file = Owned(zip(map(os.open, (path,), (_FLAGS,))), os.close)
         try:
             status = os.fstat(file.value)

@@ -56,7 +56,9 @@ class MapWindow:
     update_distance
         Metres the pose moves before the daemon is asked again (20 in Autoware).
     refresh_interval
-        Seconds after which it is asked anyhow, to learn of a changed map.
+        Seconds after which it is asked anyhow, to learn of a changed map.  A request that is certain to
+        bring nothing is not sent, except to tell the pose every second or 5 m; so small steps and short
+        intervals cost little, where the daemon's statistics can be read.
     retention
         What to keep attached of what has left the window; default nothing.
     background

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from shmmap import geometry
-from shmmap.client.client import Client
-from shmmap.client.window.change_counter import ChangeCounter
 from shmmap.client.window.state import WindowState
 from shmmap.errors import ShmmapError
 from shmmap.protocol.messages import Intent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from shmmap.client.client import Client
+    from shmmap.client.window.change_counter import ChangeCounter
 
 __all__ = ["NothingNew"]
 
@@ -78,6 +79,8 @@ class NothingNew:
         session = self._session
         opened_for = session.welcome.epoch, session.handshakes
         if opened_for != self._opened_for:
+            from shmmap.client.window.change_counter import ChangeCounter  # once a daemon, and not at import
+
             self._counter = None
             try:
                 counter = ChangeCounter(session.statistics_path)
