@@ -121,6 +121,19 @@ def makes_another_request(client: shmmap.Client) -> str:
     return ""
 
 
+def is_interrupted_once(client: shmmap.Client, after_s: float) -> bool:
+    """Ask, and have a signal come that much later; whether it came in time."""
+    try:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, after_s)
+            client.around(0.0, 0.0, 70.0)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+    except Interrupt:
+        return True
+    return False
+
+
 def is_interrupted(orders: Orders, endpoint: str, shm_dir: str) -> dict[str, Any]:
     """A signal handler's exception interrupts a request at any moment; then the next one is made."""
 
@@ -139,23 +152,21 @@ def is_interrupted(orders: Orders, endpoint: str, shm_dir: str) -> dict[str, Any
     took_s = time.perf_counter() - began
     open_before, mapped_before = len(os.listdir("/proc/self/fd")), mappings_under(shm_dir)
     while found["interrupts"] < INTERRUPTS:
-        try:
-            try:
-                signal.setitimer(signal.ITIMER_REAL, rng.uniform(1e-5, 1.2 * took_s))
-                client.around(0.0, 0.0, 70.0)
-            finally:
-                signal.setitimer(signal.ITIMER_REAL, 0.0)
-        except Interrupt:  # noqa: PERF203
-            found["interrupts"] += 1
-            failure = makes_another_request(client)
-            if failure:
-                found["not answered"] += 1
-                found["said"] = failure
-                client = shmmap.connect(endpoint, name="interrupted", timeout=2.0)
+        if not is_interrupted_once(client, rng.uniform(1e-5, 1.2 * took_s)):
+            continue
+        found["interrupts"] += 1
+        failure = makes_another_request(client)
+        if failure:
+            found["not answered"] += 1
+            found["said"] = failure
+            client = shmmap.connect(endpoint, name="interrupted", timeout=2.0)
+        settled = time.monotonic() + 0.2  # another thread unmaps
+        opened = mapped = sys.maxsize
+        while (opened > open_before or mapped > mapped_before) and time.monotonic() < settled:
             opened, mapped = len(os.listdir("/proc/self/fd")), mappings_under(shm_dir)
-            found["descriptors"] += opened > open_before
-            found["mappings"] += mapped > mapped_before
-            open_before, mapped_before = opened, mapped
+        found["descriptors"] += opened > open_before
+        found["mappings"] += mapped > mapped_before
+        open_before, mapped_before = opened, mapped
     closing = threading.Thread(target=client.close, daemon=True)
     closing.start()
     closing.join(10.0)

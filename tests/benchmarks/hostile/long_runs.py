@@ -12,7 +12,7 @@ from typing import Final
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.hostile.actors import Actor, Orders
 from tests.benchmarks.hostile.beside import Beside
-from tests.benchmarks.hostile.files import reloads, touch
+from tests.benchmarks.hostile.files import reloads, touch_the_last
 from tests.benchmarks.hostile.report import Report
 from tests.benchmarks.hostile.requests import SIDE, asks_for_normals, waits_with_many_requests
 from tests.benchmarks.hostile.segments import ROUTE_VERTICES, budget_for, idles_with_routes
@@ -29,10 +29,9 @@ SEGMENTS: Final = 7430
 def worst_five(told: Report, stage: Stage) -> None:
     """A1, A2, A3, A4 and A6 together under a full budget of 7430 segments and 1024 descriptors."""
     span = (0.0, SIDE * 20.0)
-    command = ["prlimit", f"--nofile={DESCRIPTORS}:{DESCRIPTORS}"]
     flags = ["--budget", budget_for(SEGMENTS), "--cache-size", "0"]
     with ExitStack() as stack:
-        one = stack.enter_context(stage.served(stage.many_cells(SIDE), *flags, command=command))
+        one = stack.enter_context(stage.served(stage.many_cells(SIDE), *flags, descriptors=DESCRIPTORS))
         with Actor(fills, one.endpoint, SIDE, SEGMENTS) as filler:
             filler.said(900.0)
         with RawClient(one.endpoint, hello=False) as client:
@@ -116,7 +115,7 @@ def churn(told: Report, stage: Stage) -> None:
             driver.said()
         before = counters_of(one)
         time.sleep(stage.minutes * 30.0)
-        touch(path)
+        touch_the_last(path, side)
         with Actor(reloads, one.endpoint) as operator:
             took_s, failure = operator.said(900.0)
         told.must(f"the reload, {took_s:.1f} s, was answered", not failure, failure)

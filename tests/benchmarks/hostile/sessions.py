@@ -150,8 +150,7 @@ def opens_sessions(orders: Orders, endpoint: str) -> int:
 @scene("A22", "More connections than descriptors keep nobody out, with nothing but what the kernel promises")
 def crowds(told: Report, stage: Stage) -> None:
     """2000 silent connections, then 2000 sessions, under a limit of 1024 descriptors."""
-    command = ["prlimit", f"--nofile={DESCRIPTORS}:{DESCRIPTORS}"]
-    with stage.served(stage.new_map().root, command=command) as one, Beside(told, one):
+    with stage.served(stage.new_map().root, descriptors=DESCRIPTORS) as one, Beside(told, one):
         for crowd in (says_nothing, opens_sessions):
             with Actor(crowd, one.endpoint) as attacker:
                 time.sleep(15.0)
@@ -175,9 +174,8 @@ def dropped_clients(told: Report, stage: Stage) -> None:
     side = 60
     span_m = (-side * 10.0, side * 10.0)
     made = stage.new_map(columns=side, rows=side, points=400)
-    command = ["prlimit", f"--nofile={DESCRIPTORS}:{DESCRIPTORS}"]
     with (
-        stage.served(made.root, "--budget", "12M", command=command) as one,
+        stage.served(made.root, "--budget", "12M", descriptors=DESCRIPTORS) as one,
         Beside(told, one),
         RawClient(one.endpoint) as operator,
     ):

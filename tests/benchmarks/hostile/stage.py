@@ -19,6 +19,9 @@ from tests.support.divided_map import DividedMap, make_map
 
 __all__ = ["SCENES", "Scene", "Stage", "scene"]
 
+MOST_BYTES: Final = 6 << 30
+"""Private memory of a daemon, and of each of its loaders: a defect must not take the machine with it."""
+
 
 @dataclass
 class Stage:
@@ -59,9 +62,13 @@ class Stage:
         return make_map(Path(tempfile.mkdtemp(dir=self.scratch)) / "map", **size)
 
     @contextlib.contextmanager
-    def served(self, path: Path, *flags: str, **options: Any) -> Iterator[DaemonProcess]:
-        """Serve a map while the block runs."""
-        one = DaemonProcess(path, *flags, **options)
+    def served(
+        self, path: Path, *flags: str, descriptors: int = 0, **options: Any
+    ) -> Iterator[DaemonProcess]:
+        """Serve a map while the block runs, with at most so many descriptors."""
+        limits = ["prlimit", f"--data={MOST_BYTES}"]
+        limits += [f"--nofile={descriptors}:{descriptors}"] if descriptors else []
+        one = DaemonProcess(path, *flags, command=limits, **options)
         try:
             one.start()
             if self.lifted:
