@@ -36,6 +36,8 @@ def worst_five(told: Report, stage: Stage) -> None:
             filler.said(900.0)
         with RawClient(one.endpoint, hello=False) as client:
             events_path = client.hello()[19]
+        idlers = stack.enter_context(Actor(idles_with_routes, one.endpoint, 300, span[1]))
+        idlers.said(900.0)
         stack.enter_context(Beside(told, one))
         attackers = [
             stack.enter_context(attacker)
@@ -43,15 +45,16 @@ def worst_five(told: Report, stage: Stage) -> None:
                 Actor(subscribes, events_path),
                 Actor(waits_with_many_requests, one.endpoint, [58, 57, 57, 57], 3.0),
                 Actor(leaves_without_a_word, one.endpoint, span, [10**9]),
-                Actor(idles_with_routes, one.endpoint, 300, span[1]),
                 Actor(asks_for_normals, one.endpoint),
                 Actor(walks_cold, one.endpoint, stage.minutes * 60.0, span, span),
             )
         ]
         time.sleep(stage.minutes * 60.0)
         for attacker in attackers:
-            attacker.kill()
-        told.tell(f"{', '.join(attacker.name for attacker in attackers)}: {stage.minutes:g} minutes together")
+            try:
+                told.tell(f"{attacker.name}: {attacker.end(60.0)}")
+            except RuntimeError as error:
+                told.tell(f"{str(error).splitlines()[-1]}")
 
 
 VEHICLES: Final = 200

@@ -32,7 +32,7 @@ def waits_with_many_requests(
                 session.send("area", EVERYTHING, ["points"], wait_s, None)
         for session, count in zip(sessions, counts, strict=True):
             for _ in range(count):
-                if not session.socket.poll(int(REPLY_S * 1e3)):
+                if not session.socket.poll(int(REPLY_S * 1e3)) or not orders.go_on():
                     return found
                 reply = session.receive_bytes()
                 found["refused" if len(reply) < 300 else "answers"] += 1

@@ -26,6 +26,7 @@ from tests.support.raw_client import RawClient
 DESCRIPTORS: Final = 1024
 STILL_MAPPED: Final = 100
 REST_S: Final = 3.0
+MOST_FAILURES: Final = 50
 GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16 + 32)
 
 
@@ -74,10 +75,11 @@ def subscriptions(told: Report, stage: Stage) -> None:
 
 def leaves_without_a_word(
     orders: Orders, endpoint: str, span_m: tuple[float, float], stops: list[int]
-) -> None:
+) -> tuple[int, int]:
     """Client after client asks with a place and a route, and is dropped unclosed; some cells stay mapped.
 
-    It says how many it was, and what refusals said, at each of ``stops``, and rests then.
+    It says how many it was, and what refusals said, at each of ``stops``, and rests then; returns how many
+    it was, and how many were refused.
     """
     import shmmap
 
@@ -86,7 +88,7 @@ def leaves_without_a_word(
     failures: list[str] = []
     count = 0
     for stop in stops:
-        while count < stop and len(failures) < 5:
+        while count < stop and len(failures) < MOST_FAILURES and orders.go_on():
             x, y = (rng.uniform(*span_m) for _ in range(2))
             route = tuple((x + 20.0 * math.cos(n), y + 20.0 * math.sin(n)) for n in range(64))
             try:
@@ -104,6 +106,7 @@ def leaves_without_a_word(
         orders.go_on(REST_S)
     while orders.go_on(60.0):
         pass
+    return count, len(failures)
 
 
 CROWD: Final = 2000
