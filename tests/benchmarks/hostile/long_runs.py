@@ -51,10 +51,15 @@ def worst_five(told: Report, stage: Stage) -> None:
         ]
         time.sleep(stage.minutes * 60.0)
         for attacker in attackers:
-            try:
-                told.tell(f"{attacker.name}: {attacker.end(60.0)}")
-            except RuntimeError as error:
-                told.tell(f"{str(error).splitlines()[-1]}")
+            told.tell(f"{attacker.name}: {last_words(attacker)}")
+
+
+def last_words(attacker: Actor) -> str:
+    """What an attacker came to; it may not get an answer any more."""
+    try:
+        return str(attacker.end(30.0))
+    except RuntimeError as error:
+        return str(error).splitlines()[-1]
 
 
 VEHICLES: Final = 200
