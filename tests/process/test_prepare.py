@@ -134,7 +134,7 @@ def test_a_killed_run_leaves_no_worker_and_goes_on_where_it_was(tmp_path: Path) 
         command(made, cache, NDT), env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL
     )
     try:
-        entries = cache / "layers" / "state"
+        entries = cache / "layers" / "version"
         while run.poll() is None and not list(entries.rglob("*.layer")):
             pass
         workers = [int(pid) for pid in Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()]
