@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from shmmap.errors import (
         BadRequest,
         Busy,
+        CannotStart,
         CannotWrite,
         CellError,
         ConfigError,
@@ -85,6 +86,7 @@ __all__ = [
     "BadRequest",
     "Box",
     "Busy",
+    "CannotStart",
     "CannotWrite",
     "Cell",
     "CellError",

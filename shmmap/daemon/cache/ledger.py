@@ -177,7 +177,7 @@ class Ledger:
         self.resident_bytes += resident.nbytes
         self.unchecked_count += not resident.checked
         self.segments.add(resident)
-        self.order.enter(resident)
+        self.order.new[resident] = None
         if old is not None:
             self._leave_service(old)
         return old

@@ -19,13 +19,13 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
 
-from shmmap.daemon.cache.closer import Closer
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.logfmt import log
+from shmmap.segment.closer import Closer
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, retired_name
 

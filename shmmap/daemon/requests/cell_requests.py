@@ -307,3 +307,4 @@ def note_area(session: Session, area: Area) -> None:
     session.area = area
     if not session.says_where:
         session.intent = messages.Intent(*area.center)
+        session.sessions.moved[session] = None

@@ -174,10 +174,11 @@ def difference(
             yield from pause()
         for version in outdated:
             key = cache.warm.of_version.get(version)
-            if key is not None and cache.index_of(key.cell_id) in inside:
+            index = cache.index_of(key.cell_id) if key is not None else None
+            if key is not None and index in inside:
                 gone.discard(version)
                 result.old.add(key)
-            elif key is None and not covered:
+            elif index is None and not covered:
                 gone.discard(version)
     result.removed = tuple(removed)
     result.removed_packed = pack_versions(gone)

@@ -80,6 +80,7 @@ class Dispatch:
         if isinstance(message, messages.Differential | messages.Area | messages.Selected):
             if message.intent is not None:
                 session.intent, session.says_where = bounded_intent(message.intent), True
+                session.sessions.moved[session] = None
             if isinstance(message, messages.Differential):
                 return self.cells.differential(session, message)
             if isinstance(message, messages.Area):

@@ -9,6 +9,7 @@ import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -28,6 +29,8 @@ SQUARE_M: Final = 16.0
 SQUARES_ORIGIN: Final = 1 << 22
 """Column and row of the square at the map's origin; what is farther away counts at the grid's edge."""
 GRID_M: Final = (SQUARES_ORIGIN - 1) * SQUARE_M
+MOVES_AT_ONCE: Final = 16
+"""Sessions whose paths are looked at at a time: less than a millisecond."""
 FIRST_STEP_M: Final = 32.0
 """Along its path a client's places are so far apart at first, then each twice as far away as the last."""
 
@@ -39,9 +42,10 @@ class Session:
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
     naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``exclusive_bytes`` are
     those that no other session holds.  ``says_where`` tells
-    an ``intent`` that the client stated from one that was guessed from ``area``, the last one it
-    asked for.  ``asker`` is whose turn its requests and loads count for: the process's, else the
-    session's own.
+    an ``intent`` (where the client is and is going to be) that it stated from one that was guessed from
+    ``area``, the last one it asked for; whoever sets it notes the session in `Sessions.moved`.  ``squares``
+    are those of `Places` that it counts to.  ``asker`` is whose turn its requests and loads count for: the
+    process's, else the session's own.
     """
 
     slot: int
@@ -52,8 +56,8 @@ class Session:
     held: dict[int, list[Resident]] = field(default_factory=dict)
     held_bytes: int = 0
     exclusive_bytes: int = 0
-    _intent: Intent | None = None
-    _squares: frozenset[int] = frozenset()
+    intent: Intent | None = None
+    squares: frozenset[int] = frozenset()
     says_where: bool = False
     area: Area | None = None
     requests: int = 0
@@ -65,20 +69,6 @@ class Session:
         """The client's process."""
         return self.connection.peer
 
-    @property
-    def intent(self) -> Intent | None:
-        """Where the client is and is going to be, as far as that is known."""
-        return self._intent
-
-    @intent.setter
-    def intent(self, intent: Intent | None) -> None:
-        squares: frozenset[int] = frozenset()
-        if intent is not None:
-            squares = squares_of(predicted_path(intent))
-        if squares != self._squares:
-            self.sessions.places.move(self._squares, squares)
-        self._intent, self._squares = intent, squares
-
     def connect(self, connection: Connection) -> None:
         """The session goes on on this connection."""
         self.disconnect()
@@ -88,6 +78,7 @@ class Session:
         """The session has no connection; what it said of where it is does not count any more."""
         self.connection.session = self.intent = self.area = None
         self.says_where = False
+        self.sessions.moved[self] = None
 
     def hold(self, residents: Iterable[Resident]) -> None:
         """The session was handed these segments."""
@@ -234,7 +225,9 @@ class Sessions:
     departed : dict
         By slot, those whose connection has ended and who may still map what they were handed.
     places
-        Where the clients are and are going to be.
+        Where the clients are and are going to be, as of the last `follow_moves`.
+    moved : dict
+        Whose intent is another one since then.
     """
 
     LIMIT = 4096
@@ -243,6 +236,7 @@ class Sessions:
         self._by_slot: dict[int, Session] = {}
         self.departed: dict[int, Session] = {}
         self.places = Places()
+        self.moved: dict[Session, None] = {}
 
     def __len__(self) -> int:
         return len(self._by_slot)
@@ -287,5 +281,19 @@ class Sessions:
     def close(self, session: Session) -> None:
         """End a session; what it held is for the caller to drop."""
         session.disconnect()
+        self._follow(session)
         self._by_slot.pop(session.slot, None)
         self.departed.pop(session.slot, None)
+
+    def follow_moves(self) -> None:
+        """Bring `places` up to date, for a bounded number of sessions that moved."""
+        for session in list(islice(self.moved, MOVES_AT_ONCE)):
+            self._follow(session)
+
+    def _follow(self, session: Session) -> None:
+        self.moved.pop(session, None)
+        intent = session.intent
+        squares = squares_of(predicted_path(intent)) if intent is not None else frozenset()
+        if squares != session.squares:
+            self.places.move(session.squares, squares)
+            session.squares = squares

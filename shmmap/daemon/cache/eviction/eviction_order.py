@@ -159,6 +159,8 @@ class EvictionOrder:
         Set aside: just handed out, their readers may be opening them.
     aside
         Set aside: somebody needs or maps them.
+    new : dict
+        Not scored yet; whatever comes into service is put here.
     scored : int
         How many scores were computed so far.
     """
@@ -167,25 +169,21 @@ class EvictionOrder:
         self.graced = SetAside()
         self.aside = SetAside()
         self.scored = 0
-        self._new: dict[Resident, float | None] = {}
+        self.new: dict[Resident, float | None] = {}
         self._entries: dict[Resident, _Entry] = {}
         self._sorted = _Sorted()
         self._number = 0
 
     def __len__(self) -> int:
-        return len(self._new) + len(self._entries) + len(self.graced) + len(self.aside)
-
-    def enter(self, resident: Resident) -> None:
-        """A segment is in service now."""
-        self._new[resident] = None
+        return len(self.new) + len(self._entries) + len(self.graced) + len(self.aside)
 
     def leave(self, resident: Resident) -> None:
         """It is not any more."""
         entry = self._entries.pop(resident, None)
         if entry is not None:
             self._sorted.remove(entry)
-        elif resident in self._new:
-            del self._new[resident]
+        elif resident in self.new:
+            del self.new[resident]
         elif not self.graced.take(resident):
             self.aside.take(resident)
 
@@ -194,17 +192,17 @@ class EvictionOrder:
         entry = self._entries.get(resident)
         if self.aside.take(resident) or (entry is not None and entry.loose is bool(resident.sessions)):
             self.leave(resident)
-            self._new[resident] = None
+            self.new[resident] = None
             return entry is None
         return False
 
     def all_again(self) -> None:
         """Anything that was set aside as mapped or needed may not be any more."""
-        few, many = self._new, self.aside.take_all()
+        few, many = self.new, self.aside.take_all()
         if len(few) > len(many):
             few, many = many, few
         many.update(few)  # however many there are, few of them are touched
-        self._new = many
+        self.new = many
 
     def set_aside(self, resident: Resident, where: SetAside, until_s: float) -> None:
         """It cannot go now; ``where`` is `graced` or `aside`."""
@@ -214,7 +212,7 @@ class EvictionOrder:
     def front(self, score: Score, now_s: float) -> list[Resident]:
         """Those that should go first, in that order, at most `FRONT`; empty when all are set aside."""
         for resident in (*self.graced.due(now_s), *self.aside.due(now_s)):
-            self._new[resident] = None
+            self.new[resident] = None
         if (
             len(self._entries) < FRONT
         ):  # else they wait for `score_new`: many at once cost little more than one
@@ -233,12 +231,12 @@ class EvictionOrder:
     @property
     def settled(self) -> bool:
         """Whether all have been scored."""
-        return not self._new
+        return not self.new
 
     def score_new(self, score: Score) -> None:
         """Score those that came, a bounded number."""
-        if self._new:
-            self._place([self._new.popitem()[0] for _ in range(min(BATCH, len(self._new)))], score)
+        if self.new:
+            self._place([self.new.popitem()[0] for _ in range(min(BATCH, len(self.new)))], score)
 
     def refresh(self, some: Iterable[Resident], score: Score) -> None:
         """Bring the scores of some segments up to date."""

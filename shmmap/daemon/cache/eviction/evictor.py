@@ -139,7 +139,10 @@ class Evictor:
 
     def _scored(self, now_s: float) -> Score:
         """How segments are scored, by where clients are (if they move, were a moment ago)."""
-        places = self.reclaimer.sessions.places
+        sessions = self.reclaimer.sessions
+        if sessions.moved:
+            sessions.follow_moves()
+        places = sessions.places
         if places.version != self._score.version and now_s - self._placed_s >= PLACES_S:
             self._placed_s = now_s
             self._score = self._score_at(places.version)

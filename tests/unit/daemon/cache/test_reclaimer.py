@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from shmmap.daemon.cache import closer
 from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
 from shmmap.daemon.cache.eviction.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
@@ -21,6 +20,7 @@ from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, TICK_
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Sessions
+from shmmap.segment import closer
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 

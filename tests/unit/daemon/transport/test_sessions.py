@@ -13,6 +13,7 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.cell_requests import note_area
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import (
+    MOVES_AT_ONCE,
     ROUTE_VERTICES,
     SQUARE_M,
     SQUARES_ORIGIN,
@@ -133,8 +134,24 @@ def test_who_gives_way() -> None:
     assert sessions.spare() is busy
 
 
+def move(session: Session, intent: Intent) -> None:
+    session.intent = intent
+    session.sessions.moved[session] = None
+
+
+def test_many_moves_are_followed_a_few_at_a_time() -> None:
+    sessions = Sessions()
+    for number in range(3 * MOVES_AT_ONCE):
+        move(sessions.open(connections.of(), "", 0.0), Intent(100.0 * number, 0.0))
+    for count in (1, 2, 3):
+        sessions.follow_moves()
+        assert len(sessions.places.squares) == count * MOVES_AT_ONCE
+    assert sessions.moved == {}
+
+
 def middles(sessions: Sessions) -> set[tuple[float, float]]:
     """Middles of the squares in which clients are or will be."""
+    sessions.follow_moves()
     return {
         (
             ((square >> 32) - SQUARES_ORIGIN + 0.5) * SQUARE_M,
@@ -153,7 +170,8 @@ def test_where_a_client_is() -> None:
     for at, middle in (((1.0, 2.0), (8.0, 8.0)), ((300.0, -4.0), (296.0, -8.0))):
         note_area(session, Circle(*at, 5.0))
         assert middles(sessions) == {middle}
-    session.intent, session.says_where = Intent(70.0, 8.0), True
+    move(session, Intent(70.0, 8.0))
+    session.says_where = True
     note_area(session, Circle(1.0, 1.0, 5.0))
     assert middles(sessions) == {(72.0, 8.0)}
 
@@ -174,12 +192,14 @@ def test_eviction_is_told_where_clients_are_going() -> None:
     """All clients together, each square once; who stays in its square changes nothing."""
     sessions = Sessions()
     one, other = (sessions.open(connections.of(), "", 0.0) for _ in range(2))
-    one.intent = Intent(1.0, 2.0, route=((60.0, 2.0), (140.0, 2.0)))
+    move(one, Intent(1.0, 2.0, route=((60.0, 2.0), (140.0, 2.0))))
     assert middles(sessions) == {(8.0, 8.0), (40.0, 8.0), (72.0, 8.0), (136.0, 8.0)}
-    other.intent, version = Intent(2.0, 3.0), sessions.places.version
+    move(other, Intent(2.0, 3.0))
     assert middles(sessions) == {(8.0, 8.0), (40.0, 8.0), (72.0, 8.0), (136.0, 8.0)}
-    other.intent = Intent(3.0, 4.0)
-    assert sessions.places.version == version + 1
+    version = sessions.places.version
+    move(other, Intent(3.0, 4.0))
+    sessions.follow_moves()
+    assert sessions.places.version == version
     one.connection.session = None
     sessions.close(one)
     assert middles(sessions) == {(8.0, 8.0)}
