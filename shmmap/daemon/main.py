@@ -25,9 +25,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
+import sys
 import time
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from shmmap import __version__
 from shmmap.daemon.assembly import Service
@@ -36,6 +38,7 @@ from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
+from shmmap.daemon.loading.prepared_parent import fork_early
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.prerequisites import (
@@ -58,6 +61,9 @@ from shmmap.statistics.exclusive_name import refuse_second
 
 __all__ = ["run"]
 
+SWITCH_S: Final = 0.0005
+"""How long a thread that reads the map again may keep the serving loop waiting for the interpreter."""
+
 
 def run(config: DaemonConfig) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code.
@@ -77,8 +83,10 @@ def run(config: DaemonConfig) -> int:
     if not config.map_path:
         raise ConfigError("no map is named", key="map_path", hint="give `shmmap serve MAP`, or set map_path")
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
+    early = fork_early()
     prepare_process()
     raise_descriptor_limit()
+    sys.setswitchinterval(SWITCH_S)
     activated = take_activated_socket()
     with contextlib.ExitStack() as stack:
         signals = StartSignals()
@@ -109,7 +117,7 @@ def run(config: DaemonConfig) -> int:
         for problem in catalogue.problems:
             log.warning("problem in the map", what=problem)
         with signals.held():
-            memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid)
+            memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early)
             stack.push(partial(_close, memory, signals))
         reloader = Reloader(origin, lambda: memory.cache.catalogue)
         service = Service(

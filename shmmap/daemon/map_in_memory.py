@@ -19,7 +19,7 @@ from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.budget import choose_budget, loader_bytes
 from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
 from shmmap.daemon.loading.adoption import Adoption
-from shmmap.daemon.loading.prepared_parent import PreparedParent
+from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
@@ -60,6 +60,7 @@ class MapInMemory:
         socket_path: str,
         mode: int,
         gid: int,
+        early: Early | None = None,
     ) -> None:
         self.directory = directory
         epoch = secrets.randbits(63) | 1
@@ -100,7 +101,7 @@ class MapInMemory:
         )  # fmt: skip
         self.watched = WatchedDescriptors()
         cache = (config.cache_dir, str(config.cache_bytes)) if config.cache_dir else ()
-        parent = PreparedParent((directory.path, str(loader_bytes(group_limit)), *cache), self.watched)
+        parent = PreparedParent((directory.path, str(loader_bytes(group_limit)), *cache), self.watched, early)
         parent.start()  # it imports what loaders need while this process gets ready
         pool = WorkerPool(config.loaders(), directory, parent, config.load_timeout_s, self.watched)
         self.map_switch = MapSwitch(self.cache)

@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting a child: a process of its own, with a channel of packets to it."""
+"""Starting a child: a process of its own or a fork of this one, with a channel of packets to it."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import resource
+import select
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 from shmmap.processes.packets import MAX_PACKET_BYTES
 
-__all__ = ["channel", "how_ended", "start_child"]
+__all__ = ["ForkedProcess", "channel", "fork_child", "how_ended", "start_child"]
 
 
 def channel() -> tuple[socket.socket, socket.socket]:
@@ -65,6 +69,81 @@ def start_child(
         ours.close()
         raise
     return process, ours
+
+
+class ForkedProcess:
+    """A child made by `fork_child`, with what is used of `subprocess.Popen`."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+
+    def kill(self) -> None:
+        """End it."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout: float) -> int:
+        """Return its exit code; `subprocess.TimeoutExpired` if it has not ended in so many seconds."""
+        pidfd = os.pidfd_open(self.pid)
+        try:
+            if not select.select([pidfd], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired(str(self.pid), timeout)
+        finally:
+            os.close(pidfd)
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+
+def fork_child(main: Callable[[int, int], int]) -> tuple[ForkedProcess, socket.socket] | None:
+    """Start a child that has imported already what this process has, in a session of its own.
+
+    Parameters
+    ----------
+    main
+        Called in the child with the descriptor of its end of the channel and this process's id; returns
+        the exit code.
+
+    Returns
+    -------
+    The process and our end of the channel; None where this process has other threads, which may hold locks
+    that the child would wait for.
+
+    Raises
+    ------
+    OSError
+        No more processes or descriptors just now.
+    """
+    if len(os.listdir("/proc/self/task")) > 1:
+        return None
+    parent = os.getpid()
+    ours, theirs = channel()
+    with theirs, _interrupts_blocked():
+        try:
+            pid = os.fork()
+        except OSError:
+            ours.close()
+            raise
+        if not pid:
+            _become(main, theirs.detach(), parent)
+    return ForkedProcess(pid), ours
+
+
+def _become(main: Callable[[int, int], int], fd: int, parent: int) -> NoReturn:
+    """Be the child: of what the parent has open only standard error is left."""
+    code = 1
+    try:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        nothing = os.open(os.devnull, os.O_RDWR)
+        for standard in (0, 1):
+            os.dup2(nothing, standard)
+        os.closerange(3, fd)
+        os.closerange(fd + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+        os.setsid()
+        os.chdir("/")
+        code = main(fd, parent)
+    except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
+        traceback.print_exc()
+    finally:
+        os._exit(code)
 
 
 @contextlib.contextmanager

@@ -260,7 +260,8 @@ def test_loaders_weigh_less_than_the_daemon(
     """Against everybody on the machine: their nice value alone counts only within their session."""
     one = daemon(divided_map.root)
     connect(one).area(circle(0, 0, 25))
-    loaders = [pid for pid in one.children() if os.getsid(pid) == pid]
-    assert loaders
-    groups = [Path(f"/proc/{pid}/autogroup").read_text().split()[-1] for pid in (one.pid, *loaders)]
-    assert groups == ["0", *["5"] * len(loaders)]
+    mine, *groups = [
+        Path(f"/proc/{pid}/autogroup").read_text().split()[-1] for pid in (one.pid, *one.loaders())
+    ]
+    assert mine == "0"
+    assert "5" in groups, "that of who has had a job"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 
 from shmmap.cli.options import Subparsers, add_verb
 
@@ -117,6 +118,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal says stop."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy's threads would spin, and nobody could be forked
     from shmmap.daemon.config import load_config
     from shmmap.daemon.main import run as serve
     from shmmap.daemon.service_manager.status import ServiceManager

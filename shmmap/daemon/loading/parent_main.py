@@ -28,6 +28,7 @@ from shmmap.processes.packets import receive_packet
 
 __all__ = ["main"]
 
+MOST_SETTINGS_BYTES: Final = 1 << 14
 _OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
 
 
@@ -107,20 +108,29 @@ def _tell(end: socket.socket, message: worker_messages.Ended) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID SHM_DIR MEMORY_BYTES [CACHE_DIR CACHE_BYTES]``."""
+    """Run with ``CHANNEL_FD PARENT_PID``.
+
+    The first packet has the settings, with zero bytes between them: the directory of segments, the memory
+    that a loader may take, bytes; directory and size of the disk cache where there is one.
+    """
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     signal.signal(signal.SIGIO, signal.SIG_IGN)
     take_slices(0)  # the short ones are for those who serve
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
         score.write(_OOM_SCORE)
-    limit_memory(int(arguments[3]))
-    cache = (arguments[4], int(arguments[5])) if len(arguments) > 5 else ("", 0)
     with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
         gc.collect()
         gc.freeze()  # a collection in a loader would copy what all of them share
+        data, _ = receive_packet(channel, bytearray(MOST_SETTINGS_BYTES))
+        if not data:
+            return 0  # the daemon did not start after all
+        shm_dir, memory_bytes, *cache = map(os.fsdecode, bytes(data).split(b"\0"))
+        limit_memory(int(memory_bytes))
+        cache_dir, cache_bytes = cache or ("", "0")
+        settings = WorkerSettings(shm_dir, cache_dir, int(cache_bytes))
         channel.send(__version__.encode())
-        _Parent(channel, WorkerSettings(arguments[2], *cache)).run()
+        _Parent(channel, settings).run()
     return 0
 
 

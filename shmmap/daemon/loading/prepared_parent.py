@@ -4,18 +4,22 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import subprocess
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from shmmap import __version__
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.logfmt import log
 from shmmap.processes.packets import receive_packet
-from shmmap.processes.start_child import how_ended, start_child
+from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, start_child
 
-__all__ = ["RESTART", "PreparedParent"]
+__all__ = ["RESTART", "Early", "PreparedParent", "fork_early"]
+
+Early: TypeAlias = tuple[ForkedProcess, socket.socket]
+"""A parent that has no settings yet, and the channel to it."""
 
 END_PATIENCE_S: Final = 0.1
 """How long the loop waits for a killed parent to end; one that hangs in the kernel may take for ever."""
@@ -32,15 +36,33 @@ def _installed() -> tuple[int, int] | None:
     return status.st_ino, status.st_mtime_ns
 
 
+def fork_early() -> Early | None:
+    """Make the first parent as a fork of this process: what both need is imported once.
+
+    Before this process has threads, locks, sockets or anything else that is its own; None if it is too late.
+    """
+    with contextlib.suppress(OSError):
+        return fork_child(_run_parent)
+    return None
+
+
+def _run_parent(fd: int, daemon: int) -> int:
+    from shmmap.daemon.loading.parent_main import main  # in the child: while the daemon goes on
+
+    return main([str(fd), str(daemon)])
+
+
 class PreparedParent:
     """Has loaders forked.  A parent that ends takes its loaders along; another one is started in its place.
 
     Parameters
     ----------
-    arguments
+    settings
         What it is told, see `shmmap.daemon.loading.parent_main.main`.
     watched
         Told of its descriptor.
+    early
+        The first one, if there is one already.
 
     Attributes
     ----------
@@ -48,11 +70,14 @@ class PreparedParent:
         Why the last one ended before it was ready; empty if it did not.
     """
 
-    def __init__(self, arguments: tuple[str, ...], watched: WatchedDescriptors) -> None:
+    def __init__(
+        self, settings: tuple[str, ...], watched: WatchedDescriptors, early: Early | None = None
+    ) -> None:
         self.why_not = ""
-        self._arguments = arguments
+        self._settings = settings
+        self._early = early
         self._watched = watched
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[bytes] | ForkedProcess | None = None
         self._channel: socket.socket | None = None
         self._ready = False
         self._program = _installed()
@@ -66,10 +91,13 @@ class PreparedParent:
     def start(self) -> None:
         """Start it where there is none; OSError if that cannot be done."""
         if self._channel is None:
-            self._process, self._channel = start_child(
-                "shmmap.daemon.loading.parent_main", *self._arguments, new_session=True
+            early, self._early = self._early, None
+            self._process, self._channel = early or start_child(
+                "shmmap.daemon.loading.parent_main", new_session=True
             )
             self._channel.setblocking(False)
+            with contextlib.suppress(ConnectionError):  # it has ended: `hear` hears of it
+                self._channel.send(b"\0".join(map(os.fsencode, self._settings)))
             self._watched.watch(self._channel.fileno(), self.hear)
             self._ready = False
 

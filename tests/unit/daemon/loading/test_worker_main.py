@@ -51,12 +51,13 @@ class Parent:
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.settimeout(PATIENCE_S)
         self.process = subprocess.Popen(
-            [*COMMAND, str(theirs.fileno()), str(os.getpid()), shm_dir, str(memory_bytes)],
+            [*COMMAND, str(theirs.fileno()), str(os.getpid())],
             pass_fds=(theirs.fileno(),),
             env={**ENVIRONMENT, "OPENBLAS_NUM_THREADS": "1", **environment},
             stderr=subprocess.DEVNULL,
         )
         theirs.close()
+        self.channel.send(f"{shm_dir}\0{memory_bytes}".encode())
         assert self.channel.recv(100).decode() == shmmap.__version__
 
     def fork(self) -> Loader:
@@ -314,13 +315,14 @@ def test_loaders_die_with_their_parent_and_it_with_the_daemon(shm_dir: str) -> N
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.settimeout(PATIENCE_S)
     daemon = subprocess.Popen(
-        [sys.executable, "-c", DAEMON, sys.executable, str(theirs.fileno()), shm_dir, str(2 << 30)],
+        [sys.executable, "-c", DAEMON, sys.executable, str(theirs.fileno())],
         pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, text=True, env=ENVIRONMENT,
     )  # fmt: skip
     theirs.close()
     try:
         assert daemon.stdout is not None
         parent = int(daemon.stdout.readline())
+        ours.send(f"{shm_dir}\0{2 << 30}".encode())
         assert ours.recv(100).decode() == shmmap.__version__
         mine, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with mine, its:
@@ -340,12 +342,55 @@ def test_loaders_die_with_their_parent_and_it_with_the_daemon(shm_dir: str) -> N
         ours.close()
 
 
-def test_a_parent_that_started_too_late_ends_at_once(shm_dir: str) -> None:
+FORKED = """
+import socket, sys
+from shmmap.daemon.loading.prepared_parent import fork_early
+import threading
+process, channel = fork_early()
+print(process.pid, flush=True)
+sys.stdin.readline()
+event = threading.Event()
+threading.Thread(target=event.wait, daemon=True).start()
+assert fork_early() is None, "another thread may hold a lock"
+channel.send(sys.argv[1].replace("|", "\\0").encode())
+assert channel.recv(100)
+print("ready", flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_the_first_parent_is_a_fork_of_the_daemon(shm_dir: str) -> None:
+    """It has nothing that was open, in a session of its own, and ends with the daemon."""
+    with tempfile.TemporaryFile() as inherited:
+        os.set_inheritable(inherited.fileno(), True)
+        daemon = subprocess.Popen(
+            [sys.executable, "-c", FORKED, f"{shm_dir}|{2 << 30}"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(inherited.fileno(),),
+            env={**ENVIRONMENT, "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+    assert daemon.stdin is not None
+    assert daemon.stdout is not None
+    with daemon, daemon.stdin, daemon.stdout:
+        parent = int(daemon.stdout.readline())
+        daemon.stdin.write("go on\n")
+        daemon.stdin.flush()
+        assert daemon.stdout.readline() == "ready\n"
+        folder = f"/proc/{parent}/fd"
+        opened = sorted(os.readlink(f"{folder}/{name}").partition(":")[0] for name in os.listdir(folder))
+        assert opened[:2] == ["/dev/null", "/dev/null"]
+        assert len(opened) == 4, "and standard error, and the channel"
+        assert (os.getsid(parent), os.readlink(f"/proc/{parent}/cwd")) == (parent, "/")
+        assert private_bytes(parent) < 60 << 20
+        daemon.kill()
+    assert wait_ended(parent, PATIENCE_S)
+
+
+def test_a_parent_that_started_too_late_ends_at_once() -> None:
     """Its parent is not who should be: the daemon died before the kernel knew that it cares."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         code = subprocess.run(
-            [*COMMAND, str(theirs.fileno()), "1", shm_dir, str(2 << 30)],
+            [*COMMAND, str(theirs.fileno()), "1"],
             pass_fds=(theirs.fileno(),),
             env=ENVIRONMENT,
             check=False,
