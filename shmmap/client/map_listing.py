@@ -113,7 +113,9 @@ class MapListing(Sequence[CellInfo]):
         return [self._info(n) for n in chosen] if isinstance(chosen, range) else self._info(chosen)
 
 
-def list_cells(session: Session, area: geometry.Area | None, since: int | None) -> MapListing:
+def list_cells(
+    session: Session, area: geometry.Area | None, since: int | None, timeout_s: float | None = None
+) -> MapListing:
     """Ask for all pages of the daemon's list; see `shmmap.Client.metadata`.
 
     Raises
@@ -129,6 +131,7 @@ def list_cells(session: Session, area: geometry.Area | None, since: int | None) 
             page = session.ask(
                 lambda n, at=start: messages.Metadata(n, message, since, at, _PAGE_ROWS),  # type: ignore[misc]
                 messages.MetadataPage,
+                timeout_s=timeout_s,
             )
             if listing is None:
                 listing = MapListing(

@@ -153,20 +153,28 @@ class Session:
                 raise
         raise out_of_time(timeout_s)
 
-    def ask(self, make: Callable[[int], messages.Request], kind: type[R], *, quiet_s: float = 0.0) -> R:
+    def ask(
+        self,
+        make: Callable[[int], messages.Request],
+        kind: type[R],
+        *,
+        quiet_s: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> R:
         """Send the request that ``make`` builds for a request id; returns its reply.
 
-        ``quiet_s`` is how long the daemon may be busy with it, during which silence means nothing.
+        ``quiet_s`` is how long the daemon may be busy with it, during which silence means nothing,
+        ``timeout_s`` how long the reply may take beyond that, instead of the session's own.
         """
-        timeout_s = self.timeout_s + quiet_s
+        all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
 
         def work(connection: Connection) -> R:
             message = make(connection.new_request())
-            reply = connection.ask(message, kind, timeout_s=timeout_s, quiet_s=quiet_s)
+            reply = connection.ask(message, kind, timeout_s=all_s, quiet_s=quiet_s)
             self.welcome = connection.welcome
             return reply
 
-        return self._in_turn(timeout_s, work)
+        return self._in_turn(all_s, work)
 
     def ask_cells(
         self,

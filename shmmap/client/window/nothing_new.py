@@ -62,10 +62,12 @@ class NothingNew:
     ----------
     client
         Whose connection it is.
+    timeout_s
+        How long the daemon may take to tell where cells are; None: as long as the client lets it.
     """
 
-    def __init__(self, client: Client) -> None:
-        self._client = client
+    def __init__(self, client: Client, timeout_s: float | None) -> None:
+        self._timeout_s = timeout_s
         self._session = client.session
         self._opened_for: tuple[int, int] | None = None
         self._counter: ChangeCounter | None = None
@@ -130,11 +132,13 @@ class NothingNew:
     def _look_around(self, map_version: int, area: geometry.Area) -> _Neighbourhood | None:
         if self._in_vain == map_version:
             return None
+        from shmmap.client.map_listing import list_cells  # with `array`: not at import
+
         self._around = None
         min_x, min_y, max_x, max_y = area.bounds
         region = geometry.Box(min_x - AROUND_M, min_y - AROUND_M, max_x + AROUND_M, max_y + AROUND_M)
         try:
-            listing = self._client.metadata(region)
+            listing = list_cells(self._session, region, None, self._timeout_s)
         except ShmmapError:
             return None
         if len(listing) > MOST_CELLS:

@@ -89,7 +89,7 @@ class WindowRefresher:
         self._populate = populate
         self._timeout_s = timeout_s
         self._failed_boxes = FailedBoxes(client)
-        self._nothing_new = NothingNew(client)
+        self._nothing_new = NothingNew(client, timeout_s)
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
 
