@@ -6,7 +6,6 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,6 +15,7 @@ import pytest
 import shmmap
 from shmmap.client import attaching
 from shmmap.client.connection import Connection
+from shmmap.client.orphans import running
 from shmmap.protocol.messages import Differential
 from shmmap.segment.attach import attach
 from tests.support.daemon_process import DaemonProcess, open_files
@@ -85,12 +85,12 @@ def test_a_client_that_is_dropped_leaves_nothing_here_and_frees_what_it_held(
     """No descriptor, no mapping, no thread; and the daemon can take the memory back at once."""
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as operator:
-        files, threads = set(open_files()), threading.active_count()
+        files, threads = set(open_files()), len(running)
         for _ in range(3):
             cells = shmmap.connect(one.endpoint).around(0, 0, 30, wait=LONG_S)
             assert cells.complete
         gc.collect()
-        assert (set(open_files()), threading.active_count()) == (files, threads)
+        assert (set(open_files()), len(running)) == (files, threads)
         assert len(mapped(one)) == len(cells), "cells live as long as somebody has them"
         refused = operator.evict()
         assert (refused.freed, refused.pinned) == (0, len(cells))
@@ -106,14 +106,14 @@ def test_a_client_that_is_dropped_leaves_nothing_here_and_frees_what_it_held(
 def test_a_window_that_is_dropped_lets_everything_go(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as operator:
-        files, threads = set(open_files()), threading.active_count()
+        files, threads = set(open_files()), len(running)
         window = shmmap.MapWindow(one.endpoint, 30)
         window.move_to(0, 0, wait=LONG_S)
         count = len(window.cells)
         assert len(mapped(one)) == count > 0
         del window
         gc.collect()
-        assert (set(open_files()), threading.active_count(), mapped(one)) == (files, threads, [])
+        assert (set(open_files()), len(running), mapped(one)) == (files, threads, [])
         assert operator.evict().freed == count
 
 

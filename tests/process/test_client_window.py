@@ -21,6 +21,7 @@ import pytest
 
 import shmmap
 from shmmap.client import map_listing
+from shmmap.client.orphans import running
 from shmmap.client.window.follower import WindowFollower
 from shmmap.client.window.retention import Departed
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
@@ -380,13 +381,13 @@ def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
 
 def test_a_window_nobody_closes_ends_with_the_program(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
-    before = threading.active_count()
+    before = len(running)
     window = shmmap.MapWindow(one.endpoint, 30)
     window.move_to(0, 0, wait=LONG_S)
     view = window.cells[0].xyz
-    assert threading.active_count() == before + 2, "the window's, and its connection's"
+    assert len(running) == before + 2, "the window's, and its connection's"
     del window
-    assert threading.active_count() == before
+    assert len(running) == before
     assert np.isfinite(view).all()
     program = f"""
 import shmmap
