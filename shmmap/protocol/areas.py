@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
@@ -20,6 +20,9 @@ __all__ = [
     "area_from_message",
     "area_to_message",
 ]
+
+MOST_VERTICES: Final = 4096
+"""Of a route, as it may be sent; the daemon goes by its beginning."""
 
 
 class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
@@ -93,7 +96,7 @@ class Intent(msgspec.Struct, array_like=True, frozen=True):
     vx: float = 0.0
     vy: float = 0.0
     heading: float | None = None
-    route: tuple[tuple[float, float], ...] = ()
+    route: Annotated[tuple[tuple[float, float], ...], msgspec.Meta(max_length=MOST_VERTICES)] = ()
 
 
 class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a client may ask, one declaration per request."""
+"""What a client may ask, one declaration per request.
+
+Lists have a greatest length, so that what is too long is refused before anything of it is decoded.
+"""
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
@@ -27,6 +30,14 @@ __all__ = [
     "Stats",
     "Unpin",
 ]
+
+MOST_NAMES: Final = 20_000
+"""Cells that a request names one by one."""
+MOST_LAYERS: Final = 64
+
+Ids: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MOST_NAMES)]
+Layers: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MOST_LAYERS)]
+Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MOST_NAMES)]
 
 
 class Hello(msgspec.Struct, array_like=True, tag="hello"):
@@ -66,7 +77,7 @@ class Area(msgspec.Struct, array_like=True, tag="area"):
 
     request: int
     area: AreaMessage
-    layers: tuple[str, ...] = ("points",)
+    layers: Layers = ("points",)
     wait: float | None = None
     intent: Intent | None = None
 
@@ -80,8 +91,8 @@ class Differential(msgspec.Struct, array_like=True, tag="differential"):
 
     request: int
     area: AreaMessage
-    layers: tuple[str, ...] = ("points",)
-    held: tuple[HeldCell, ...] = ()
+    layers: Layers = ("points",)
+    held: Held = ()
     packed: bytes = b""
     wait: float | None = None
     intent: Intent | None = None
@@ -91,8 +102,8 @@ class Selected(msgspec.Struct, array_like=True, tag="selected"):
     """Cells by id, in the order asked for, duplicates preserved."""
 
     request: int
-    ids: tuple[str, ...]
-    layers: tuple[str, ...] = ("points",)
+    ids: Ids
+    layers: Layers = ("points",)
     wait: float | None = None
     intent: Intent | None = None
 
@@ -127,22 +138,22 @@ class Evict(msgspec.Struct, array_like=True, tag="evict"):
     """Retire cells, all when ``ids`` is nil (privileged); those in use are freed when they are let go."""
 
     request: int
-    ids: tuple[str, ...] | None = None
+    ids: Ids | None = None
 
 
 class Pin(msgspec.Struct, array_like=True, tag="pin"):
     """Keep cells resident until `Unpin` or the daemon's end (privileged); no ids: only list the pins."""
 
     request: int
-    ids: tuple[str, ...] = ()
-    layers: tuple[str, ...] = ("points",)
+    ids: Ids = ()
+    layers: Layers = ("points",)
 
 
 class Unpin(msgspec.Struct, array_like=True, tag="unpin"):
     """Keep cells, all when ``ids`` is nil, no longer than others (privileged)."""
 
     request: int
-    ids: tuple[str, ...] | None = None
+    ids: Ids | None = None
 
 
 class Shutdown(msgspec.Struct, array_like=True, tag="shutdown"):

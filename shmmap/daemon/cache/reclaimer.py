@@ -206,8 +206,7 @@ class Reclaimer:
             retired = self._next_due(now_s)
             if retired is None:
                 break
-            heapq.heappop(self._due)
-            freed += self._probe(retired, now_s)
+            freed += self._probe(retired, now_s)  # if that fails, its time has still come
         for resident in islice(self._unheard, LOOKS_AT_ONCE):
             retired = self.ledger.retired.get(resident.name)
             if retired is not None:

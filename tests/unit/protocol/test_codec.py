@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -138,3 +140,26 @@ def test_packed_versions(versions: list[int]) -> None:
 def test_packed_versions_cut_short_are_refused(count: int) -> None:
     with pytest.raises(BadRequest):
         unpack_versions(bytes(count))
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        ["selected", 7, ["x"] * 1_000_000],
+        ["evict", 7, ["x"] * 1_000_000],
+        ["pin", 7, ["x"] * 1_000_000],
+        ["area", 7, ["circle", 0.0, 0.0, 1.0], ["points"] * 500_000],
+        ["differential", 7, ["circle", 0.0, 0.0, 1.0], ["points"], [["x"]] * 600_000],
+        ["area", 7, ["circle", 0.0, 0.0, 1.0], ["points"], None, [0, 0, 0, 0, None, [[0, 0]] * 500_000]],
+    ],
+)
+def test_lists_that_are_too_long_are_refused_unread(request_: list[object]) -> None:
+    """At their length, whatever their elements are: nothing of them is made."""
+    data = msgspec.msgpack.encode(request_)
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadRequest, match="of length <="):
+            decode_request(data)
+        assert tracemalloc.get_traced_memory()[1] < 100_000
+    finally:
+        tracemalloc.stop()

@@ -154,6 +154,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
                 statistics_layout.START.size,
                 statistics_layout.EXTENSION.size,
                 statistics_layout.STATE.size,
+                statistics_layout.CHANGES.size,
                 CELL_ROW_BYTES,
                 CLIENT_ROW_BYTES,
             ],
