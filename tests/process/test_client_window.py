@@ -27,6 +27,7 @@ from shmmap.client.window.retention import Departed
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
 LONG_S = 60.0
@@ -419,7 +420,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
     with shmmap.connect(one.endpoint) as client:
         window = shmmap.MapWindow(client, 30, retention=Collects())
         window.move_to(0, 0, wait=LONG_S)
-        view = window.cells[0].xyz
+        view, others = window.cells[0].xyz, len(window.cells) - 1
         over = window._follower._over  # type: ignore[union-attr]
         gc.collect()
         gc.disable()
@@ -433,7 +434,9 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
         finally:
             gc.enable()
         over.get(timeout=LONG_S)
-        client.release()
+        waits, released = Patience(), 0
+        while waits((released := released + client.release()) < others):
+            pass  # its thread leaves its last function
         assert np.isfinite(view).all()
         del view
         assert client.release() == 1, "what ends now is unmapped at once, and told"
