@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +23,15 @@ from shmmap.origin.metadata_entries import MapMetadata, list_some
 from shmmap.origin.metadata_yaml import read_metadata
 from shmmap.origin.sidecar import Source, default_cache_directory, load_sidecar, save_sidecar, sidecar_file
 from shmmap.origin.single_pcd import load_single_pcd
+from shmmap.processes.end_with_parent import with_us
 
 __all__ = ["MapDirectory", "open_map"]
 
 # Smaller maps are scanned in a few milliseconds: a cached catalogue would only be less fresh.
 _CACHED_FROM_CELLS = 2000
+
+# A map whose cached catalogue is larger is read again in a process of its own.
+_LARGE_BYTES = 4 << 20
 
 
 def open_map(
@@ -88,7 +95,8 @@ class MapDirectory:
         """Read which cells there are now, with their boxes and their files' stamps.
 
         A large map's catalogue comes from the cache while the metadata and the directories are
-        unchanged; stamps may then be older than the files.  ``fresh`` looks at every file.
+        unchanged; stamps may then be older than the files.  ``fresh`` looks at every file; for a map that
+        is very large and in the cache already a process of its own does (`shmmap.origin.reread`).
 
         Raises
         ------
@@ -97,13 +105,42 @@ class MapDirectory:
         MapDataError
             The metadata is wrong, fits none of the files, or (strict) lacks some of them.
         """
-        layout = find_layout(self.path, self.metadata, self.pcd_paths)
-        key = json.dumps([layout.roots, layout.metadata, self.strict])
+        key = self._key(find_layout(self.path, self.metadata, self.pcd_paths))
         sidecar = sidecar_file(self.cache_dir, key)
-        if not fresh:
+        if not fresh or self._read_apart(sidecar):
             cached = load_sidecar(sidecar, key)
             if cached is not None:
                 return cached
+        return self.scanned()
+
+    def _key(self, layout: MapLayout) -> str:
+        return json.dumps([layout.roots, layout.metadata, self.strict])
+
+    def _read_apart(self, sidecar: str) -> bool:
+        """Have a process of its own read a very large map; whether its catalogue was written anew."""
+        try:
+            before = os.stat(sidecar)
+            if before.st_size < _LARGE_BYTES:
+                return False
+            words = json.dumps(dataclasses.asdict(self))
+            done = subprocess.run(
+                [*with_us(), sys.executable, "-m", "shmmap.origin.reread", words],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd="/",
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}, check=False,
+            )  # fmt: skip
+            after = os.stat(sidecar)
+        except OSError:
+            return False
+        return done.returncode == 0 and (before.st_ino, before.st_mtime_ns) != (
+            after.st_ino,
+            after.st_mtime_ns,
+        )
+
+    def scanned(self) -> Catalogue:
+        """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`."""
+        layout = find_layout(self.path, self.metadata, self.pcd_paths)
+        key = self._key(layout)
+        sidecar = sidecar_file(self.cache_dir, key)
         scanned_ns = time.time_ns()
         files = scan(layout.roots, recursive=not self.strict)
         if not len(files.names):

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import random
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from shmmap.errors import MapDataError
+from shmmap.origin import map_directory
 from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.sidecar import default_cache_directory
@@ -200,3 +204,30 @@ def test_where_the_cache_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     assert default_cache_directory() == "/var/cache/shmmap"
     (tmp_path / "map").mkdir()
     assert open_map(tmp_path / "map").cache_dir == "/var/cache/shmmap"
+
+
+def test_a_very_large_map_is_read_again_in_a_process_of_its_own(
+    origin: MapDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its changes are seen, nothing is parsed here, and what it cannot do is done here, errors and all."""
+    first = origin.load()
+    file = rewrite_unseen(origin)
+    settle(Path(origin.path))
+    scans: list[str] = []
+    real = map_directory.scan
+
+    def scan(*arguments: Any, **words: Any) -> Any:
+        scans.append("here")
+        return real(*arguments, **words)
+
+    monkeypatch.setattr(map_directory, "scan", scan)
+    monkeypatch.setattr(map_directory, "_LARGE_BYTES", 1)
+    assert compare(first, origin.load(fresh=True)).ids("changed") == (str(file),)
+    assert scans == []
+    few = dataclasses.replace(origin, cached_from_cells=CELLS + 1)
+    assert compare(first, few.load(fresh=True)).ids("changed") == (str(file),)
+    assert scans == ["here"], "the process has kept no catalogue of so few cells"
+    Path(origin.path, "pointcloud_map_metadata.yaml").unlink()
+    with pytest.raises(MapDataError):
+        origin.load(fresh=True)
+    assert scans == ["here", "here"]
