@@ -131,10 +131,8 @@ class MapDirectory:
             after = os.stat(sidecar)
         except OSError:
             return False
-        return done.returncode == 0 and (before.st_ino, before.st_mtime_ns) != (
-            after.st_ino,
-            after.st_mtime_ns,
-        )
+        anew = (before.st_ino, before.st_mtime_ns) != (after.st_ino, after.st_mtime_ns)
+        return done.returncode == 0 and anew
 
     def scanned(self) -> Catalogue:
         """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`."""

@@ -18,6 +18,7 @@ import pytest
 from shmmap.errors import MapDataError
 from shmmap.origin import map_directory
 from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.directory_scan import scan
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.sidecar import default_cache_directory
 
@@ -214,13 +215,12 @@ def test_a_very_large_map_is_read_again_in_a_process_of_its_own(
     file = rewrite_unseen(origin)
     settle(Path(origin.path))
     scans: list[str] = []
-    real = map_directory.scan
 
-    def scan(*arguments: Any, **words: Any) -> Any:
+    def scan_here(*arguments: Any, **words: Any) -> Any:
         scans.append("here")
-        return real(*arguments, **words)
+        return scan(*arguments, **words)
 
-    monkeypatch.setattr(map_directory, "scan", scan)
+    monkeypatch.setattr(map_directory, "scan", scan_here)
     monkeypatch.setattr(map_directory, "_LARGE_BYTES", 1)
     assert compare(first, origin.load(fresh=True)).ids("changed") == (str(file),)
     assert scans == []
