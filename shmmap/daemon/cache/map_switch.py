@@ -99,7 +99,7 @@ class MapSwitch:
         else:
             self._history.clear()
             self._remembered = 0
-        changed = np.union1d(change.changed, change.moved)
+        changed = np.concatenate((change.changed, change.moved))
         cache.statistics.map_changed()
         self._leftovers += cache.serve(new, changed if change.same_cells else None)
         self._residents = deque(cache.ledger.residents())
