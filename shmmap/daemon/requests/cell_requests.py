@@ -200,6 +200,7 @@ class CellRequests:
                 key = Key(cache.catalogue.id(index), layer)
                 if (
                     key not in wanted.refused
+                    and cache.warm.get(index, layer) is None  # it may have come for somebody else
                     and self._scheduler.want(index, layer, distance, now_s, wanted.session.asker)
                     and note
                 ):

@@ -206,3 +206,16 @@ def test_very_much_is_let_go_in_parts(inner: Inner, made: DividedMap) -> None:
     assert [len(session.held) for _ in work] == [CELLS - CELLS_A_STEP * part for part in range(1, PARTS)]
     assert list(session.held) == versions[:1]
     assert one.replies[-1][1].request == 2
+
+
+def test_what_came_for_somebody_else_meanwhile_is_not_loaded_again(inner: Inner, made: DividedMap) -> None:
+    one = inner(str(made.root))
+    session = one.session()
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=3000.0))
+    for _ in range(PARTS):  # found, and the first loads asked for
+        next(work)
+    one.ask(one.session(), Area(2, EVERYWHERE, wait=30.0))
+    assert len(one.cells_of(2).cells) == CELLS
+    finish(work)
+    assert len(one.cells_of(1).cells) == CELLS
+    assert one.statistics.values["loads_started"] == CELLS
