@@ -141,9 +141,15 @@ def test_loaders_do_not_get_the_socket(activated: DaemonProcess, connect: Connec
     activated.start()
     connect(activated).area(circle(0, 0, 5))
     assert activated.children()
+    listening = [
+        line.split()[6]
+        for line in Path("/proc/net/unix").read_text().splitlines()
+        if activated.endpoint in line
+    ]
+    assert listening
     for pid in activated.children():
-        variables = Path(f"/proc/{pid}/environ").read_bytes()
-        assert b"LISTEN_FDS=" not in variables
+        opened = [os.readlink(f"/proc/{pid}/fd/{name}") for name in os.listdir(f"/proc/{pid}/fd")]
+        assert not {f"socket:[{inode}]" for inode in listening} & set(opened)
     assert activated.stop() == 0
 
 

@@ -49,6 +49,8 @@ def fork_early() -> Early | None:
 def _run_parent(fd: int, daemon: int) -> int:
     from shmmap.daemon.loading.parent_main import main  # in the child: while the daemon goes on
 
+    for name in ("LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES", "NOTIFY_SOCKET"):
+        os.environ.pop(name, None)  # are for the daemon
     return main([str(fd), str(daemon)])
 
 
