@@ -143,7 +143,13 @@ class Scheduler:
                 continue
             self.loads.start(load, now_s)
             self._job_numbers += 1
-            if not self.pool.submit(job, now_s):
+            try:
+                taken = self.pool.submit(job, now_s)
+            except OSError as error:
+                code = "no_space" if is_full(error) else "load_failed"
+                self._fail(load, code, f"no file for a segment: {error.strerror}", None, now_s)
+                continue
+            if not taken:
                 self.loads.requeue(load)
                 return
             self._jobs[job.number] = load

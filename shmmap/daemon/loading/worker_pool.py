@@ -8,7 +8,6 @@ compute nothing, and while all compute one more is kept for points alone.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import select
 import signal
@@ -181,7 +180,13 @@ class WorkerPool:
         return worker
 
     def submit(self, job: Work, now_s: float) -> bool:
-        """Give a job to the least busy worker, starting one if all are busy; False if nobody took it."""
+        """Give a job to the least busy worker, starting one if all are busy; False if nobody took it.
+
+        Raises
+        ------
+        OSError
+            There is no file for its segment to be had.
+        """
         computed = is_computed(job)
         worker, start = self._least_busy(computed=computed), self._may_start
         if worker is None and not (start or (not computed and self._may_start_one_for_points)):
@@ -195,31 +200,28 @@ class WorkerPool:
                     return False
         if worker.ready and _has_ended(worker.pidfd):
             return False  # its parent is about to say so: the job would be taken for what it died of
+        fd = -1 if isinstance(job, worker_messages.Check) else self.directory.create()
         try:
-            self._send(worker, job)
-        except OSError as error:
-            if error.errno not in (errno.EAGAIN, errno.EPIPE, errno.ECONNRESET):
-                log.error("no file for a segment", reason=error)
+            self._send(worker, job, fd)
+        except OSError:
+            if fd >= 0:
+                os.close(fd)
             return False  # full or dying: its end is reported by its channel
+        if fd >= 0:
+            worker.segments[job.number] = fd
         if not worker.queue:
             worker.head_since_s = now_s
         worker.queue[job.number] = job
         worker.layers += computed
         return True
 
-    def _send(self, worker: Worker, job: Work) -> None:
+    def _send(self, worker: Worker, job: Work, fd: int) -> None:
         """Send a job, and an empty file with one that makes a segment."""
         packet = worker_messages.encode(job)
-        if isinstance(job, worker_messages.Check):
+        if fd < 0:
             worker.channel.send(packet)
-            return
-        fd = self.directory.create()
-        try:
+        else:
             socket.send_fds(worker.channel, [packet], [fd])
-        except BaseException:
-            os.close(fd)
-            raise
-        worker.segments[job.number] = fd
 
     def answer(self, worker: Worker, message: worker_messages.Decision) -> None:
         """Answer a worker's `worker_messages.Need`."""
