@@ -72,6 +72,7 @@ class Scheduler:
         self._jobs: dict[int, Load] = {}
         self._job_numbers = 0
         self._doubtful: deque[Key] = deque()
+        self._unfinished = False
         self.room = Room(cache, self.loads, pool)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
@@ -123,37 +124,36 @@ class Scheduler:
             self.room.feed(self._jobs, now_s)
         if self._doubtful:
             self._drop_some()
-        for _ in range(LOOKS_A_PUMP):
-            if not len(self.loads):
-                return
-            points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
-            load = self.loads.next_queued(points=points, layers=layers)
-            if load is None:
-                return
-            job = self._job(load, self._job_numbers + 1)
-            if job is None:
-                self._end(load)
-                continue
-            shortage = self._cache.ledger.shortage(load.estimate)
-            if load.estimate and shortage > 0:
-                refusal = self.room.refusal(load, shortage, now_s)
-                if not refusal:
-                    return
+        self._unfinished = len(self.loads) > 0 and all(self._hand_out_one(now_s) for _ in range(LOOKS_A_PUMP))
+
+    def _hand_out_one(self, now_s: float) -> bool:
+        """See to the load that comes next; False if there is none, or it has to wait."""
+        points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
+        if (load := self.loads.next_queued(points=points, layers=layers)) is None:
+            return False
+        if (job := self._job(load, self._job_numbers + 1)) is None:
+            self._end(load)
+            return True
+        shortage = self._cache.ledger.shortage(load.estimate)
+        if load.estimate and shortage > 0:
+            refusal = self.room.refusal(load, shortage, now_s)
+            if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
-                continue
-            self.loads.start(load, now_s)
-            self._job_numbers += 1
-            try:
-                taken = self.pool.submit(job, now_s)
-            except OSError as error:
-                code = "no_space" if is_full(error) else "load_failed"
-                self._fail(load, code, f"no file for a segment: {error.strerror}", None, now_s)
-                continue
-            if not taken:
-                self.loads.requeue(load)
-                return
+            return bool(refusal)
+        self.loads.start(load, now_s)
+        self._job_numbers += 1
+        try:
+            taken = self.pool.submit(job, now_s)
+        except OSError as error:
+            code = "no_space" if is_full(error) else "load_failed"
+            self._fail(load, code, f"no file for a segment: {error.strerror}", None, now_s)
+            return True
+        if taken:
             self._jobs[job.number] = load
             self._statistics.add("loads_started", isinstance(job, Job))
+        else:
+            self.loads.requeue(load)
+        return taken
 
     def _job(self, load: Load, number: int) -> Job | Check | None:
         """What a worker has to do for a load; None if its cell left the map, or nobody wants it any more."""
@@ -198,7 +198,7 @@ class Scheduler:
 
     def next_event_s(self) -> float:
         """When `pump` has something to do although nothing arrives; infinity for never."""
-        if self._doubtful:
+        if self._doubtful or self._unfinished:
             return 0.0
         cache = self._cache
         return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())

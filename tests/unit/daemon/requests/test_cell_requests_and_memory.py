@@ -5,15 +5,17 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
+from shmmap.daemon.loading.scheduler import LOOKS_A_PUMP
 from shmmap.protocol.messages import (
     Area,
     CircleMessage,
     Selected,
 )
-from tests.support.divided_map import DividedMap
+from tests.support.divided_map import DividedMap, make_map
 from tests.support.pcd_files import write_ascii
-from tests.unit.daemon.inner_daemon import Inner, names
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
 
 
 def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: DividedMap) -> None:
@@ -176,3 +178,18 @@ def test_a_cell_asked_for_twice_and_evicted_while_the_request_waits(
     assert names(one.cells_of(2)) == list(wanted)
     assert sum(reply.request == 2 for _, reply in one.replies) == 1
     assert len(one.cells) == 0
+
+
+def test_very_many_refusals_are_told_some_a_turn(inner: Inner, tmp_path: Path) -> None:
+    """One turn sees to some loads that find no room, and the next one follows at once."""
+    made = make_map(tmp_path / "many", columns=12, rows=12, points=5)
+    one = inner(str(made.root), budget_bytes=1 << 20)
+    one.ledger.overhead_bytes = one.ledger.budget_bytes  # nothing fits, and nothing can make room
+    one.ask(one.session(), Area(1, EVERYWHERE, wait=300.0))
+    left = [len(one.loads)]
+    while left[-1]:
+        one.scheduler.pump(one.now_s())
+        left.append(len(one.loads))
+        assert (one.scheduler.next_event_s() == 0.0) is bool(left[-1])
+    assert left == [144, 144 - LOOKS_A_PUMP, 144 - 2 * LOOKS_A_PUMP, 0]
+    assert {failed.code for failed in one.cells_of(1).failed} == {"over_budget"}
