@@ -35,7 +35,7 @@ from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
-LOOKS_A_PUMP: Final = 64
+LOOKS_A_PUMP: Final = 16
 """Loads that one `pump` hands out or finds to be of no use any more."""
 
 
