@@ -40,7 +40,7 @@ class Unmapper:
                 _drain(sinks[0])
 
     def defer_to(self, queue: SimpleQueue[Owned | None]) -> None:
-        """From now on hand memory to a queue, whose thread drops it: that unmaps it."""
+        """From now on hand memory to a queue, whose thread unmaps it."""
         self._sinks = (*self._sinks, queue)
 
     def stop_deferring(self, queue: SimpleQueue[Owned | None]) -> None:

@@ -54,5 +54,10 @@ class Owned:
         self.__del__ = take_back
 
     def give_back(self) -> None:
-        """Give it back now, not only when this object ends."""
+        """Give it back now, not only when this object ends; not after `keep`."""
         self.__del__()
+
+    def end(self) -> None:
+        """Give it back now, whoever else still has this object; in a thread that runs no signal handlers."""
+        take_back, self.__del__ = self.__del__, bool  # which does nothing
+        take_back()

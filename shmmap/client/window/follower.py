@@ -189,6 +189,7 @@ class WindowFollower:
             except Empty:
                 return not self._stopping
             if memory is not None:
+                memory.end()  # who put it here may still have it for a moment
                 del memory
                 continue
             self._called = False  # before the pose is read: the next one calls again
