@@ -108,7 +108,7 @@ class MapInMemory:
         self.scheduler = Scheduler(self.cache, self.map_switch, pool, clock=time.monotonic)
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
         self.cache.tell_all()
-        self.watched.watch(reclaimer.closer.fd, self.scheduler.hear_of_freed)
+        self.watched.watch(reclaimer.closer.fd, self.scheduler.hear_of_freed, "memory")
         if pins.fd >= 0:
             self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(time.monotonic()), "memory")
         if self.cache.names.fd >= 0:

@@ -80,6 +80,16 @@ def test_a_loader_that_hangs_ends_at_its_deadline(
     assert client.ask("stats")[4]["loads_timed_out"] == 1
 
 
+def ask_for_four(client: RawClient) -> int:
+    """Ask for four cells, and wait until a loader, which stands still, has been given them."""
+    started = client.ask("stats")[4]["loads_started"]
+    request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
+    waiting = Patience()
+    while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
+        pass
+    return request
+
+
 def test_a_loader_that_is_killed_costs_one_cell(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
@@ -87,11 +97,7 @@ def test_a_loader_that_is_killed_costs_one_cell(
     client = connect(one)
     client.area(circle(0, 0, 5))
     (loader,) = one.stop_loaders()
-    started = client.ask("stats")[4]["loads_started"]
-    request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
-    waiting = Patience()
-    while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
-        pass  # the stopped loader has its jobs now
+    request = ask_for_four(client)
     os.kill(loader, signal.SIGKILL)
     reply = client.cells_reply(client.wait_for(request))
     assert len(reply.cells) == 3
@@ -126,11 +132,7 @@ def test_the_loaders_parent_is_killed(
     client = connect(one)
     client.area(circle(0, 0, 5))
     (loader,), parent = one.stop_loaders(), one.loaders_parent()
-    started = client.ask("stats")[4]["loads_started"]
-    request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
-    waiting = Patience()
-    while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
-        pass  # the stopped loader has its jobs now
+    request = ask_for_four(client)
     os.kill(parent, signal.SIGKILL)
     reply = client.cells_reply(client.wait_for(request))
     assert (len(reply.cells), reply.failed) == (4, [])

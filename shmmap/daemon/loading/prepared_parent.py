@@ -100,7 +100,7 @@ class PreparedParent:
             self._channel.setblocking(False)
             with contextlib.suppress(ConnectionError):  # it has ended: `hear` hears of it
                 self._channel.send(b"\0".join(map(os.fsencode, self._settings)))
-            self._watched.watch(self._channel.fileno(), self.hear)
+            self._watched.watch(self._channel.fileno(), self.hear, "loaders")
             self._ready = False
 
     def fork(self, end: socket.socket) -> None:

@@ -88,12 +88,12 @@ class Dispatch:
             return self.cells.selected(session, message)
         if isinstance(message, messages.Release):
             return self._release(session, message)
-        if isinstance(message, messages.Bye):
-            self.handshake.leave(session)
-        elif isinstance(message, OPERATOR_REQUESTS):
+        if isinstance(message, OPERATOR_REQUESTS):
             self.authorization.require(connection.peer, now_s)
             return self.operators.handle(session, message, now_s)
-        if isinstance(message, messages.Stats):
+        if isinstance(message, messages.Bye):
+            self.handshake.leave(session)
+        elif isinstance(message, messages.Stats):
             self.handshake.look_after_departed()
             self.survey.ask(
                 session, lambda usage: self.due(connection, self._tell_stats(session, message, usage))

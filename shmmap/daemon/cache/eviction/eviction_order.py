@@ -213,9 +213,7 @@ class EvictionOrder:
         """Those that should go first, in that order, at most `FRONT`; empty when all are set aside."""
         for resident in (*self.graced.due(now_s), *self.aside.due(now_s)):
             self.new[resident] = None
-        if (
-            len(self._entries) < FRONT
-        ):  # else they wait for `score_new`: many at once cost little more than one
+        if len(self._entries) < FRONT:  # else they wait: many at once cost little more than one
             self.score_new(score)
         seen: dict[Resident, None] = {}
         for _ in range(TRIES):
