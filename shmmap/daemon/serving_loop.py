@@ -56,7 +56,7 @@ class ServingLoop:
     _answer_at_end: bool = True
     _turn_began_ns: int = field(default_factory=time.thread_time_ns)
     _most_s: float = 0.0
-    _most_of_it: str = "beat"
+    _most_of_it: str = "statistics"
     _told_s: float = float("-inf")
 
     def stop(self, *, answer: bool = True) -> None:
@@ -98,7 +98,7 @@ class ServingLoop:
         if took_ns > LONG_TURN_NS and (now_s := time.monotonic()) >= self._told_s + TOLD_S:
             self._told_s = now_s
             self.event_log.publish(LongTurn, self._most_of_it, took_ns)
-        self._most_s, self._most_of_it = 0.0, "beat"
+        self._most_s, self._most_of_it = 0.0, "statistics"
         return self.watched.poll(timeout_s)
 
     def _turn(self, ready: list[int]) -> None:
@@ -150,9 +150,9 @@ class ServingLoop:
         """What has its own time: deadlines, surveys, statistics."""
         self._guarded("loaders", self.scheduler.lost.end_overdue, now_s)
         self._guarded("answers", self.cells.answer_overdue, now_s)
-        self._guarded("survey", self.cache.survey.turn, now_s)
+        self._guarded("usage", self.cache.survey.turn, now_s)
         if self.map_switch.busy:
             self._guarded("map", self.map_switch.step, now_s)
-        self._guarded("beat", self.sampler.turn, now_s)
+        self._guarded("statistics", self.sampler.turn, now_s)
         if now_s >= self.operators.stop_by_s:
             self.stop()

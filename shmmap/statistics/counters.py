@@ -40,8 +40,8 @@ TURN_KINDS: Final = {
     "answers": "another part of a large request was served, or one that waited was answered",
     "loaders": "a loader was heard, and what it loaded published",
     "memory": "loads were handed out, room made and memory freed",
-    "survey": "the kernel was asked who uses segments",
-    "beat": "the statistics were written",
+    "usage": "the kernel was asked who uses segments",
+    "statistics": "the statistics were written",
     "map": "another state of the map was taken over",
 }
 """What a turn of the serving loop is named after: what took most of it."""

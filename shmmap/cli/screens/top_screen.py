@@ -212,10 +212,7 @@ def _longest_turns(counters: dict[str, int]) -> list[Line]:
     longest = {kind: counters.get(f"longest_turn_{kind}_ns", 0) for kind in TURN_KINDS}
     shown = sorted(longest, key=lambda kind: -longest[kind])
     told = [kind for kind in shown if longest[kind] >= WORTH_TELLING_NS][:3] or shown[:1]
-    return [
-        [("longest turns:", "")],
-        *([(f"{format_duration(longest[kind] * 1e-9)} ({kind})", "")] for kind in told),
-    ]
+    return [[(f"longest turn {format_duration(longest[kind] * 1e-9)} ({kind})", "")] for kind in told]
 
 
 def _loads(counters: dict[str, int]) -> list[Line]:
