@@ -299,7 +299,7 @@ class WorkerPool:
                 os.close(pidfd)
             else:
                 self._ending.add(pidfd)
-                self.watched.watch(pidfd, lambda: self._bury(pidfd))
+                self.watched.watch(pidfd, lambda: self._bury(pidfd), "loaders")
         return list(worker.queue.values())
 
     def _bury(self, pidfd: int) -> None:

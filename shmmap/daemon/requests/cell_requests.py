@@ -24,7 +24,7 @@ from shmmap.daemon.requests.differential import lacking, warm_difference
 from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, WaitingList, parts
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, NoSession
 from shmmap.geometry import Area
 from shmmap.protocol import messages
 
@@ -231,6 +231,8 @@ class CellRequests:
                 self._patient.again(wanted)
             else:
                 yield from self._answer(wanted)
+        except NoSession as error:
+            wanted.session.connection.refuse(wanted.request, error)
         finally:
             if over and wanted in self._patient:
                 self._patient.remove(wanted)

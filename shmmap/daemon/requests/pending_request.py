@@ -175,7 +175,7 @@ class WaitingList:
         self._due = due
         self._dropped = dropped
         self._waiting: dict[Key, dict[PendingRequest, None]] = {}
-        self._settled: deque[tuple[Key, dict[PendingRequest, None]]] = deque()
+        self._settled: deque[tuple[Key, Iterator[PendingRequest]]] = deque()
         self._over: deque[PendingRequest] = deque()
         self._left: deque[tuple[Session, list[Resident]]] = deque()
         self._of: dict[Session, dict[PendingRequest, int]] = {}  # with the number of cells it began with
@@ -280,13 +280,13 @@ class WaitingList:
         for _ in range(KEYS_A_STEP):
             if self._settled:
                 key, waiters = self._settled[0]
-                if not waiters:
+                waiter = next(waiters, None)
+                if waiter is None:
                     self._settled.popleft()
                     continue
-                wanted, _ = waiters.popitem()
-                wanted.outstanding.discard(key)
-                if not wanted.outstanding and wanted in self:
-                    self._due(wanted)
+                waiter.outstanding.discard(key)
+                if not waiter.outstanding and waiter in self:
+                    self._due(waiter)
             elif self._over:
                 wanted = self._over[0]
                 if wanted.keys:
@@ -314,7 +314,7 @@ class WaitingList:
         """A load ended: answer the requests it was the last one for."""
         waiters = self._waiting.pop(key, None)
         if waiters:
-            self._settled.append((key, waiters))
+            self._settled.append((key, iter(waiters)))
             self.tidy()
 
     def left(self, session: Session) -> None:

@@ -91,13 +91,15 @@ class Session:
                 continue
             else:
                 known.append(resident)
-            resident.sessions.discard(self.slot)  # it may be that of an earlier session of this slot
-            self._count(resident, 1)
-            resident.sessions.add(self.slot)
+            self.held_bytes += resident.nbytes
+            if self.slot not in resident.sessions:
+                self._share(resident, 1)
+                resident.sessions.add(self.slot)
+            elif len(resident.sessions) == 1:  # an earlier session of this slot has it still
+                self.exclusive_bytes += resident.nbytes
 
-    def _count(self, resident: Resident, one: int) -> None:
+    def _share(self, resident: Resident, one: int) -> None:
         """One more of the segment's holders is this session, or (-1) one less."""
-        self.held_bytes += one * resident.nbytes
         others = resident.sessions
         if not others:
             self.exclusive_bytes += one * resident.nbytes
@@ -107,12 +109,18 @@ class Session:
             if other is not None:
                 other.exclusive_bytes -= one * resident.nbytes
 
+    def _lose(self, resident: Resident) -> None:
+        self.held_bytes -= resident.nbytes
+        later = self.sessions.by_slot(self.slot)
+        if later is None or later is self or resident not in later.held.get(resident.version, ()):
+            resident.sessions.discard(self.slot)
+            self._share(resident, -1)
+
     def drop(self, versions: Iterable[int]) -> list[Resident]:
         """The session does not have these versions any more; returns what it had of them."""
         dropped = [resident for version in versions for resident in self.held.pop(version, ())]
         for resident in dropped:
-            resident.sessions.discard(self.slot)
-            self._count(resident, -1)
+            self._lose(resident)
         return dropped
 
     def drop_segment(self, resident: Resident) -> None:
@@ -120,8 +128,7 @@ class Session:
         known = self.held.get(resident.version, [])
         if resident in known:
             known.remove(resident)
-            resident.sessions.discard(self.slot)
-            self._count(resident, -1)
+            self._lose(resident)
             if not known:
                 del self.held[resident.version]
 

@@ -13,7 +13,7 @@ from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import UNKNOWN_A_STEP
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
-from shmmap.errors import BadRequest, NoSession
+from shmmap.errors import BadRequest, NoSession, ShmmapError
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Area, CircleMessage, Differential, HeldCell, Release, Selected
 from tests.support.divided_map import DividedMap, make_map
@@ -219,3 +219,26 @@ def test_what_came_for_somebody_else_meanwhile_is_not_loaded_again(inner: Inner,
     finish(work)
     assert len(one.cells_of(1).cells) == CELLS
     assert one.statistics.values["loads_started"] == CELLS
+
+
+def test_a_session_that_ends_while_one_that_waited_is_answered_is_told(
+    inner: Inner, made: DividedMap
+) -> None:
+    """It is no defect of the daemon's, and nothing stays of it."""
+    one = inner(str(made.root))
+    refused: list[str] = []
+    session = one.session()
+
+    def refuse(request: int, error: ShmmapError) -> None:
+        refused.append(error.code)
+
+    session.connection.refuse = refuse  # type: ignore[method-assign]
+    one.hold_answers = True
+    one.ask(session, Area(1, EVERYWHERE, wait=30.0))
+    one.run_until(lambda: one.due)
+    next(one.due[0])
+    one.sessions.close(session)
+    finish(one.due[0])
+    assert (refused, one.replies) == (["no_session"], [])
+    one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
+    assert (one.ledger._needed, one.cells._patient._waiting, len(one.cells)) == ({}, {}, 0)

@@ -79,6 +79,29 @@ def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
     assert all(not segment.sessions for segment in segments)
 
 
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_later_session_of_the_same_slot_keeps_what_it_has(shared: bool) -> None:
+    """What the earlier one had is tidied away after it has ended, and the client may be back by then."""
+    sessions = Sessions()
+    segment, other_has = resident(1, 1, 10), resident(2, 2, 100)
+    other = sessions.open(connections.of(), "", 0.0)
+    earlier = sessions.open(connections.of(), "", 0.0, slot=5)
+    earlier.hold([segment, other_has])
+    if shared:
+        other.hold([segment])
+    sessions.close(earlier)
+    later = sessions.open(connections.of(), "", 0.0, slot=5)
+    later.hold([segment])
+    for one in earlier.residents():
+        earlier.drop_segment(one)
+    assert (segment.sessions, other_has.sessions) == ({5, other.slot} if shared else {5}, set())
+    assert (later.held_bytes, later.exclusive_bytes) == (10, 0 if shared else 10)
+    assert (other.held_bytes, other.exclusive_bytes) == (10 if shared else 0, 0)
+    later.drop([1])
+    assert (segment.sessions, later.exclusive_bytes) == ({other.slot} if shared else set(), 0)
+    assert other.exclusive_bytes == (10 if shared else 0)
+
+
 def test_a_session_and_its_connections() -> None:
     """It can change its connection, and says nothing of where it is meanwhile."""
     sessions = Sessions()
