@@ -76,15 +76,15 @@ def check_zmtp(data: bytes) -> str:
     """What comes on a connection: messages or one of two errors, the same however it is cut into pieces."""
     outcomes = []
     for piece, at_once in ((len(data) or 1, 10_000), (7, 10_000), (64, 3)):
-        incoming = Incoming(b"ROUTER", b"DEALER", 4096, lambda _said: None)
+        incoming = Incoming(b"ROUTER", b"DEALER", 4096)
         heard: list[tuple[bytes, bool]] = []
         outcome = "silence"
         try:
             for at in range(0, len(data), piece):
                 incoming.add(data[at : at + piece])
-                heard += incoming.messages(at_once)
+                heard += incoming.messages(at_once, lambda _said: None)
                 while incoming.more:
-                    heard += incoming.messages(at_once)
+                    heard += incoming.messages(at_once, lambda _said: None)
             outcome = "messages" if heard else outcome
         except (ProtocolMismatch, BadRequest) as error:
             outcome = type(error).__name__

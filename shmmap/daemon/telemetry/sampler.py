@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sized
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
-from shmmap.daemon.telemetry.session_rows import client_row
+from shmmap.daemon.telemetry.session_rows import SessionRows
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.statistics.client_rows import MAX_CLIENTS
 from shmmap.statistics.counters import SPANS, WINDOWED
 
 __all__ = ["BEAT_S", "Sampler"]
@@ -54,6 +52,7 @@ class Sampler:
     next_s: float = 0.0
     _whole_s: float = 0.0
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
+    _rows: SessionRows = field(default_factory=SessionRows)
     _told_s: float = float("-inf")
     _last_s: float = 0.0
 
@@ -101,8 +100,7 @@ class Sampler:
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
-        clients = islice(self.sessions, MAX_CLIENTS)
-        cache.statistics.show_clients([client_row(session) for session in clients])
+        cache.statistics.show_clients(self._rows.of(self.sessions))
         cache.events.pressure.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s

@@ -76,7 +76,7 @@ class Connection:
         self._socket = connected
         self._listener = listener
         self._watched = listener.watched
-        self._incoming = Incoming(listener.kind, listener.other, listener.most_bytes, self._send)
+        self._incoming = Incoming(listener.kind, listener.other, listener.most_bytes)
         self._unsent: deque[memoryview] = deque()
         self._cut = False
         self.fd = connected.fileno()
@@ -220,7 +220,7 @@ class Connection:
 
     def _take_messages(self) -> None:
         try:
-            for body, several in self._incoming.messages(FRAMES_AT_ONCE):
+            for body, several in self._incoming.messages(FRAMES_AT_ONCE, self._send):
                 self._listener.hear(self, body, several)
             if self._incoming.more and self._reading:
                 self._watched.call_again(self.fd)

@@ -41,8 +41,6 @@ class Incoming:
         The only socket type that may be at the other end, ``DEALER`` or ``SUB``.
     most_bytes
         The longest message, all its frames and their headers together.
-    say
-        Sends what the protocol itself has to say.
 
     Attributes
     ----------
@@ -50,11 +48,10 @@ class Incoming:
         Whether something that came was not looked at yet.
     """
 
-    def __init__(self, kind: bytes, peer: bytes, most_bytes: int, say: Callable[[bytes], None]) -> None:
+    def __init__(self, kind: bytes, peer: bytes, most_bytes: int) -> None:
         self._kind = kind
         self._peer = peer
         self._most_bytes = most_bytes
-        self._say = say
         self._buffer = bytearray()
         self._next = 0  # where the next frame begins; before it are whole frames of a message
         self._first: tuple[int, int] | None = None  # that message's first frame, from and to
@@ -74,10 +71,11 @@ class Incoming:
         """Take bytes that came."""
         self._buffer += data
 
-    def messages(self, most_frames: int) -> list[tuple[bytes, bool]]:
+    def messages(self, most_frames: int, say: Callable[[bytes], None]) -> list[tuple[bytes, bool]]:
         """Return messages that are whole now: of each its first frame, and whether there were more.
 
-        Not more than so many frames are looked at; ``more`` then tells that others may be there.
+        Not more than so many frames are looked at; ``more`` then tells that others may be there.  ``say``
+        sends what the protocol itself has to say.
 
         Raises
         ------
@@ -87,7 +85,7 @@ class Incoming:
             A message is longer than may be.
         """
         self.more = False
-        if not self._greeted and not self._greet():
+        if not self._greeted and not self._greet(say):
             return []
         messages: list[tuple[bytes, bool]] = []
         start = 0  # of the message under way
@@ -99,7 +97,7 @@ class Incoming:
             if flags & _COMMAND:
                 if self._next != start:
                     raise ProtocolMismatch("a command within a message")
-                self._command(bytes(self._buffer[begin:end]))
+                self._command(bytes(self._buffer[begin:end]), say)
                 start = end
             elif not self._ready:
                 raise ProtocolMismatch("a message before the handshake")
@@ -119,7 +117,7 @@ class Incoming:
                 self._first = (self._first[0] - start, self._first[1] - start)
         return messages
 
-    def _greet(self) -> bool:
+    def _greet(self, say: Callable[[bytes], None]) -> bool:
         if len(self._buffer) < len(GREETING):
             return False
         greeting = self._buffer[: len(GREETING)]
@@ -128,7 +126,7 @@ class Incoming:
         del self._buffer[: len(GREETING)]
         self._greeted = True
         ready = b"\x05READY" + _property(b"Socket-Type", self._kind) + _property(b"Identity", b"")
-        self._say(framed(ready, _COMMAND))
+        say(framed(ready, _COMMAND))
         return True
 
     def _frame(self, start: int) -> tuple[int, int, int] | None:
@@ -147,14 +145,14 @@ class Incoming:
             raise BadRequest(f"a message of more than {self._most_bytes} bytes")
         return None if len(buffer) < end else (flags, begin, end)
 
-    def _command(self, body: bytes) -> None:
+    def _command(self, body: bytes, say: Callable[[bytes], None]) -> None:
         name, rest = body[1 : 1 + body[0]] if body else b"", body[1:]
         if name == b"READY":
             if _property(b"Socket-Type", self._peer) not in rest:
                 raise ProtocolMismatch(f"the other end is no {self._peer.decode()}")
             self._ready = True
         elif name == b"PING":
-            self._say(framed(b"\x04PONG" + body[7:23], _COMMAND))
+            say(framed(b"\x04PONG" + body[7:23], _COMMAND))
 
 
 def _property(name: bytes, value: bytes) -> bytes:

@@ -23,7 +23,7 @@ PIN_MEMO_S: Final = 0.2
 """How long, at least, a segment found pinned is not considered again."""
 PRESSURE_S: Final = 10.0
 """Scores are kept up to date for so long after somebody needed room."""
-REFRESH_S: Final = 0.02
+REFRESH_S: Final = 0.01
 """How often a few scores are brought up to date."""
 ROUND_S: Final = 2.0
 """How often, at most, those of all segments, a few at a time."""

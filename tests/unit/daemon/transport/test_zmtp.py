@@ -20,13 +20,13 @@ class Ear:
 
     def __init__(self) -> None:
         self.said: list[bytes] = []
-        self.incoming = Incoming(b"ROUTER", b"DEALER", LONGEST, self.said.append)
+        self.incoming = Incoming(b"ROUTER", b"DEALER", LONGEST)
 
     def hear(self, *pieces: bytes, at_once: int = 1000) -> list[tuple[bytes, bool]]:
         heard = []
         for piece in pieces:
             self.incoming.add(piece)
-            heard += self.incoming.messages(at_once)
+            heard += self.incoming.messages(at_once, self.said.append)
         return heard
 
 
@@ -48,16 +48,16 @@ def test_any_pieces(messages: list[list[bytes]], cuts: list[int], at_once: int) 
         *(data[a:b] for a, b in zip([0, *ends], [*ends, len(data)], strict=True)), at_once=at_once
     )
     while ear.incoming.more:
-        heard += ear.incoming.messages(at_once)
+        heard += ear.incoming.messages(at_once, ear.said.append)
     assert heard == [(frames[0], len(frames) > 1) for frames in messages]
     assert len(ear.incoming) == 0
 
 
 @pytest.mark.parametrize("size", [0, 255, 256, 70_000])
 def test_frames_of_any_length(size: int) -> None:
-    incoming = Incoming(b"ROUTER", b"DEALER", 1 << 20, lambda _data: None)
+    incoming = Incoming(b"ROUTER", b"DEALER", 1 << 20)
     incoming.add(GREETING + READY + framed(bytes(size)))
-    assert incoming.messages(9) == [(bytes(size), False)]
+    assert incoming.messages(9, lambda _data: None) == [(bytes(size), False)]
 
 
 def test_what_the_daemon_says() -> None:
@@ -108,8 +108,8 @@ def test_work_at_once_is_bounded() -> None:
     ear = Ear()
     heard = ear.hear(GREETING + READY + framed(b"a") * 40, at_once=16)
     assert (len(heard), ear.incoming.more) == (15, True)
-    assert (len(ear.incoming.messages(16)), ear.incoming.more) == (16, True)
-    assert (len(ear.incoming.messages(16)), ear.incoming.more) == (9, False)
+    assert (len(ear.incoming.messages(16, ear.said.append)), ear.incoming.more) == (16, True)
+    assert (len(ear.incoming.messages(16, ear.said.append)), ear.incoming.more) == (9, False)
 
 
 @given(st.binary(max_size=300))
