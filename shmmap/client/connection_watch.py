@@ -3,7 +3,9 @@
 
 The thread is where libzmq's parts belong because signal handlers run in the main thread alone: no handler's
 exception can leave a part behind that nobody knows of.  For the same reason it is started by one function
-that is built in, and whoever waits for it does so in queues.
+that is built in, and whoever waits for it does so in queues.  The thread lets no signal interrupt it: the
+kernel may give one to any thread, and a context whose end it interrupts stays, with a thread and five
+descriptors.
 """
 
 from __future__ import annotations
@@ -16,11 +18,16 @@ import time
 import weakref
 from collections.abc import Sequence
 from queue import Empty, SimpleQueue
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import zmq
 
 from shmmap.client.orphans import running
+
+if TYPE_CHECKING:
+    import signal as _signal
+else:
+    import _signal  # `signal` is the same with enumerations, which take a millisecond to import
 
 __all__ = ["ConnectionWatch"]
 
@@ -32,6 +39,8 @@ _EVENTS: Final = (
     | zmq.EVENT_CONNECT_RETRIED
     | zmq.EVENT_MONITOR_STOPPED
 )
+_OURS: Final = frozenset({_signal.SIGBUS, _signal.SIGFPE, _signal.SIGILL, _signal.SIGSEGV})
+"""Signals that a thread brings upon itself; they are not to be put off."""
 _LAST_WORDS_MS: Final = 100  # closing may take this long to deliver a last message
 _MADE_S: Final = 0.001
 _OVER_S: Final = 0.5  # who waits for the end looks again after this long, should another have waited, too
@@ -50,6 +59,8 @@ class ConnectionWatch:
         Of the socket.
     waiting
         Gets a None in each of these queues when the connection breaks; may change at any time.
+    kind
+        Of socket.
 
     Attributes
     ----------
@@ -72,8 +83,9 @@ class ConnectionWatch:
         self,
         owner: object,
         endpoint: str,
-        options: Sequence[tuple[int, int]],
+        options: Sequence[tuple[int, int | bytes]],
         waiting: Sequence[SimpleQueue[Any]] = (),
+        kind: int = zmq.DEALER,
     ) -> None:
         self.owner = weakref.ref(owner)
         self.handshakes = 0
@@ -88,7 +100,7 @@ class ConnectionWatch:
         self._ended = False
         self._thread = 0
         self._socket: zmq.Socket[bytes] | None = None
-        _thread.start_new_thread(self._run, (endpoint, options))
+        _thread.start_new_thread(self._run, (endpoint, options, kind))
         failure = self._made.get()
         if failure is not None:
             raise failure
@@ -131,16 +143,17 @@ class ConnectionWatch:
                 return
             return
 
-    def _run(self, endpoint: str, options: Sequence[tuple[int, int]]) -> None:
+    def _run(self, endpoint: str, options: Sequence[tuple[int, int | bytes]], kind: int) -> None:
         self._thread = _thread.get_ident()
         try:
+            _signal.pthread_sigmask(_signal.SIG_BLOCK, _signal.valid_signals() - _OURS)
             with contextlib.ExitStack() as ends:
                 running.add(self)
                 ends.callback(running.discard, self)
                 # a context of our own: no other library's sockets can hold up its end
                 context = zmq.Context()
                 ends.callback(context.term)
-                socket = context.socket(zmq.DEALER)
+                socket = context.socket(kind)
                 ends.callback(socket.close, linger=_LAST_WORDS_MS)
                 for option, value in options:
                     socket.setsockopt(option, value)

@@ -9,7 +9,6 @@ is reported as `Missed`.
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 import weakref
 from collections import deque
@@ -22,6 +21,7 @@ import msgspec
 import zmq
 
 from shmmap.client.connection import Connection
+from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import candidates
 from shmmap.errors import BadRequest, NoAnswer, ProtocolMismatch
 from shmmap.protocol.events import Beat, Event, EventPage, Recent, decode_event
@@ -32,6 +32,13 @@ _TIMEOUT_S: Final = 5.0
 _QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
 _RECONNECT_MS: Final = 20
 _RECONNECT_MAX_MS: Final = 500
+_OPTIONS: Final = (
+    (zmq.LINGER, 0),
+    (zmq.RCVHWM, _QUEUE),
+    (zmq.RECONNECT_IVL, _RECONNECT_MS),
+    (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
+    (zmq.SUBSCRIBE, b""),
+)
 
 
 class Missed(msgspec.Struct, frozen=True):
@@ -95,15 +102,10 @@ class EventStream:
         except ProtocolMismatch:
             self._connection.close()
             raise
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
-        self._finalizer = weakref.finalize(self, _shut, self._socket, context, os.getpid())
-        self._socket.connect(f"ipc://{path}")
-        self._socket.subscribe(b"")
+        self._watch = ConnectionWatch(self, f"ipc://{path}", _OPTIONS, kind=zmq.SUB)
+        # also when nobody calls close(), and at the end of the program
+        self._finalizer = weakref.finalize(self, self._watch.stop)
+        self._socket = self._watch.socket
         self._ready: deque[Happening] = deque()
         self.epoch = self._connection.welcome.epoch
         self.heard_s = time.monotonic()
@@ -123,7 +125,8 @@ class EventStream:
 
     def close(self) -> None:
         """End the subscription."""
-        self._finalizer()
+        self._watch.stop()
+        self._finalizer.detach()
         self._connection.close()
 
     def __iter__(self) -> Iterator[Happening]:
@@ -227,9 +230,3 @@ def _events_path(connection: Connection) -> str:
     # in another mount namespace the directory has another name than the daemon knows
     beside = Path(connection.path).parent / Path(path).name
     return str(beside) if beside.exists() else path
-
-
-def _shut(socket: zmq.Socket[bytes], context: zmq.Context[zmq.Socket[bytes]], pid: int) -> None:
-    if os.getpid() == pid:  # in a forked child they are the parent's
-        socket.close(linger=0)
-        context.term()

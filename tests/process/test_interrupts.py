@@ -8,12 +8,14 @@ instants are for ``tests/benchmarks/interrupts.py``.
 
 from __future__ import annotations
 
+import ctypes
 import dis
 import gc
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
@@ -22,6 +24,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import pytest
+import zmq
 
 import shmmap
 from shmmap.errors import BadRequest
@@ -30,6 +33,8 @@ from tests.support.divided_map import DividedMap
 
 Factory = Callable[..., DaemonProcess]
 LONG_S = 60.0
+
+_libc = ctypes.CDLL(None)
 
 _BEFORE = ("CALL", "RESUME", "JUMP_BACKWARD", "JUMP_ABSOLUTE")
 """Instructions after which Python runs handlers, by how their names begin."""
@@ -184,6 +189,64 @@ def test_connecting(daemon: Factory, divided_map: DividedMap) -> None:
             assert holdings(one) == before, number
 
     assert interrupted_everywhere(lambda: shmmap.connect(one.endpoint, name="x").close(), check) > 100
+
+
+def test_following_events(daemon: Factory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    shmmap.EventStream(one.endpoint).close()
+    before = holdings(one)
+
+    def check(number: int) -> None:
+        if number % 16 == 0:
+            gc.collect()
+            shmmap.connect(one.endpoint).close()
+            assert holdings(one) == before, number
+
+    def follow() -> None:
+        shmmap.EventStream(one.endpoint, name="x", timeout=LONG_S).close()
+
+    assert interrupted_everywhere(follow, check) > 100
+
+
+# --- a signal that comes to another thread ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["client", "events"])
+def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, what: str) -> None:
+    """The kernel may choose any thread for it; where it interrupts the end, half of a context stays."""
+    one = daemon(divided_map.root)
+    socket: zmq.Socket[bytes]
+
+    def made() -> tuple[Callable[[], None], zmq.Socket[bytes]]:
+        if what == "events":
+            stream = shmmap.EventStream(one.endpoint, timeout=LONG_S)
+            return stream.close, stream._socket
+        client = shmmap.connect(one.endpoint, timeout=LONG_S)
+        connection = client.session._connection
+        assert connection is not None
+        return client.close, connection._socket
+
+    made()[0]()
+    before = holdings(one)
+    close, socket = made()
+    hold_up = socket.context.socket(zmq.PAIR)  # the context ends when the last socket of it is closed
+    closing = threading.Thread(target=close)
+    handled = signal.signal(signal.SIGUSR1, lambda *_: None)
+    try:
+        closing.start()
+        while not socket.closed:
+            time.sleep(0.001)
+        main = os.getpid()
+        for _ in range(50):
+            for thread in set(map(int, os.listdir("/proc/self/task"))) - {main}:
+                _libc.tgkill(main, thread, signal.SIGUSR1)
+            time.sleep(0.001)
+    finally:
+        hold_up.close()
+        closing.join()
+        signal.signal(signal.SIGUSR1, handled)
+    del close, socket, hold_up, closing
+    assert holdings(one) == before
 
 
 # --- a client used in a handler -----------------------------------------------------------------------
