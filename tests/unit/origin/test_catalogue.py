@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.geometry import Circle
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import compare
 from shmmap.segment.layout import SourceStamp
 
 Box = tuple[float, float, float, float]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.metadata_entries import EntryCollector, MapMetadata
 from shmmap.origin.metadata_lines import collect_lines
-from shmmap.origin.metadata_yaml import parse_metadata, read_metadata
+from shmmap.origin.metadata_yaml import metadata_bytes, parse_metadata
 
 HEAD = "x_resolution: 20.0\ny_resolution: 20.0\n"
 
@@ -214,7 +214,7 @@ def test_bytes_that_are_no_text() -> None:
 
 def test_a_missing_file(tmp_path: object) -> None:
     with pytest.raises(MapMissing, match="No such file"):
-        read_metadata(f"{tmp_path}/none.yaml")
+        metadata_bytes(f"{tmp_path}/none.yaml")
 
 
 def test_ten_thousand_entries_quick_equals_parser_equals_pyyaml() -> None:

@@ -17,7 +17,8 @@ import pytest
 
 from shmmap.errors import MapDataError
 from shmmap.origin import map_directory
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import compare
 from shmmap.origin.directory_scan import scan
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.sidecar import default_cache_directory
