@@ -19,7 +19,6 @@ kept a second time: of a million cells whose files have changed, a new state tak
 from __future__ import annotations
 
 import math
-import mmap
 import os
 import stat
 import struct
@@ -190,22 +189,15 @@ class _Columns:
                 part, there = block[: size - done], old[done : done + _BLOCK_BYTES]
                 self.fill(part.data)
                 if not np.array_equal(part, there):
-                    column = _memory(size)
+                    column = np.empty(size, np.uint8)
                     column[:done], column[done : done + len(part)] = old[:done], part
                 done += len(part)
             if column is None:
                 return before
         else:
-            column = _memory(size)
+            column = np.empty(size, np.uint8)
         self.fill(column[done:].data)
         return column.view(dtype).reshape(shape)
-
-
-def _memory(size: int) -> NDArray[np.uint8]:
-    """Return memory that goes back to the kernel as soon as nobody uses it any more."""
-    if not size:
-        return np.empty(0, np.uint8)
-    return np.frombuffer(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), np.uint8)
 
 
 def _padded(size: int) -> int:
