@@ -38,7 +38,7 @@ def raise_descriptor_limit() -> None:
 def give_back_large_tables() -> None:
     """Let large memory go back to the kernel when it is freed.
 
-    After the first table of a large map is freed, glibc would keep what others leave: 30 MB of a million cells.
+    After the first table of a large map, glibc would keep what others leave: 30 MB of a million cells.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

@@ -67,7 +67,8 @@ def read_apart(map_path: str, words: str, before: Catalogue | None) -> Catalogue
     ShmmapError
         What the process raised; or there was none, or it ended before it was done.
     """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    paths = os.pathsep.join(filter(None, sys.path))
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths}
     command = [sys.executable, "-m", "shmmap.origin.reread", str(os.getpid()), words]
     try:
         process = subprocess.Popen(

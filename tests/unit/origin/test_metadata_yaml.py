@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import random
+import re
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.origin import metadata_lines
 from shmmap.origin.metadata_entries import EntryCollector, MapMetadata
 from shmmap.origin.metadata_lines import collect_lines
 from shmmap.origin.metadata_yaml import metadata_bytes, parse_metadata
@@ -182,6 +184,7 @@ def test_the_last_of_repeated_entries_counts() -> None:
         (HEAD + f"{'a' * 900}.pcd: [1, 2]\n", "aaa.*904 characters.*so long a name", "bad_corner"),
         (HEAD + "a.pcd: [1, 2\nb.pcd: [3, 4]\n", "line 4: no YAML", "bad_yaml"),
         (HEAD + "a.pcd: [1, 2]]\n", "no YAML", "bad_yaml"),
+        ("%TAG !a! b\n---\n" + HEAD, "tag directives are not read .at byte 0", "bad_yaml"),
         (HEAD + "a.pcd: *b\n", "line 3: aliases", "bad_yaml"),
         (HEAD + "[a, b]: [1, 2]\n", "line 3: a key must be a name", "bad_yaml"),
         ("- a\n- b\n", "not a YAML mapping", "bad_yaml"),
@@ -205,6 +208,21 @@ def test_a_problem_is_short_however_long_the_key() -> None:
     (problem,) = read(HEAD + "? " + "k" * 100_000 + "\n: 1\na.pcd: [1, 2]\n").problems
     assert problem.startswith("unknown key ignored: kkk")
     assert len(problem) < 200
+
+
+def test_a_long_line_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To look for a line that can be read at each of its places takes time by the square of its length."""
+    looked: list[int] = []
+    pattern = metadata_lines._LINE
+
+    class Counted:
+        def match(self, block: bytes, position: int) -> re.Match[bytes] | None:
+            looked.append(position)
+            return pattern.match(block, position)
+
+    monkeypatch.setattr(metadata_lines, "_LINE", Counted())
+    assert not is_quick(HEAD + "n" * 10_000)
+    assert looked == [0, 19, 38]
 
 
 def test_bytes_that_are_no_text() -> None:
