@@ -44,6 +44,7 @@ from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.prerequisites import (
     access_of_segments,
     choose_pins,
+    give_back_large_tables,
     make_runtime_dir,
     raise_descriptor_limit,
 )
@@ -85,6 +86,7 @@ def run(config: DaemonConfig) -> int:
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     early = fork_early()
     prepare_process()
+    give_back_large_tables()
     raise_descriptor_limit()
     sys.setswitchinterval(SWITCH_S)
     activated = take_activated_socket()
@@ -119,6 +121,7 @@ def run(config: DaemonConfig) -> int:
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early)
             stack.push(partial(_close, memory, signals))
+        del catalogue  # a reload replaces it
         reloader = Reloader(origin, lambda: memory.cache.catalogue)
         service = Service(
             config,

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import resource
 from pathlib import Path
+from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.groups import group_id
@@ -15,13 +17,32 @@ from shmmap.errors import CannotStart
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["access_of_segments", "choose_pins", "make_runtime_dir", "raise_descriptor_limit"]
+__all__ = [
+    "access_of_segments",
+    "choose_pins",
+    "give_back_large_tables",
+    "make_runtime_dir",
+    "raise_descriptor_limit",
+]
+
+_M_MMAP_THRESHOLD: Final = -3
+_LARGE_BYTES: Final = 1 << 20
 
 
 def raise_descriptor_limit() -> None:
     """A session takes two descriptors; the customary limit of 1024 would end at 500 clients."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def give_back_large_tables() -> None:
+    """Let large memory go back to the kernel when it is freed.
+
+    After the first table of a large map, glibc would keep what others leave: 30 MB of a million cells.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def access_of_segments(config: DaemonConfig) -> tuple[int, int]:

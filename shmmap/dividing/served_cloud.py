@@ -29,6 +29,7 @@ from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wir
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.map_origin import MapOrigin
@@ -108,7 +109,7 @@ class DividedCloud:
         self._tell = tell
         self._use_lock = -1
 
-    def load(self, *, fresh: bool = False) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
         """Divide the cloud unless that is done, and return the catalogue of its cells.
 
         Raises
@@ -136,7 +137,9 @@ class DividedCloud:
             raise CannotWrite(
                 f"{error.filename or self._directory}: {error.strerror}", hint="name another --cache-dir"
             ) from error
-        catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(fresh=fresh)
+        catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(
+            fresh=fresh, before=before
+        )
         report = read_report(out) or {}
         catalogue.problems = (*catalogue.problems, *map(str, report.get("notes", ())))
         return catalogue

@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +17,7 @@ from shmmap.origin.spatial_index import SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
 
-__all__ = ["Catalogue", "CatalogueChange", "Tables", "compare"]
+__all__ = ["Catalogue", "common_directory"]
 
 Indices = NDArray[np.intp]
 
@@ -46,6 +43,8 @@ class Catalogue:
         (N, 3) int64, size in bytes, mtime_ns, ctime_ns.
     problems
         Oddities found while reading the map, one sentence each, for the log and `shmmap status`.
+    before
+        An earlier state; what was made for its very ``names`` or ``boxes`` is used for them here, too.
 
     Raises
     ------
@@ -63,8 +62,27 @@ class Catalogue:
         boxes: NDArray[np.float64],
         stamps: NDArray[np.int64],
         problems: Sequence[str] = (),
+        before: Catalogue | None = None,
     ) -> None:
-        self._names = CellNames(id_prefix, names)
+        self._names: CellNames
+        self._index: SpatialIndex
+        if before is not None and before.names is names and before.id_prefix == id_prefix:
+            self._names = before._names
+        else:
+            self._names = CellNames(id_prefix, names)
+        if before is not None and before.boxes is boxes:
+            self._index = before._index
+        else:
+            self._refuse_bad(boxes)
+            self._index = SpatialIndex(boxes)
+        self._stamps = stamps
+        self._versions = np.zeros(len(stamps), np.uint64)  # 0: not computed yet
+        self._block_digests: NDArray[np.uint64] | None = None
+        self._fixed_digest = 0
+        self._map_version: int | None = None
+        self.problems = tuple(problems)
+
+    def _refuse_bad(self, boxes: NDArray[np.float64]) -> None:
         bad = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)
         if bad.any():
             first = int(np.flatnonzero(bad)[0])
@@ -73,13 +91,6 @@ class Catalogue:
                 path=self.id(first),
                 cause="bad_box",
             )
-        self._index = SpatialIndex(boxes)
-        self._stamps = stamps
-        self._versions = np.zeros(len(stamps), np.uint64)  # 0: not computed yet
-        self._block_digests: NDArray[np.uint64] | None = None
-        self._fixed_digest = 0
-        self._map_version: int | None = None
-        self.problems = tuple(problems)
 
     @classmethod
     def from_cells(
@@ -118,22 +129,15 @@ class Catalogue:
         """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame; do not write."""
         return self._index.boxes
 
-    @cached_property
+    @property
     def bounds(self) -> tuple[float, float, float, float] | None:
         """Box around all cells, metres, map frame; None where there are none."""
-        if not len(self):
-            return None
-        min_x, min_y = self.boxes[:, :2].min(axis=0).tolist()
-        max_x, max_y = self.boxes[:, 2:].max(axis=0).tolist()
-        return min_x, min_y, max_x, max_y
+        return self._index.bounds
 
-    @cached_property
+    @property
     def mean_size(self) -> tuple[float, float]:
         """Mean extent of the cells along x and y, metres."""
-        if not len(self):
-            return 0.0, 0.0
-        x, y = (self.boxes[:, 2:] - self.boxes[:, :2]).mean(axis=0).tolist()
-        return x, y
+        return self._index.mean_size
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -236,80 +240,6 @@ class Catalogue:
         are more than ``most``, some of them, more than ``most``, in no order.
         """
         return self._index.query(area, most), True
-
-
-class Tables(Protocol):
-    """What is compared of two catalogues; each as `Catalogue` has it."""
-
-    @property
-    def id_prefix(self) -> str: ...
-    @property
-    def names(self) -> NDArray[np.bytes_]: ...
-    @property
-    def boxes(self) -> NDArray[np.float64]: ...
-    @property
-    def stamps(self) -> NDArray[np.int64]: ...
-    def ids(self, indices: Indices) -> list[str]: ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CatalogueChange:
-    """What differs between two catalogues of a map; indices ascending, which is id order."""
-
-    old: Tables
-    new: Tables
-    added: Indices
-    """In the new one only."""
-    removed: Indices
-    """In the old one only; these are indices of the old one."""
-    changed: Indices
-    """In both with different stamps: another version."""
-    moved: Indices
-    """In both with different boxes (the metadata was edited): another version, too."""
-
-    def __bool__(self) -> bool:
-        return self.count > 0
-
-    @property
-    def count(self) -> int:
-        """How many cells there are in all of them."""
-        return len(self.added) + len(self.removed) + len(self.changed) + len(self.moved)
-
-    @property
-    def same_cells(self) -> bool:
-        """Whether indices mean the same cells as before."""
-        return not len(self.added) and not len(self.removed)
-
-    def ids(self, how: str, most: int | None = None) -> tuple[str, ...]:
-        """Ids of the cells that were ``how``: added, removed, changed or moved; the first ``most``."""
-        tables = self.old if how == "removed" else self.new
-        return tuple(tables.ids(getattr(self, how)[:most]))
-
-
-def compare(old: Tables, new: Tables) -> CatalogueChange:
-    """Find what changed from ``old`` to ``new``, without visiting every cell in Python."""
-    if old.id_prefix == new.id_prefix and np.array_equal(old.names, new.names):
-        in_old = in_new = np.arange(len(new.names))
-    else:
-        prefix = common_directory([old.id_prefix, new.id_prefix])
-        _, in_old, in_new = np.intersect1d(
-            _names_below(prefix, old), _names_below(prefix, new), assume_unique=True, return_indices=True
-        )
-    differs = (old.stamps[in_old] != new.stamps[in_new]).any(axis=1)
-    moved = (old.boxes[in_old] != new.boxes[in_new]).any(axis=1)
-    return CatalogueChange(
-        old,
-        new,
-        added=np.setdiff1d(np.arange(len(new.names)), in_new, assume_unique=True),
-        removed=np.setdiff1d(np.arange(len(old.names)), in_old, assume_unique=True),
-        changed=in_new[differs],
-        moved=in_new[moved],
-    )
-
-
-def _names_below(prefix: str, catalogue: Tables) -> NDArray[np.bytes_]:
-    between = os.fsencode(catalogue.id_prefix[len(prefix) :])
-    return np.char.add(between, catalogue.names) if between else catalogue.names
 
 
 def common_directory(paths: Sequence[str]) -> str:

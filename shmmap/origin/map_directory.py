@@ -6,8 +6,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,21 +15,24 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_bytes import Source
+from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.directory_scan import ScannedFiles, scan
 from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
 from shmmap.origin.metadata_entries import MapMetadata, list_some
-from shmmap.origin.metadata_yaml import read_metadata
-from shmmap.origin.sidecar import Source, default_cache_directory, load_sidecar, save_sidecar, sidecar_file
+from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES, TOO_LARGE, metadata_bytes, parse_metadata
+from shmmap.origin.reading_apart import read_apart
+from shmmap.origin.sidecar import default_cache_directory, load_sidecar, save_sidecar, sidecar_file
 from shmmap.origin.single_pcd import load_single_pcd
-from shmmap.processes.end_with_parent import with_us
 
 __all__ = ["MapDirectory", "open_map"]
 
 # Smaller maps are scanned in a few milliseconds: a cached catalogue would only be less fresh.
 _CACHED_FROM_CELLS = 2000
 
-# A map whose cached catalogue is larger is read again in a process of its own.
-_LARGE_BYTES = 4 << 20
+# Longer metadata, of some 2000 cells, is read in a process of its own: a parser is not interrupted in the
+# midst of a number or a name, and all threads here would wait for it.
+_READ_HERE_BYTES = 64 << 10
 
 
 def open_map(
@@ -91,12 +92,13 @@ class MapDirectory:
         find_layout(self.path, self.metadata, self.pcd_paths)
         return self
 
-    def load(self, *, fresh: bool = False) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
         """Read which cells there are now, with their boxes and their files' stamps.
 
         A large map's catalogue comes from the cache while the metadata and the directories are
-        unchanged; stamps may then be older than the files.  ``fresh`` looks at every file; for a map that
-        is very large and in the cache already a process of its own does (`shmmap.origin.reread`).
+        unchanged; stamps may then be older than the files.  ``fresh`` looks at every file.  Long metadata
+        is read in a process of its own (`shmmap.origin.reading_apart`); what has not changed since
+        ``before`` is shared with that.
 
         Raises
         ------
@@ -107,51 +109,43 @@ class MapDirectory:
         """
         key = self._key(find_layout(self.path, self.metadata, self.pcd_paths))
         sidecar = sidecar_file(self.cache_dir, key)
-        if not fresh or self._read_apart(sidecar):
-            cached = load_sidecar(sidecar, key)
-            if cached is not None:
-                return cached
-        return self.scanned()
+        if not fresh and (cached := load_sidecar(sidecar, key)) is not None:
+            return cached
+        try:
+            return self.scanned(_READ_HERE_BYTES)
+        except MapDataError as error:
+            if error.cause != TOO_LARGE:
+                raise
+        earlier = before if isinstance(before, Catalogue) else None
+        return read_apart(self.path, json.dumps(dataclasses.asdict(self)), earlier)
 
     def _key(self, layout: MapLayout) -> str:
         return json.dumps([layout.roots, layout.metadata, self.strict])
 
-    def _read_apart(self, sidecar: str) -> bool:
-        """Have a process of its own read a very large map; whether its catalogue was written anew."""
-        try:
-            before = os.stat(sidecar)
-            if before.st_size < _LARGE_BYTES:
-                return False
-            words = json.dumps(dataclasses.asdict(self))
-            done = subprocess.run(
-                [*with_us(), sys.executable, "-m", "shmmap.origin.reread", words],
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd="/",
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}, check=False,
-            )  # fmt: skip
-            after = os.stat(sidecar)
-        except OSError:
-            return False
-        anew = (before.st_ino, before.st_mtime_ns) != (after.st_ino, after.st_mtime_ns)
-        return done.returncode == 0 and anew
+    def scanned(self, most_bytes: int = MOST_METADATA_BYTES) -> Catalogue:
+        """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`.
 
-    def scanned(self) -> Catalogue:
-        """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`."""
+        Metadata of more bytes is refused before anything else is looked at.
+        """
         layout = find_layout(self.path, self.metadata, self.pcd_paths)
         key = self._key(layout)
         sidecar = sidecar_file(self.cache_dir, key)
         scanned_ns = time.time_ns()
+        data, sources = b"", []
+        if layout.metadata is not None:
+            # looked at before it is read: a change meanwhile then differs from what is written down
+            sources = [Source.of(layout.metadata, _status(layout.metadata))]
+            data = metadata_bytes(layout.metadata, most_bytes)
         files = scan(layout.roots, recursive=not self.strict)
         if not len(files.names):
             raise MapMissing(f"there is no PCD file in {', '.join(layout.roots)}")
         if layout.metadata is None:
             return _without_metadata(files)
-        # looked at before it is read: a change meanwhile then differs from what is written down
-        metadata_source = Source.of(layout.metadata, _status(layout.metadata))
-        entries = read_metadata(layout.metadata, strict=self.strict)
+        entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
         if len(catalogue) >= self.cached_from_cells and all(os.path.isdir(root) for root in layout.roots):
-            directories = [Source.of(path, status) for path, status in files.directories.items()]
-            save_sidecar(sidecar, key, [metadata_source, *directories], catalogue, scanned_ns)
+            sources += [Source.of(path, status) for path, status in files.directories.items()]
+            save_sidecar(sidecar, key, sources, catalogue, scanned_ns)
         return catalogue
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import Tables
 
 __all__ = ["MapOrigin"]
 
@@ -21,10 +22,11 @@ class MapOrigin(Protocol):
     def path(self) -> str:
         """The map as a person would name it."""
 
-    def load(self, *, fresh: bool = False) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
         """Find out which cells there are now.
 
-        ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.
+        ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.  What has not
+        changed since ``before``, an earlier state, may be shared with it.
 
         Raises
         ------

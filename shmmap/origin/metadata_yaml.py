@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from typing import Any, Final
 
 import yaml
 
@@ -11,7 +12,11 @@ from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.metadata_entries import MOST_NAME_BYTES, EntryCollector, MapMetadata, shortened
 from shmmap.origin.metadata_lines import collect_lines
 
-__all__ = ["parse_metadata", "read_metadata"]
+__all__ = ["MOST_METADATA_BYTES", "TOO_LARGE", "metadata_bytes", "parse_metadata"]
+
+MOST_METADATA_BYTES: Final = 1 << 30
+"""A map of ten million cells has half of that."""
+TOO_LARGE: Final = "too_large"
 
 # The C parser where PyYAML was built with it; both report the same events.
 _LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
@@ -19,23 +24,31 @@ _LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 # The parser's time grows with the square of the depth; metadata needs two levels.
 _MAX_DEPTH = 64
 
+# ... and with the square of their number; metadata needs none.
+_TAG_DIRECTIVE = re.compile(rb"^%TAG", re.MULTILINE)
 
-def read_metadata(path: str, *, strict: bool = False) -> MapMetadata:
-    """Read the metadata file at ``path``.
+
+def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES) -> bytes:
+    """Return what is in the metadata file at ``path``.
 
     Raises
     ------
     MapMissing
         There is no such file, or it may not be read.
     MapDataError
-        It is not what Autoware's loader reads (``strict``), or not even close to it.
+        It has more bytes; the error's cause is `TOO_LARGE`.
     """
     try:
         with open(path, "rb") as file:
-            data = file.read()
+            data = file.read(most_bytes + 1)
     except OSError as error:
         raise MapMissing(f"cannot read the map's metadata {path}: {error.strerror}") from error
-    return parse_metadata(data, path=path, strict=strict)
+    if len(data) > most_bytes:
+        raise MapDataError(
+            f"more than {most_bytes >> 20} MiB of metadata", path=path, cause=TOO_LARGE,
+            hint="it has a line for each cell: is it the map's metadata?",
+        )  # fmt: skip
+    return data
 
 
 def parse_metadata(data: bytes, *, path: str, strict: bool = False, lines: bool = True) -> MapMetadata:
@@ -68,6 +81,8 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
             f"line {mark.line + 1}: {message}", path=path, offset=_line_offset(data, mark.line), cause=cause
         )
 
+    if tag := _TAG_DIRECTIVE.search(data):
+        raise MapDataError("tag directives are not read", path=path, offset=tag.start(), cause="bad_yaml")
     try:
         for event in yaml.parse(data, Loader=_LOADER):
             if isinstance(event, yaml.AliasEvent):

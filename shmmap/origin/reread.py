@@ -1,28 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m shmmap.origin.reread MAP``: read a map, a `MapDirectory` as JSON, into its sidecar.
+"""``python -m shmmap.origin.reread PARENT_PID MAP``: read a map, given as JSON, for another process.
 
-Python's share of reading a million cells takes seconds, during which nobody else in a process would have the
-interpreter, and memory that is not given back.  So a daemon has it done here.
+See `shmmap.origin.reading_apart`.  The catalogue goes into the cache, too.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
+import signal
 import sys
+from typing import Final
 
+import msgspec
+
+from shmmap.errors import InternalError, ShmmapError
+from shmmap.origin.catalogue_bytes import write_catalogue
 from shmmap.origin.map_directory import MapDirectory
+from shmmap.origin.reading_apart import Outcome
+from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["main"]
 
-_NICENESS = 10  # whoever is being served goes first
+_NICENESS: Final = 10  # whoever is being served goes first
+_MOST_BYTES: Final = 8 << 30
+_MOST_S: Final = 600
+"""Memory and processor time for a map; a million cells take 0.4 GB and 8 s."""
 
 
 def main(arguments: list[str]) -> int:
-    """Run; a map that cannot be read ends it with a traceback, and is read again by who asked."""
+    """Run; what is wrong with the map is told, too."""
+    die_with(int(arguments[0]), signal.SIGTERM)
     os.nice(_NICENESS)
-    MapDirectory(**json.loads(arguments[0])).scanned()
+    _limit(resource.RLIMIT_DATA, _MOST_BYTES)
+    _limit(resource.RLIMIT_CPU, _MOST_S)
+    origin = MapDirectory(**json.loads(arguments[1]))
+    outcome, catalogue = Outcome(), None
+    try:
+        catalogue = origin.scanned()
+    except ShmmapError as error:
+        outcome = Outcome.of(error)
+    except OSError as error:
+        outcome = Outcome.of(ShmmapError(f"{origin.path}: {error}"))
+    except MemoryError:
+        said = f"{origin.path}: to read it takes more than {_MOST_BYTES >> 30} GiB of memory"
+        outcome = Outcome.of(ShmmapError(said, hint="is its metadata sound?"))
+    except Exception as error:  # noqa: BLE001  standard error goes nowhere
+        outcome = Outcome.of(InternalError(f"{origin.path}: {type(error).__name__}: {error}"))
+    with open(sys.stdout.fileno(), "wb", closefd=False) as out:
+        out.write(msgspec.json.encode(outcome) + b"\n")
+        if catalogue is not None:
+            write_catalogue(out, "", (), catalogue)
     return 0
+
+
+def _limit(what: int, most: int) -> None:
+    """Lower one of this process's limits, unless it is low enough."""
+    lower = [
+        most if limit == resource.RLIM_INFINITY else min(most, limit) for limit in resource.getrlimit(what)
+    ]
+    resource.setrlimit(what, (lower[0], lower[1]))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ grids, one per power of two, so that one huge cell does not widen the search for
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,20 +40,35 @@ _MAX_BUCKETS = 2**31 - 2
 
 
 class _Grid:
-    """Cells of similar size, sorted by the bucket of their min corner."""
+    """Cells of similar size, sorted by the bucket of their min corner.
+
+    Parameters
+    ----------
+    cells
+        Rows of ``boxes``, (N, 4), all of the map's.
+    """
 
     def __init__(self, cells: Indices, boxes: Floats) -> None:
-        min_x, min_y, max_x, max_y = boxes.T
-        self._width, self._height = float((max_x - min_x).max()), float((max_y - min_y).max())
-        self._min_x, self._min_y = float(min_x.min()), float(min_y.min())
-        span_x, span_y = float(min_x.max()) - self._min_x, float(min_y.max()) - self._min_y
+        lows, highs, sizes = [], [], []
+        for _, (min_x, min_y, max_x, max_y) in _blocks(cells, boxes):
+            lows.append((min_x.min(), min_y.min()))
+            highs.append((min_x.max(), min_y.max()))
+            sizes.append(((max_x - min_x).max(), (max_y - min_y).max()))
+        self._width, self._height = (float(size) for size in np.max(sizes, axis=0))
+        self._min_x, self._min_y = (float(low) for low in np.min(lows, axis=0))
+        high_x, high_y = (float(high) for high in np.max(highs, axis=0))
         larger = max(self._width, self._height) or 1.0
-        self._bucket_x = max(self._width or larger, span_x / _MAX_BUCKETS)
-        self._bucket_y = max(self._height or larger, span_y / _MAX_BUCKETS)
-        ix = np.floor((min_x - self._min_x) / self._bucket_x).astype(np.int64)
-        iy = np.floor((min_y - self._min_y) / self._bucket_y).astype(np.int64)
-        self._columns, self._rows = int(ix.max()) + 1, int(iy.max()) + 1
-        keys = iy << 32 | ix
+        self._bucket_x = max(self._width or larger, (high_x - self._min_x) / _MAX_BUCKETS)
+        self._bucket_y = max(self._height or larger, (high_y - self._min_y) / _MAX_BUCKETS)
+        keys = np.empty(len(cells), np.int64)
+        columns, rows = [], []
+        for block, (min_x, min_y, _, _) in _blocks(cells, boxes):
+            ix = np.floor((min_x - self._min_x) / self._bucket_x).astype(np.int64)
+            iy = np.floor((min_y - self._min_y) / self._bucket_y).astype(np.int64)
+            columns.append(int(ix.max()) + 1)
+            rows.append(int(iy.max()) + 1)
+            keys[block] = iy << 32 | ix
+        self._columns, self._rows = max(columns), max(rows)
         order = np.argsort(keys, kind="stable")
         self._keys = keys[order]
         self._cells = cells[order]
@@ -94,11 +111,28 @@ class SpatialIndex:
         self.boxes: Floats = np.asfortranarray(boxes)
         self._grids: list[_Grid] = []
         if len(boxes) > _LINEAR_CELLS and _has_extent(boxes):
-            extent = np.maximum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
-            level = np.frexp(extent)[1]
+            level = np.empty(len(boxes), np.int16)
+            for block, (min_x, min_y, max_x, max_y) in _blocks(np.arange(len(boxes)), self.boxes):
+                level[block] = np.frexp(np.maximum(max_x - min_x, max_y - min_y))[1]
             for exponent in np.unique(level):
-                cells = np.flatnonzero(level == exponent)
-                self._grids.append(_Grid(cells, boxes[cells]))
+                self._grids.append(_Grid(np.flatnonzero(level == exponent), self.boxes))
+
+    @cached_property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Box around all boxes, metres, map frame; None where there are none."""
+        if not len(self.boxes):
+            return None
+        min_x, min_y = self.boxes[:, :2].min(axis=0).tolist()
+        max_x, max_y = self.boxes[:, 2:].max(axis=0).tolist()
+        return min_x, min_y, max_x, max_y
+
+    @cached_property
+    def mean_size(self) -> tuple[float, float]:
+        """Mean extent of the boxes along x and y, metres."""
+        if not len(self.boxes):
+            return 0.0, 0.0
+        min_x, min_y, max_x, max_y = self.boxes.T
+        return float((max_x - min_x).mean()), float((max_y - min_y).mean())
 
     @property
     def nbytes(self) -> int:
@@ -137,6 +171,13 @@ class SpatialIndex:
             if count > most:
                 break
         return np.concatenate(found)
+
+
+def _blocks(cells: Indices, boxes: Floats) -> Iterator[tuple[slice, Floats]]:
+    """Return the columns of rows ``cells`` of boxes, some at a time: nothing as long as the map is made."""
+    for begin in range(0, len(cells), _AT_ONCE):
+        block = slice(begin, begin + _AT_ONCE)
+        yield block, boxes.T.take(cells[block], axis=1)
 
 
 def _has_extent(boxes: Floats) -> bool:

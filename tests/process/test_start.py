@@ -74,3 +74,18 @@ def test_a_second_daemon_with_another_runtime_directory(
     assert (one.segments(), os.listdir(place)) == (segments, [])
     one.arguments = []
     assert len(connect(one).area(circle(0, 0, 25)).cells) == 12
+
+
+def test_endless_metadata(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    """A number without an end: the map is wrong, which is said in a few words."""
+    metadata = divided_map.root / "pointcloud_map_metadata.yaml"
+    good = metadata.read_text()
+    metadata.write_text(f"{good}a.pcd: [{'7' * 1_000_000}, 0]\n")
+    one = daemon(divided_map.root, start=False)
+    assert one.run_to_end() == 65
+    assert f"shmmap: {metadata}: line " in one.log
+    assert "a.pcd: the corner must be two numbers, not [777" in one.log
+    assert "Traceback" not in one.log
+    assert len(one.log) < 2000
+    metadata.write_text(good)
+    one.start()

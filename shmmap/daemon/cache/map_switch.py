@@ -12,7 +12,7 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Resident
-from shmmap.origin.catalogue import CatalogueChange
+from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.segment.version import Stamp
 
 __all__ = ["MapSwitch"]

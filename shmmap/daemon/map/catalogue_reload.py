@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import CatalogueChange, compare
+from shmmap.origin.catalogue_change import CatalogueChange, compare
 
 __all__ = ["Reloader", "Reread"]
 
@@ -78,7 +78,7 @@ class Reloader:
 
     def _load(self, before: CatalogueView) -> None:
         try:
-            catalogue = self._origin.load(fresh=True)
+            catalogue = self._origin.load(fresh=True, before=before)
             _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # found here, not in the loop
             self._result = Reread(catalogue, compare(before, catalogue))
         except ShmmapError as error:

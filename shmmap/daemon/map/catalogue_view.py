@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.geometry import Area
-from shmmap.origin.catalogue import Tables
+from shmmap.origin.catalogue_change import Tables
 from shmmap.segment.version import Stamp
 
 __all__ = ["CatalogueView", "ViewOrigin"]
@@ -92,5 +92,5 @@ class ViewOrigin(Protocol):
     def path(self) -> str:
         """The map as a person would name it."""
 
-    def load(self, *, fresh: bool = False) -> CatalogueView:
+    def load(self, *, fresh: bool = False, before: Tables | None = None) -> CatalogueView:
         """Find out which cells are known now; errors are those of `MapOrigin.load`."""

@@ -15,7 +15,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import CatalogueChange
+from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.protocol import events
 
 __all__ = ["MapChange"]

@@ -182,7 +182,7 @@ def says(client: RawClient, tag: str, *elements: Any) -> list[Any]:
 
 @scene("A17", "Metadata with endless numbers and names is refused in a few words")
 def long_metadata(told: Report, stage: Stage) -> None:
-    """A corner of ten million digits, and a cell whose name has ten million letters; both reloaded."""
+    """A corner of ten million digits, a name of ten million letters, and their like; all reloaded."""
     made = stage.new_map()
     metadata = made.root / "pointcloud_map_metadata.yaml"
     good = metadata.read_text()
@@ -190,6 +190,11 @@ def long_metadata(told: Report, stage: Stage) -> None:
         "a number of 10 million digits": f"a.pcd: [{'7' * 10_000_000}, 0]\n",
         "a name of 10 MB": f"{'n' * 10_000_000}.pcd: [0, 0]\n",
         "a resolution of 10 million digits": f"x_resolution: {'7' * 10_000_000}\n",
+        "a line of 10 MB": "n" * 10_000_000,
+        "a key of 10 MB": f"? {'n' * 10_000_000}\n: [0, 0]\n",
+        "10 million brackets": f"a.pcd: {'[' * 10_000_000}",
+        "a million anchors": "".join(f"a{i}: &a{i} [1, 2]\n" for i in range(1_000_000)),
+        "aliases": "a: &a [1, 2]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(500_000)),
     }
     with stage.served(made.root) as one, Beside(told, one), RawClient(one.endpoint, timeout=120.0) as client:
         for what, line in bad.items():

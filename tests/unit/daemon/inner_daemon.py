@@ -35,7 +35,8 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
 from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Selected

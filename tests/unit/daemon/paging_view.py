@@ -12,6 +12,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.errors import Offline
 from shmmap.geometry import Area, Box
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import Tables
 from shmmap.segment.version import Stamp
 
 __all__ = ["PagingOrigin", "PagingView"]
@@ -128,8 +129,8 @@ class PagingOrigin:
         self.offline = False
         self.path = whole.id_prefix
 
-    def load(self, *, fresh: bool = False) -> CatalogueView:
-        del fresh
+    def load(self, *, fresh: bool = False, before: Tables | None = None) -> CatalogueView:
+        del fresh, before
         if self.offline:
             raise Offline(f"{self.path}: it does not answer")
         return PagingView(self._whole, self._pages, frozenset(self.known))

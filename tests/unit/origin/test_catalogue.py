@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.geometry import Circle
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import compare
 from shmmap.segment.layout import SourceStamp
 
 Box = tuple[float, float, float, float]
@@ -232,3 +233,30 @@ def test_compare_of_another_directory() -> None:
     assert not compare(old, old)
     assert compare(new, new).same_cells
     assert not compare(old, new).same_cells
+
+
+places = st.sampled_from(["/m/", "/m/v1/", "/m/v1/x/", "/n/", "/"])
+files = st.sampled_from(["a", "b", "a_longer_name.pcd", "v1", "x", "é", "x/a", "v1/x/b"])
+paths = st.builds("".join, st.tuples(places, files))
+
+
+@given(st.sets(paths, max_size=9), st.sets(paths, max_size=9))
+@settings(max_examples=300, deadline=None)
+def test_compare_whatever_the_directories_and_the_longest_names(old: set[str], new: set[str]) -> None:
+    change = compare(catalogue(dict.fromkeys(old, STAMP)), catalogue(dict.fromkeys(new, STAMP)))
+    assert set(change.ids("added")) == new - old
+    assert set(change.ids("removed")) == old - new
+    assert change.count == len(new ^ old)
+
+
+def test_compare_across_blocks() -> None:
+    """Cells that come and go change the others' indices, also beyond the first block that is looked at."""
+    ids = [f"/m/{i:06d}.pcd" for i in range(80_000)]
+    old, new = dict.fromkeys(ids, STAMP), dict.fromkeys(ids[1:], STAMP)
+    new[ids[40_000]] = SourceStamp(1, 2, 3)
+    new["/m/070000.pcd.pcd"] = STAMP
+    change = compare(catalogue(old), catalogue(new))
+    assert change.ids("removed") == (ids[0],)
+    assert change.ids("added") == ("/m/070000.pcd.pcd",)
+    assert change.ids("changed") == (ids[40_000],)
+    assert change.count == 3

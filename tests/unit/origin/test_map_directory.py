@@ -12,7 +12,7 @@ import pytest
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.geometry import Circle
-from shmmap.origin.catalogue import compare
+from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.segment.layout import SourceStamp
 from tests.support.pcd_files import write_pcd

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import random
+import re
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.origin import metadata_lines
 from shmmap.origin.metadata_entries import EntryCollector, MapMetadata
 from shmmap.origin.metadata_lines import collect_lines
-from shmmap.origin.metadata_yaml import parse_metadata, read_metadata
+from shmmap.origin.metadata_yaml import metadata_bytes, parse_metadata
 
 HEAD = "x_resolution: 20.0\ny_resolution: 20.0\n"
 
@@ -182,6 +184,7 @@ def test_the_last_of_repeated_entries_counts() -> None:
         (HEAD + f"{'a' * 900}.pcd: [1, 2]\n", "aaa.*904 characters.*so long a name", "bad_corner"),
         (HEAD + "a.pcd: [1, 2\nb.pcd: [3, 4]\n", "line 4: no YAML", "bad_yaml"),
         (HEAD + "a.pcd: [1, 2]]\n", "no YAML", "bad_yaml"),
+        ("%TAG !a! b\n---\n" + HEAD, "tag directives are not read .at byte 0", "bad_yaml"),
         (HEAD + "a.pcd: *b\n", "line 3: aliases", "bad_yaml"),
         (HEAD + "[a, b]: [1, 2]\n", "line 3: a key must be a name", "bad_yaml"),
         ("- a\n- b\n", "not a YAML mapping", "bad_yaml"),
@@ -207,6 +210,21 @@ def test_a_problem_is_short_however_long_the_key() -> None:
     assert len(problem) < 200
 
 
+def test_a_long_line_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To look for a line that can be read at each of its places takes time by the square of its length."""
+    looked: list[int] = []
+    pattern = metadata_lines._LINE
+
+    class Counted:
+        def match(self, block: bytes, position: int) -> re.Match[bytes] | None:
+            looked.append(position)
+            return pattern.match(block, position)
+
+    monkeypatch.setattr(metadata_lines, "_LINE", Counted())
+    assert not is_quick(HEAD + "n" * 10_000)
+    assert looked == [0, 19, 38]
+
+
 def test_bytes_that_are_no_text() -> None:
     with pytest.raises(MapDataError, match="no YAML"):
         parse_metadata(HEAD.encode() + b"\xff\xfe: [1, 2]\n", path="m.yaml")
@@ -214,7 +232,7 @@ def test_bytes_that_are_no_text() -> None:
 
 def test_a_missing_file(tmp_path: object) -> None:
     with pytest.raises(MapMissing, match="No such file"):
-        read_metadata(f"{tmp_path}/none.yaml")
+        metadata_bytes(f"{tmp_path}/none.yaml")
 
 
 def test_ten_thousand_entries_quick_equals_parser_equals_pyyaml() -> None:

@@ -12,6 +12,7 @@ import pytest
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.errors import ShmmapError
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import Tables
 
 Result = Reread | ShmmapError
 
@@ -21,8 +22,9 @@ class Origin:
 
     path = "/maps/town"
 
-    def load(self, *, fresh: bool = False) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
         assert fresh
+        assert before is not None
         return Catalogue.from_cells([])
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
-from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import compare
 from shmmap.protocol.messages import (
     Area,
     Cells,

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading a map in a process of its own (`shmmap.origin.reread`).
+
+Python's share of reading a million cells takes seconds, during which nobody else in a process would have
+the interpreter, and memory that is not given back.  To parse a number of ten million digits takes a third of
+a second, in which no other thread runs at all.  What the process finds comes through a pipe: an error, or the
+catalogue.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import IO, cast
+
+import msgspec
+
+from shmmap.errors import MapDataError, ShmmapError, error_from_wire
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_bytes import read_catalogue
+from shmmap.processes.start_child import how_ended
+
+__all__ = ["Outcome", "read_apart"]
+
+
+class Outcome(msgspec.Struct):
+    """The first line that the process writes: an error, as replies have it, or empty; then the catalogue."""
+
+    error: str = ""
+    message: str = ""
+    hint: str = ""
+    path: str = ""
+    offset: int | None = None
+    cause: str = ""
+
+    @classmethod
+    def of(cls, error: ShmmapError) -> Outcome:
+        """What is told of an error."""
+        found = cls(error.code, error.message, error.hint)
+        if isinstance(error, MapDataError):
+            found.path, found.offset, found.cause = error.path, error.offset, error.cause
+        return found
+
+    def raised(self) -> ShmmapError:
+        """Return the error that was told."""
+        error = error_from_wire(self.error, self.message, self.hint)
+        if isinstance(error, MapDataError):
+            error.path, error.offset, error.cause = self.path, self.offset, self.cause
+        return error
+
+
+def read_apart(map_path: str, words: str, before: Catalogue | None) -> Catalogue:
+    """Have a process read a map.
+
+    Parameters
+    ----------
+    map_path
+        The map, for messages.
+    words
+        What the process is told: a `MapDirectory` as JSON.
+    before
+        An earlier state: what has not changed is shared with it.
+
+    Raises
+    ------
+    ShmmapError
+        What the process raised; or there was none, or it ended before it was done.
+    """
+    paths = os.pathsep.join(filter(None, sys.path))
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths}
+    command = [sys.executable, "-m", "shmmap.origin.reread", str(os.getpid()), words]
+    try:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            env=environment, cwd="/",
+        )  # fmt: skip
+    except OSError as error:
+        raise ShmmapError(
+            f"{map_path}: cannot start a process that reads it: {error.strerror}",
+            hint="raise the limit of processes or memory (TasksMax=, ulimit -u, MemoryMax=)",
+        ) from error
+    try:
+        with cast("IO[bytes]", process.stdout) as pipe:
+            if line := pipe.readline():
+                outcome = msgspec.json.decode(line, type=Outcome)
+                if outcome.error:
+                    raise outcome.raised()
+                return read_catalogue(pipe, before=before)[1]
+    except (ValueError, msgspec.MsgspecError):  # it did not get to the end
+        pass
+    finally:
+        process.kill()
+        process.wait()
+    raise ShmmapError(
+        f"{map_path}: the process that reads it ended with {how_ended(process.returncode)}",
+        hint="was it killed, or is its memory too small?",
+    )
