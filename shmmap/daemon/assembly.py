@@ -11,6 +11,7 @@ import os
 import signal
 import socket
 import time
+from collections import deque
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
@@ -40,7 +41,7 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
-from shmmap.daemon.serving_loop import ServingLoop
+from shmmap.daemon.serving_loop import Chore, ServingLoop
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.listener import Connections, Listener
@@ -120,6 +121,9 @@ class Service:
             defects,
             self._inbox.due,
         )
+        chores: deque[tuple[str, Chore]] = deque()
+        chores += [("usage", cache.survey), ("map", memory.map_switch)]
+        chores += [("statistics", sampler), ("memory", cache.evictor)]
         self._handshake = handshake
         self._loop = ServingLoop(
             watched,
@@ -129,11 +133,10 @@ class Service:
             cells,
             cache,
             scheduler,
-            sampler,
+            chores,
             statistics,
             defects,
             memory.event_log,
-            memory.map_switch,
         )
 
     def run(self, started_s: float) -> None:

@@ -7,12 +7,18 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from shmmap.segment.directory import is_full
 from shmmap.segment.version import Stamp
 
-__all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired"]
+__all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired", "failure_code"]
 
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
 """Failures for lack of memory: they pass when somebody lets go."""
+
+
+def failure_code(error: OSError) -> str:
+    """Code of a load that failed for want of a segment's file."""
+    return "no_space" if is_full(error) else "load_failed"
 
 
 class Key(NamedTuple):

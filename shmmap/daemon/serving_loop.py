@@ -9,36 +9,56 @@ descriptors to the next; whoever has just sent something waits for it: each is m
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
-from shmmap.daemon.telemetry.sampler import BEAT_S, Sampler
-from shmmap.daemon.transport.inbox import Inbox
+from shmmap.daemon.telemetry.sampler import BEAT_S
+from shmmap.daemon.transport.inbox import Inbox, Turn
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.protocol.events import LongTurn
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["ServingLoop"]
+__all__ = ["Chore", "ServingLoop"]
 
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
+ENOUGH_NS: Final = 500_000
+"""Processor time after which a turn begins no other kind of work."""
 LONG_TURN_NS: Final = 10_000_000
 """Processor time of a turn that is worth an event."""
 TOLD_S: Final = 1.0
 
 
+class Chore(Protocol):
+    """Work that has its own time and is done in bounded parts."""
+
+    @property
+    def next_s(self) -> float:
+        """When a part of it is due; infinity for never, any time that is over for at once."""
+
+    def turn(self, now_s: float) -> None:
+        """Do the part that is due."""
+
+
 @dataclass(eq=False, slots=True)
 class ServingLoop:
-    """Serves one map until told to stop."""
+    """Serves one map until told to stop.
+
+    Parameters
+    ----------
+    chores
+        By the kind of turn that each makes: a turn does a part of one of them, of those that are due the one
+        that had none for the longest time.
+    """
 
     watched: WatchedDescriptors
     inbox: Inbox
@@ -47,11 +67,10 @@ class ServingLoop:
     cells: CellRequests
     cache: CellCache
     scheduler: Scheduler
-    sampler: Sampler
+    chores: deque[tuple[str, Chore]]
     statistics: StatisticsWriter
     defects: Defects
     event_log: EventLog
-    map_switch: MapSwitch
     stopping: bool = False
     _answer_at_end: bool = True
     _turn_began_ns: int = field(default_factory=time.thread_time_ns)
@@ -79,13 +98,12 @@ class ServingLoop:
 
     def _patience_s(self) -> float:
         """How long nothing has to be done if nothing comes."""
-        if len(self.inbox) or self.map_switch.busy:
+        if len(self.inbox):
             return 0
         until_s = min(
             self.scheduler.next_event_s(),
             self.cells.next_deadline_s(),
-            self.sampler.next_s,
-            self.cache.survey.next_step_s,
+            *(chore.next_s for _kind, chore in self.chores),
         )
         return min(max(0.0, until_s - time.monotonic()), BEAT_S)
 
@@ -104,9 +122,18 @@ class ServingLoop:
     def _turn(self, ready: list[int]) -> None:
         self._hear(ready)
         self._serve()
+        self._breathe()
         self._look_after_the_rest(time.monotonic())
+        self._breathe()
         self._guarded("memory", self.scheduler.pump, time.monotonic())
         self._guarded("memory", self.cache.tell_all)
+
+    def _breathe(self) -> None:
+        """If this turn has taken its time, begin another one: hear who has come, serve one of them, go on."""
+        if time.thread_time_ns() - self._turn_began_ns > ENOUGH_NS:
+            self._hear(self._poll(0))
+            if (turn := self.inbox.take()) is not None:
+                self._serve_one(turn, time.monotonic())
 
     def _guarded(self, kind: str, call: Callable[..., object], *arguments: object) -> None:
         """Call what must not end the daemon if it fails, unless that happens again and again."""
@@ -132,27 +159,33 @@ class ServingLoop:
         start_s = time.monotonic()
         end_s = start_s + SERVE_S
         while start_s < end_s and (turn := self.inbox.take()) is not None:
-            if turn.over:
-                turn.work = self.dispatch.handle(turn)
-                self._guarded("requests", turn.go_on)
-            else:
-                self._guarded("answers", turn.go_on)
-            self._guarded("memory", self.cache.tell_all)
-            now_s = time.monotonic()
-            self.inbox.served(turn, now_s - start_s)
-            if turn.asked and turn.over:
-                self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
-            start_s = now_s
+            start_s = self._serve_one(turn, start_s)
             if len(self.inbox):
                 self._hear(self._poll(0))
 
+    def _serve_one(self, turn: Turn, start_s: float) -> float:
+        """Serve whose turn it is; returns when that was done."""
+        if turn.over:
+            turn.work = self.dispatch.handle(turn)
+            self._guarded("requests", turn.go_on)
+        else:
+            self._guarded("answers", turn.go_on)
+        self._guarded("memory", self.cache.tell_all)
+        now_s = time.monotonic()
+        self.inbox.served(turn, now_s - start_s)
+        if turn.asked and turn.over:
+            self.statistics.add_duration("request", int((now_s - start_s) * 1e9))
+        return now_s
+
     def _look_after_the_rest(self, now_s: float) -> None:
-        """What has its own time: deadlines, surveys, statistics."""
+        """What has its own time: deadlines, and the next part of a chore."""
         self._guarded("loaders", self.scheduler.lost.end_overdue, now_s)
         self._guarded("answers", self.cells.answer_overdue, now_s)
-        self._guarded("usage", self.cache.survey.turn, now_s)
-        if self.map_switch.busy:
-            self._guarded("map", self.map_switch.step, now_s)
-        self._guarded("statistics", self.sampler.turn, now_s)
+        for _ in range(len(self.chores)):
+            kind, chore = self.chores[0]
+            self.chores.rotate(-1)
+            if chore.next_s <= now_s:
+                self._guarded(kind, chore.turn, now_s)
+                break
         if now_s >= self.operators.stop_by_s:
             self.stop()

@@ -220,7 +220,7 @@ class StatisticsWriter:
             self._identity_due = None
             self._identity_sequence += 1
 
-    def beat(self, *, max_rows: int = 256) -> None:
+    def beat(self, *, max_rows: int = 128) -> None:
         """Write the time, all counters and at most ``max_rows`` changed rows (the rest at later beats)."""
         self._write_identity()
         if self._changes_due:

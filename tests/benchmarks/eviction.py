@@ -113,9 +113,8 @@ def steps(count: int, policy: str) -> None:
     for number in range(count):
         appear(number, now_s)
     while not ledger.order.settled:
-        evictor.refresh(now_s := now_s + 1.0)
-    gc.freeze()
-    gc.set_threshold(*gc.get_threshold()[:2], 1 << 30)  # as the daemon does
+        evictor.turn(now_s := now_s + 1.0)
+    gc.disable()  # as the daemon does
     drivers = [sessions.open(connections.of(), "", 0.0) for _ in range(CLIENTS)]
     number, made, refreshed = count, list[float](), list[float]()
     for turn in range(2000):
@@ -126,7 +125,7 @@ def steps(count: int, policy: str) -> None:
         begin = time.thread_time()
         evictor.free(ledger.shortage(SEGMENT_BYTES), now_s)
         middle, scored = time.thread_time(), ledger.order.scored
-        evictor.refresh(now_s)
+        evictor.turn(now_s)
         end = time.thread_time()
         made.append((middle - begin) * 1e3)
         if ledger.order.scored > scored:

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +30,7 @@ ENTRIES_A_STEP: Final = 2048
 class MapSwitch:
     """Changes the catalogue that the cache serves, and remembers the changes.
 
-    To change over takes one short step.  What is in memory is then looked at little by little, in `step`; a
+    To change over takes one short step.  What is in memory is then looked at little by little, in `turn`; a
     cell that is asked for meanwhile is looked for at once (`CellCache.find_warm`).
     """
 
@@ -36,7 +38,7 @@ class MapSwitch:
         self._cache = cache
         self._history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=STATES_REMEMBERED)
         self._remembered = 0
-        self._residents: deque[Resident] = deque()
+        self._unseen: Iterator[Resident] | None = None
         self._leftovers: list[dict[int, Any]] = []
 
     def changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
@@ -102,22 +104,30 @@ class MapSwitch:
         changed = np.concatenate((change.changed, change.moved))
         cache.statistics.map_changed()
         self._leftovers += cache.serve(new, changed if change.same_cells else None)
-        self._residents = deque(cache.ledger.residents())
-        cache.unentered = len(self._residents)
+        self._unseen = cache.ledger.segments.walk()
+        cache.unentered = cache.ledger.resident_count
 
     @property
     def busy(self) -> bool:
-        """Whether `step` has something to do."""
-        return bool(self._residents or self._leftovers)
+        """Whether `turn` has something to do."""
+        return bool(self._unseen or self._leftovers)
 
-    def step(self, now_s: float) -> None:
+    @property
+    def next_s(self) -> float:
+        """When `turn` has something to do: at once, or never."""
+        return 0.0 if self.busy else math.inf
+
+    def turn(self, now_s: float) -> None:
         """Look at some of what is in memory: it is right, out of date, or of no cell of the map any more."""
         cache = self._cache
-        for _ in range(min(SEGMENTS_A_STEP, len(self._residents))):
-            resident = self._residents.popleft()
-            if cache.ledger.resident_named(resident.name) is resident:
-                self._look_at(resident, now_s)
-        cache.unentered = len(self._residents)
+        if self._unseen is not None:
+            some = list(islice(self._unseen, SEGMENTS_A_STEP))
+            for resident in some:
+                if cache.ledger.resident_named(resident.name) is resident:
+                    self._look_at(resident, now_s)
+            cache.unentered = max(1, cache.unentered - len(some))
+            if len(some) < SEGMENTS_A_STEP:
+                self._unseen, cache.unentered = None, 0
         for _ in range(ENTRIES_A_STEP):
             if not self._leftovers:
                 break

@@ -91,7 +91,7 @@ class Survey:
         return not (self._asked or self._running)
 
     @property
-    def next_step_s(self) -> float:
+    def next_s(self) -> float:
         """When `turn` has something to do: infinity for never."""
         return float("inf") if self.idle else self._rests_until_s
 

@@ -13,6 +13,7 @@ cell that failed: only workers look at files, because a look may take as long as
 from __future__ import annotations
 
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from typing import Final
@@ -24,19 +25,19 @@ from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
-from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.processes.start_child import how_ended
-from shmmap.segment.directory import is_full
 from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
 LOOKS_A_PUMP: Final = 16
-"""Loads that one `pump` hands out or finds to be of no use any more."""
+HAND_OUT_S: Final = 0.0005
+"""Loads that one `pump` hands out or finds to be of no use any more, and time of the processor for that."""
 
 
 class Scheduler:
@@ -117,14 +118,15 @@ class Scheduler:
         """Free what is due, hand queued loads to workers as far as memory and workers allow."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.forget_refusals()
-        if now_s < self._cache.evictor.refresh_until_s:
-            self._cache.evictor.refresh(now_s)
         self._cache.look_for_some(now_s)
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
-        if self._doubtful:
-            self._drop_some()
-        self._unfinished = len(self.loads) > 0 and all(self._hand_out_one(now_s) for _ in range(LOOKS_A_PUMP))
+        self._drop_some()
+        end_s = time.thread_time() + HAND_OUT_S
+        for _ in range(LOOKS_A_PUMP):
+            self._unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
+            if not self._unfinished or time.thread_time() > end_s:
+                break
 
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
@@ -145,8 +147,7 @@ class Scheduler:
         try:
             taken = self.pool.submit(job, now_s)
         except OSError as error:
-            code = "no_space" if is_full(error) else "load_failed"
-            self._fail(load, code, f"no file for a segment: {error.strerror}", None, now_s)
+            self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
             return True
         if taken:
             self._jobs[job.number] = load
@@ -280,8 +281,7 @@ class Scheduler:
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
-            code = "no_space" if is_full(error) else "load_failed"
-            self._fail(load, code, f"cannot publish: {error.strerror}", None, now_s)
+            self._fail(load, failure_code(error), f"cannot publish: {error.strerror}", None, now_s)
             return
         cache.tell(cache.events.loaded, resident, int((now_s - load.started_s) * 1e9), replaces)
         self._statistics.add("loads_from_cache", done.cached)

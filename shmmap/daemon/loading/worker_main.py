@@ -21,6 +21,7 @@ from typing import Final
 
 from shmmap.daemon.host.scheduling import weigh_less
 from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.records import failure_code
 from shmmap.errors import MapDataError, Offline, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
 from shmmap.layers.derive import CellJob
@@ -32,7 +33,7 @@ from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
-from shmmap.segment.directory import ShmDirectory, is_full
+from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.verify import verify_file
@@ -136,8 +137,7 @@ class _Worker:
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
-            code = "no_space" if is_full(error) else "load_failed"
-            self._fail(job, code, f"{job.path}: {error.strerror or error}")
+            self._fail(job, failure_code(error), f"{job.path}: {error.strerror or error}")
         except MemoryError:
             most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])
             why = f"making {job.layer} takes more than the {most} of memory that a loader may use"

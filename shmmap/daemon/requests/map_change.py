@@ -20,7 +20,7 @@ from shmmap.protocol import events
 
 __all__ = ["MapChange"]
 
-CELLS_TOLD: Final = 128
+CELLS_TOLD: Final = 64
 """Changed cells named one by one: a map written anew has a million; `metadata` names them all."""
 PROBLEMS_TOLD: Final = 64
 """Problems of the map in the log."""

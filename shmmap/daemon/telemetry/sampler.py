@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The daemon's pulse: a few times a second what it keeps is measured and written to the statistics.
 
-It beats from the serving loop itself, so that whoever is hung does not beat.  While cells come and go it
-beats more often, and lightly: only what has changed is written then.
+It beats from the serving loop itself, so that whoever is hung does not beat; a beat takes some turns.  While
+cells come and go it beats more often, and lightly: only what has changed is written then.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sized
+import contextlib
+from collections.abc import Callable, Iterator, Sized
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -49,25 +50,36 @@ class Sampler:
     sessions: Sessions
     waiting: Sized
     on_beat: Callable[[], None]
-    next_s: float = 0.0
+    _next_s: float = 0.0
     _whole_s: float = 0.0
+    _beating: Iterator[None] | None = None
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _rows: SessionRows = field(default_factory=SessionRows)
     _told_s: float = float("-inf")
     _last_s: float = 0.0
 
-    def turn(self, now_s: float) -> None:
-        """Beat if it is time to, soon after cells came, went or changed."""
+    @property
+    def next_s(self) -> float:
+        """When it is time to beat, or to go on with it: soon after cells came, went or changed."""
+        if self._beating is not None:
+            return 0.0
         if self.cache.statistics.outdated:
             # whoever asks right after a change sees it, yet a stream of changes costs little
-            self.next_s = min(self.next_s, self._last_s + CHANGE_BEAT_S)
-        if now_s < self.next_s:
-            return
-        whole = now_s >= self._whole_s
-        if whole:
-            self._whole_s = now_s + BEAT_S
-        self._last_s, self.next_s = now_s, self._whole_s
-        self._beat(now_s, whole=whole)
+            return min(self._next_s, self._last_s + CHANGE_BEAT_S)
+        return self._next_s
+
+    def turn(self, now_s: float) -> None:
+        """Beat, or go on with it."""
+        if self._beating is None:
+            whole = now_s >= self._whole_s
+            if whole:
+                self._whole_s = now_s + BEAT_S
+            self._last_s, self._next_s = now_s, self._whole_s
+            self._beating = self._beat(now_s, whole=whole)
+        beating, self._beating = self._beating, None
+        with contextlib.suppress(StopIteration):
+            next(beating)
+            self._beating = beating
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
@@ -92,15 +104,12 @@ class Sampler:
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
-        """What takes longer, and need not be done at each of many beats while cells load."""
+        """What need not be done at each of many beats while cells load."""
         cache, values = self.cache, self.cache.statistics.values
-        if cache.survey.idle:  # else the serving loop is at it
-            cache.survey.step()
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
-        cache.statistics.show_clients(self._rows.of(self.sessions))
         cache.events.pressure.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
@@ -114,12 +123,21 @@ class Sampler:
             if cache.ledger.resident_named(resident.name) is resident:
                 cache.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
 
-    def _beat(self, now_s: float, *, whole: bool) -> None:
-        self.measure()
+    def _beat(self, now_s: float, *, whole: bool) -> Iterator[None]:
+        """Each part takes less than a millisecond."""
+        cache = self.cache
         if whole:
+            if cache.survey.idle:  # else it has turns of its own
+                cache.survey.step()
+            yield
             self._look_around(now_s)
+            cache.statistics.show_clients(self._rows.of(self.sessions))
+            yield
             self._show_used()
-        self.cache.ledger.overhead_bytes = self.cache.statistics.size_bytes
-        self.cache.statistics.beat()
+            yield
+        self.measure()
+        cache.ledger.overhead_bytes = cache.statistics.size_bytes
+        cache.statistics.beat()
         if whole:
+            yield
             self.on_beat()

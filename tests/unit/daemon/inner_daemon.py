@@ -165,7 +165,9 @@ class InnerDaemon:
         self.cache.survey.turn(now_s)
         self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
-        self.map_switch.step(now_s)
+        self.map_switch.turn(now_s)
+        if self.evictor.next_s <= now_s:
+            self.evictor.turn(now_s)
         while not self.hold_answers and self.due:
             finish(self.due.pop(0))
         self.cache.tell_all()

@@ -41,21 +41,20 @@ class Evictor:
         Segments retired to make room.
     wake_s
         When `free` is worth calling again although nothing changed: at once, or when a grace ends.
-    refresh_until_s
-        Until when `refresh` has something to do: for a while after somebody needed room.
     """
 
     reclaimer: Reclaimer
     policy: EvictionPolicy
     evicted_count: int = 0
     wake_s: float = math.inf
-    refresh_until_s: float = -math.inf
     _score: Score = field(init=False)
     _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
     _round_version: int = 0
     _round_s: float = -math.inf
     _placed_s: float = -math.inf
     _refreshed_s: float = -math.inf
+    _refresh_until_s: float = -math.inf
+    _new_ones: bool = False
 
     def __post_init__(self) -> None:
         self._score = self._score_at(0)
@@ -70,7 +69,7 @@ class Evictor:
         missing = shortage - ledger.coming_bytes
         if missing <= 0:
             return True
-        self.refresh_until_s = now_s + PRESSURE_S
+        self._refresh_until_s = now_s + PRESSURE_S
         order, looks = ledger.order, 0
         first = order.front(self._scored(now_s), now_s)
         for resident in first:
@@ -123,15 +122,19 @@ class Evictor:
 
     # --- keeping the order up to date -----------------------------------------------------------
 
-    def refresh(self, now_s: float) -> None:
-        """Bring some scores up to date, while memory is short and clients move."""
-        if now_s - self._refreshed_s < REFRESH_S:
-            return
+    @property
+    def next_s(self) -> float:
+        """When `turn` has something to do; for a while after somebody needed room."""
+        return self._refreshed_s + REFRESH_S if self._refreshed_s < self._refresh_until_s else math.inf
+
+    def turn(self, now_s: float) -> None:
+        """Score some segments that came, or bring some scores up to date, in turn."""
         self._refreshed_s = now_s
         ledger, score = self.reclaimer.ledger, self._scored(now_s)
-        ledger.order.score_new(score)
-        some = list(islice(self._round, BATCH))
-        if some:
+        self._new_ones = not self._new_ones
+        if self._new_ones:
+            ledger.order.score_new(score)
+        elif some := list(islice(self._round, BATCH)):
             ledger.order.refresh(some, score)
         elif self._round_version != score.version and now_s - self._round_s >= ROUND_S:
             self._round_s = now_s

@@ -8,8 +8,23 @@ from typing import Any
 import pytest
 
 from shmmap.daemon.telemetry.sampler import BEAT_S, CHANGE_BEAT_S, Sampler
+from shmmap.daemon.telemetry.session_rows import ROWS_AT_ONCE, SessionRows
+from shmmap.daemon.transport.sessions import Sessions
+from shmmap.statistics.client_rows import MAX_CLIENTS
+from tests.support import connections
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner
+
+PARTS = 5
+
+
+def beat(sampler: Sampler, now_s: float) -> int:
+    """Have the sampler do what is due; returns in how many turns."""
+    count = 0
+    while sampler.next_s <= now_s:
+        sampler.turn(now_s)
+        count += 1
+    return count
 
 
 def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_beat(
@@ -28,18 +43,60 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
 
     monkeypatch.setattr(one.statistics, "_write_row", noted)
     now_s = 1000.0
-    sampler.turn(now_s)
+    beat(sampler, now_s)
     assert whole == [1000.0]
     residents: list[Any] = list(one.ledger.residents())
     one.cache.used.update(residents)
     one.cache.rows.show(residents[0], "resident")
     written.clear()
-    sampler.turn(now_s := 1000.0 + CHANGE_BEAT_S / 2)
+    beat(sampler, now_s := 1000.0 + CHANGE_BEAT_S / 2)
     assert written == []
-    sampler.turn(now_s := 1000.0 + CHANGE_BEAT_S)
+    beat(sampler, now_s := 1000.0 + CHANGE_BEAT_S)
     assert written == [residents[0].name]
-    sampler.turn(now_s := 1000.0 + BEAT_S / 2)
+    beat(sampler, now_s := 1000.0 + BEAT_S / 2)
     assert (written, whole) == ([residents[0].name], [1000.0])
-    sampler.turn(now_s := 1000.0 + BEAT_S)
+    beat(sampler, now_s := 1000.0 + BEAT_S)
     assert set(written) == {resident.name for resident in residents}
     assert whole == [1000.0, 1000.0 + BEAT_S]
+
+
+def test_a_beat_takes_some_turns_and_goes_on_where_it_was(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    whole: list[float] = []
+    sampler = Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), lambda: whole.append(1.0))
+    assert sampler.next_s <= 0.0
+    sampler.turn(1000.0)
+    assert (sampler.next_s, whole) == (0.0, [])
+    beats = one.statistics._sequence
+    assert beat(sampler, 1000.001) == PARTS - 1
+    assert (whole, one.statistics._sequence) == ([1.0], beats + 1)
+    assert sampler.next_s == 1000.0 + BEAT_S
+
+
+def test_rows_of_many_clients_are_made_anew_a_few_at_a_time() -> None:
+    """The oldest ones first, and only of those that changed."""
+    sessions, rows = Sessions(), SessionRows()
+    clients = [sessions.open(connections.of(), f"{number}", 0.0) for number in range(2 * ROWS_AT_ONCE + 8)]
+    shown = [len(rows.of(sessions)) for _ in range(4)]
+    assert shown == [ROWS_AT_ONCE, 2 * ROWS_AT_ONCE, len(clients), len(clients)]
+    before = rows.of(sessions)
+    clients[-1].requests = 7
+    assert [new is old for new, old in zip(rows.of(sessions), before, strict=True)].count(False) == 1
+    for client in clients:
+        client.requests += 1
+    requests = [(row.requests, one.requests) for row, one in zip(rows.of(sessions), clients, strict=True)]
+    assert [told == now for told, now in requests].count(True) == ROWS_AT_ONCE
+    for _ in range(2):
+        for client in clients[:ROWS_AT_ONCE]:
+            client.requests += 1  # these ask all the time
+        rows.of(sessions)
+    assert all(row.requests for row in rows.of(sessions)), "the others have their turn"
+    sessions.close(clients[0])
+    assert [row.session for row in rows.of(sessions)] == [client.slot for client in clients[1:]]
+
+
+def test_more_clients_than_there_are_rows() -> None:
+    sessions, rows = Sessions(), SessionRows()
+    for _ in range(MAX_CLIENTS + 5):
+        sessions.open(connections.of(), "", 0.0)
+    assert [len(rows.of(sessions)) for _ in range(5)] == [64, 128, 192, MAX_CLIENTS, MAX_CLIENTS]
