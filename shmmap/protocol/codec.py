@@ -11,10 +11,11 @@ from typing import Final
 import msgspec
 
 from shmmap.errors import BadRequest, ProtocolMismatch
-from shmmap.protocol.messages import FailedCell, Handle, PendingCell, Reply, Request
+from shmmap.protocol.messages import Handle, Reply, Request
 
 __all__ = [
     "MAX_REQUEST_BYTES",
+    "PackedArray",
     "decode_reply",
     "decode_request",
     "encode",
@@ -56,6 +57,36 @@ def encode_handle(handle: Handle) -> bytes:
     return _encoder.encode(handle)
 
 
+class PackedArray:
+    """An array of a message, encoded a part at a time: very many elements at once take long."""
+
+    def __init__(self, elements: Sequence[object] = ()) -> None:
+        self._count = 0
+        self._parts: list[bytes] = []
+        self.add(elements)
+
+    def add(self, elements: Sequence[object]) -> None:
+        """Encode some more elements."""
+        if elements:
+            self._count += len(elements)
+            self._parts.append(encode(elements)[len(_head(len(elements))) :])
+
+    def __bytes__(self) -> bytes:
+        return b"".join((_head(self._count), *self._parts))
+
+
+def _head(count: int) -> bytes:
+    """What an array of so many elements begins with."""
+    if count < 16:
+        return bytes((0x90 | count,))
+    if count < 1 << 16:
+        return b"\xdc" + count.to_bytes(2, "big")
+    return b"\xdd" + count.to_bytes(4, "big")
+
+
+_NOTHING: Final = PackedArray()
+
+
 def encode_cells(
     request: int,
     epoch: int,
@@ -63,23 +94,18 @@ def encode_cells(
     handles: Sequence[bytes],
     removed: tuple[str, ...],
     removed_packed: bytes,
-    pending: Sequence[PendingCell],
-    failed: Sequence[FailedCell],
     layers: tuple[str, ...],
     covered: bool = True,
+    pending: PackedArray = _NOTHING,
+    failed: PackedArray = _NOTHING,
 ) -> bytes:
-    """Return a `Cells` reply put together from handles that are encoded already."""
-    count = len(handles)
-    if count < 16:
-        head = bytes((0x90 | count,))
-    elif count < 1 << 16:
-        head = b"\xdc" + count.to_bytes(2, "big")
-    else:
-        head = b"\xdd" + count.to_bytes(4, "big")
+    """Return a `Cells` reply put together from what is encoded already."""
     start = encode(("cells", request, epoch, map_version))
-    end = encode((removed, removed_packed, pending, failed, layers, covered))
-    # one array of eleven elements instead of two: replace their one-byte heads
-    return b"".join((b"\x9b", start[1:], head, *handles, end[1:]))
+    dropped = encode((removed, removed_packed))
+    end = encode((layers, covered))
+    # one array of eleven elements instead of three: replace their one-byte heads
+    parts = (start[1:], _head(len(handles)), *handles, dropped[1:], bytes(pending), bytes(failed), end[1:])
+    return b"".join((b"\x9b", *parts))
 
 
 def decode_request(data: bytes | memoryview) -> Request:

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 
-from shmmap.daemon.cache.reclaimer import Reclaimer
+from shmmap.daemon.cache.reclaimer import LOOKS_AT_ONCE, Reclaimer
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.records import Resident
 from shmmap.protocol.messages import Holder
@@ -65,25 +64,39 @@ class Holders:
             known.append(UNKNOWN_SLOT)
         return known
 
-    def of(self, residents: Iterable[Resident]) -> tuple[Holder, ...]:
-        """Who keeps these segments, largest first; session 0 is "unknown": a pin without our lock.
+    def of(self, resident: Resident) -> tuple[Holder, ...]:
+        """Who keeps a segment; session 0 is "unknown": a pin without our lock."""
+        return tuple(self._told({slot: [resident.nbytes, 1] for slot in self._users_of(resident)}))
 
-        A bounded look: at so many segments, and for so long.
+    def look(self, residents: Iterable[Resident], holders: list[Holder]) -> Iterator[None]:
+        """Add who keeps these segments to ``holders``, largest first, when that is found out.
+
+        A bounded look: at so many segments, and for so long; a few a turn.
         """
-        end_s = time.thread_time() + HOLDERS_S
-        bytes_of: Counter[int] = Counter()
-        cells_of: Counter[int] = Counter()
-        for resident in islice(residents, MOST_SEGMENTS):
-            if time.thread_time() > end_s:
+        spent_s, found = 0.0, dict[int, list[int]]()
+        for number, resident in enumerate(islice(residents, MOST_SEGMENTS)):
+            if number and number % LOOKS_AT_ONCE == 0:
+                yield
+            begin_s = time.thread_time()
+            for slot in self._users_of(resident):
+                sums = found.setdefault(slot, [0, 0])
+                sums[0] += resident.nbytes
+                sums[1] += 1
+            spent_s += time.thread_time() - begin_s
+            if spent_s > HOLDERS_S:
                 break
-            for slot in self.users_among(resident, self.slots_of(resident) or ()):
-                bytes_of[slot] += resident.nbytes
-                cells_of[slot] += 1
-        found = []
-        for slot, nbytes in bytes_of.most_common():
+        holders += self._told(found)
+
+    def _users_of(self, resident: Resident) -> list[int]:
+        return self.users_among(resident, self.slots_of(resident) or ())
+
+    def _told(self, found: Mapping[int, Sequence[int]]) -> list[Holder]:
+        """By slot, bytes and segments: as a reply says it."""
+        holders = []
+        for slot, (nbytes, cells) in sorted(found.items(), key=lambda item: -item[1][0]):
             session = self.reclaimer.sessions.by_slot(slot)
             if session is None:
-                found.append(Holder(0, 0, -1, "unknown", nbytes, cells_of[slot]))
+                holders.append(Holder(0, 0, -1, "unknown", nbytes, cells))
             else:
-                found.append(session.as_holder(nbytes, cells_of[slot]))
-        return tuple(found)
+                holders.append(session.as_holder(nbytes, cells))
+        return holders

@@ -7,29 +7,50 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
+import msgspec
+
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import SPACE_CODES, Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest, parts
 from shmmap.daemon.transport.sessions import Session
-from shmmap.protocol.codec import encode_cells
+from shmmap.protocol.codec import PackedArray, encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
 
 __all__ = ["Answer", "CellReplies"]
 
+MOST_HOLDERS: Final = 16
+"""Named beside each cell that does not fit: those who have most."""
+UNNAMED: Final = (Holder(0, 0, -1, "", 0, 0),)
+"""Stands for them until they are found out."""
 PROMISED: Final = 1e9
 """Priority of a load that only a "pending" speaks of: behind the distances of all that is asked for."""
 
 
 @dataclass(eq=False, slots=True)
 class Answer:
-    """A reply in the making; ``blockers``, who fills the budget, is looked up once if needed."""
+    """A reply in the making.
+
+    ``pending`` and ``failed`` are what is not in ``packed`` yet, the same two encoded.  If ``short``, some
+    failed for lack of memory, and who has it is still to be named (`UNNAMED`).
+    """
 
     handles: list[bytes] = field(default_factory=list)
     residents: list[Resident] = field(default_factory=list)
     pending: list[PendingCell] = field(default_factory=list)
     failed: list[FailedCell] = field(default_factory=list)
-    blockers: tuple[Holder, ...] | None = None
+    short: bool = False
+    packed: tuple[PackedArray, ...] = ()
+
+    def pack(self) -> None:
+        """Encode what came since the last time."""
+        if self.pending or self.failed:
+            self.packed = pending, failed = self.packed or (PackedArray(), PackedArray())
+            pending.add(self.pending)
+            self.pending.clear()
+            if not self.short:
+                failed.add(self.failed)
+                self.failed.clear()
 
 
 @dataclass(eq=False, slots=True)
@@ -52,8 +73,12 @@ class CellReplies:
         if wanted.area is not None and wanted.area.z is not None:
             inside = set(self.cache.at_height([index for index, _ in wanted.cells], wanted.area.z))
             wanted.cells = [cell for cell in wanted.cells if cell[0] in inside]
-        for cell_id, layer in wanted.unknown:
-            answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
+        for number, unknown in enumerate(parts(wanted.unknown)):
+            if number:
+                yield from wanted.pause(self.cache)
+            for cell_id, layer in unknown:
+                answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
+            answer.pack()
         for number, part in enumerate(parts(wanted.cells)):
             if number:
                 yield from wanted.pause(self.cache)
@@ -66,6 +91,9 @@ class CellReplies:
                     answer.residents.append(resident)
                 else:
                     self._answer_cold(wanted, index, layer, answer, now_s)
+            answer.pack()
+        if answer.short:
+            yield from self._name_holders(wanted, answer)
         self.reply(
             wanted.session, wanted.request, answer, wanted.layers, wanted.covered,
             removed=wanted.removed, removed_packed=wanted.removed_packed,
@@ -89,7 +117,7 @@ class CellReplies:
         cache = self.cache
         reply = encode_cells(
             request, cache.epoch, cache.catalogue.map_version, answer.handles, removed, removed_packed,
-            answer.pending, answer.failed, layers, covered,
+            layers, covered, *answer.packed,
         )  # fmt: skip
         session.connection.reply(reply)
 
@@ -128,11 +156,24 @@ class CellReplies:
         elif not current and failure is not None and not promised:
             holders: tuple[Holder, ...] = ()
             if failure.code in SPACE_CODES:
-                if answer.blockers is None:
-                    answer.blockers = cache.holders.of(cache.ledger.segments.walk())
-                holders = answer.blockers
+                holders, answer.short = UNNAMED, True
             answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders))
         elif not current:
             if not promised:  # evicted, or no longer out of room: "pending" promises a load
                 self.scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
             answer.pending.append(PendingCell(wire_id, layer))
+
+    def _name_holders(self, wanted: PendingRequest, answer: Answer) -> Iterator[None]:
+        """Say beside each cell that there is no memory for who fills the budget."""
+        holders: list[Holder] = []
+        for _ in self.cache.holders.look(self.cache.ledger.segments.walk(), holders):
+            yield from wanted.pause(self.cache)
+        del holders[MOST_HOLDERS:]
+        failed, answer.failed, answer.short = answer.failed, [], False
+        for number, part in enumerate(parts(failed)):
+            if number:
+                yield from wanted.pause(self.cache)
+            for cell in part:
+                short = cell.holders is UNNAMED
+                answer.failed.append(msgspec.structs.replace(cell, holders=tuple(holders)) if short else cell)
+            answer.pack()

@@ -204,7 +204,7 @@ class MapQueries:
         state = "resident" if self.cache.is_current(resident) else "stale"
         if resident.name in self.cache.ledger.retired:
             state = "zombie"
-        holders = self.cache.holders.of([resident])
+        holders = self.cache.holders.of(resident)
         return messages.ShownSegment(
             resident.key.layer, resident.version, resident.name, state, resident.nbytes, resident.points,
             holders,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmmap.protocol.codec import decode_reply, encode, encode_cells, encode_handle
+from shmmap.protocol.codec import PackedArray, decode_reply, encode, encode_cells, encode_handle
 from shmmap.protocol.messages import Cells, FailedCell, Handle, Holder, PendingCell
 
 numbers = st.integers(0, (1 << 64) - 1)
@@ -46,9 +46,11 @@ def test_any_content(
     whole = Cells(
         *ids, tuple(cells), tuple(removed), packed, tuple(pending), tuple(failures), tuple(layers), covered
     )
+    halves = PackedArray(failures[:7])
+    halves.add(failures[7:])
     parts = encode_cells(
-        *ids, [encode_handle(h) for h in cells], tuple(removed), packed, pending, failures,
-        tuple(layers), covered,
+        *ids, [encode_handle(h) for h in cells], tuple(removed), packed,
+        tuple(layers), covered, PackedArray(pending), halves,
     )  # fmt: skip
     assert parts == encode(whole)
     assert decode_reply(parts) == whole
@@ -58,14 +60,22 @@ def test_any_content(
 def test_any_number_of_handles(count: int) -> None:
     """The head of a MessagePack array has one byte, three or five."""
     handle = Handle("a.pcd", 1, "points", "0" * 16, 0, 4096, 10, 0.0, 0.0, 20.0, 20.0)
-    parts = encode_cells(1, 2, 3, [encode_handle(handle)] * count, (), b"", [], [], ())
+    parts = encode_cells(1, 2, 3, [encode_handle(handle)] * count, (), b"", ())
     assert parts == encode(Cells(1, 2, 3, (handle,) * count))
 
 
 @pytest.mark.parametrize("count", [0, 15, 16, 65535, 65536])
 def test_any_number_of_removed_ids(count: int) -> None:
     removed = ("x",) * count
-    assert encode_cells(1, 2, 3, [], removed, b"", [], [], ()) == encode(Cells(1, 2, 3, (), removed))
-    assert encode_cells(1, 2, 3, [], (), bytes(count), [], [], ()) == encode(
-        Cells(1, 2, 3, (), (), bytes(count))
-    )
+    assert encode_cells(1, 2, 3, [], removed, b"", ()) == encode(Cells(1, 2, 3, (), removed))
+    assert encode_cells(1, 2, 3, [], (), bytes(count), ()) == encode(Cells(1, 2, 3, (), (), bytes(count)))
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65535, 65536])
+@pytest.mark.parametrize("at_once", [1, 16, 64])
+def test_an_array_in_parts(count: int, at_once: int) -> None:
+    array = PackedArray()
+    for begin in range(0, count, at_once):
+        array.add([begin] * min(at_once, count - begin))
+    whole = [number // at_once * at_once for number in range(count)]
+    assert bytes(array) == encode(whole)

@@ -11,7 +11,14 @@ import pytest
 
 from shmmap.protocol import events as e
 from shmmap.protocol import messages as m
-from shmmap.protocol.codec import decode_reply, decode_request, encode, encode_cells, encode_handle
+from shmmap.protocol.codec import (
+    PackedArray,
+    decode_reply,
+    decode_request,
+    encode,
+    encode_cells,
+    encode_handle,
+)
 from tests.support.message_pack import pack, unpack
 
 U64 = 2**64 - 1
@@ -358,11 +365,11 @@ def test_a_reply_put_together_from_packed_handles_is_the_same_bytes(count: int) 
         (m.FailedCell("d", "points", "x", "y"),), ("points", "voxel(leaf=1.0)"), False,
     )  # fmt: skip
     together = encode_cells(
-        4, U64, 5, [encode_handle(HANDLE)] * count, whole.removed, whole.removed_packed, whole.pending,
-        whole.failed, whole.layers, whole.covered,
+        4, U64, 5, [encode_handle(HANDLE)] * count, whole.removed, whole.removed_packed,
+        whole.layers, whole.covered, PackedArray(whole.pending), PackedArray(whole.failed),
     )  # fmt: skip
     assert together == encode(whole)
-    assert encode_cells(4, 3, 5, [], (), b"", (), (), ()) == encode(m.Cells(4, 3, 5))
+    assert encode_cells(4, 3, 5, [], (), b"", ()) == encode(m.Cells(4, 3, 5))
 
 
 def test_a_reply_of_a_daemon_older_than_1_3() -> None:

@@ -5,9 +5,16 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
+import pytest
+
+from shmmap.daemon.cache.holders import Holders
+from shmmap.daemon.cache.reclaimer import LOOKS_AT_ONCE
 from shmmap.daemon.loading.scheduler import LOOKS_A_PUMP
+from shmmap.daemon.records import Key, Resident
 from shmmap.protocol.messages import (
     Area,
     CircleMessage,
@@ -191,5 +198,37 @@ def test_very_many_refusals_are_told_some_a_turn(inner: Inner, tmp_path: Path) -
         one.scheduler.pump(one.now_s())
         left.append(len(one.loads))
         assert one.scheduler.next_event_s() == 0.0 or not left[-1]
-    assert left == [*range(144, 0, -LOOKS_A_PUMP), 0]
+    assert all(0 < before - after <= LOOKS_A_PUMP for before, after in pairwise(left))
     assert {failed.code for failed in one.cells_of(1).failed} == {"over_budget"}
+
+
+def test_who_has_the_memory_is_found_out_some_a_turn(
+    inner: Inner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many segments there are; and it is said beside each cell that there is none for."""
+    made = make_map(tmp_path / "many", columns=12, rows=12, points=5)
+    one = inner(str(made.root))
+    one.everything()
+    gone = one.ledger.by_key[Key(one.cache.catalogue.id(0), "points")]
+    one.reclaimer.retire(gone, one.now_s() - 1.0)
+    one.run_until(lambda: gone.name not in one.ledger.retired)
+    one.ledger.overhead_bytes = one.ledger.budget_bytes
+    looked: list[str] = []
+    users = one.cache.holders.users_among
+
+    def noted(resident: Resident, slots: Sequence[int]) -> list[int]:
+        looked.append(resident.name)
+        return users(resident, slots)
+
+    monkeypatch.setattr(Holders, "users_among", lambda _self, *told: noted(*told))
+    one.hold_answers = True
+    one.ask(one.session("asks"), Area(2, EVERYWHERE, wait=300.0))
+    one.run_until(lambda: one.due)
+    turns = []
+    for _ in one.due.pop(0):
+        turns.append(len(looked))
+        looked.clear()
+    assert sum(turns) + len(looked) == 143
+    assert max(turns) == LOOKS_AT_ONCE
+    (failed,) = one.cells_of(2).failed
+    assert (failed.code, failed.holders) == ("over_budget", ()), "nobody maps anything"
