@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A long life with clients that wander, come, go, stop and die, on a map that changes: does anything grow?
 
-    python -m tests.benchmarks.soak [--minutes 10] [--clients 16] [--seed 1]
+    python -m tests.benchmarks.soak [--minutes 10] [--pace 8] [--clients 16] [--seed 1]
 
-Samples the daemon's resident memory, descriptors, threads, its loaders' memory, the names and the
+On an ordinary day each client asks every 0.4 s, and every 8 s something happens to one of them, to the map or
+to a loader; all of that comes ``--pace`` times as fast: an hour is a working day of eight.
+
+Samples the daemon's resident memory, descriptors, threads, sessions, its loaders' memory, the names and the
 bytes in its shared-memory directory (a tmpfs of its own where this user may mount one: then bytes
 without a name count, too).  The first third is for warming up.  Judged are: bytes within the budget at every
 sample, no client that saw a byte change, and for every series that the median of the last fifth is not
@@ -29,6 +32,7 @@ from pathlib import Path
 import numpy as np
 
 import shmmap
+from shmmap.statistics.reader import read_statistics
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
 
@@ -38,8 +42,16 @@ CELLS = 20
 POINTS = 8000
 BUDGET = 24 << 20
 SAMPLE_S = 0.25
-EVENT_S = 1.0
-ALLOWANCES = {"rss_kib": 6 << 10, "loaders_kib": 24 << 10, "descriptors": 24, "threads": 0, "names": 40}
+EVENT_S = 8.0
+PAUSE_S = 0.4
+ALLOWANCES = {
+    "rss_kib": 6 << 10,
+    "loaders_kib": 24 << 10,
+    "descriptors": 24,
+    "threads": 0,
+    "sessions": 8,
+    "names": 40,
+}
 
 
 @contextmanager
@@ -69,12 +81,15 @@ def status(pid: int) -> tuple[int, int]:
 class Soak:
     """The daemon, its clients, and what was seen of them."""
 
-    def __init__(self, one: DaemonProcess, made: DividedMap, clients: int, seed: int, tmpfs: bool) -> None:
+    def __init__(
+        self, one: DaemonProcess, made: DividedMap, clients: int, seed: int, tmpfs: bool, pace: float
+    ) -> None:
         self.one = one
         self.made = made
         self.random = random.Random(seed)
         self.points = np.random.default_rng(seed)
         self.tmpfs = tmpfs
+        self.pace = pace
         self.numbers = 0
         self.clients: list[subprocess.Popen[bytes]] = []
         self.stopped: set[int] = set()
@@ -90,7 +105,9 @@ class Soak:
         self.numbers += 1
         command = [sys.executable, "-m", "tests.support.wandering_client", self.one.endpoint]
         half = CELLS * self.made.size / 2
-        self.clients.append(subprocess.Popen([*command, str(self.numbers), str(half)], cwd=ROOT))
+        self.clients.append(
+            subprocess.Popen([*command, str(self.numbers), str(half), str(PAUSE_S / self.pace)], cwd=ROOT)
+        )
 
     def sample(self) -> None:
         """Look at everything once."""
@@ -99,6 +116,7 @@ class Soak:
         loaders = sum(status(pid)[0] for pid in self.one.children())
         names = os.listdir(self.one.shm_dir)
         seen = {
+            "sessions": read_statistics(self.one.instance, self.one.shm_dir).counters["sessions"],
             "rss_kib": rss, "threads": threads, "loaders_kib": loaders, "names": len(names),
             # retired segments that are still mapped are kept open, and are not what could leak
             "descriptors": len(os.listdir(f"/proc/{self.one.pid}/fd"))
@@ -175,7 +193,7 @@ class Soak:
         while (now_s := time.monotonic()) < end_s:
             self.sample()
             if now_s >= event_s:
-                event_s = now_s + EVENT_S
+                event_s = now_s + EVENT_S / self.pace
                 self.event()
             time.sleep(SAMPLE_S)
 
@@ -209,6 +227,7 @@ def main() -> int:
     """Print one line of JSON; 1 if something grew or went wrong."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--pace", type=float, default=8.0)
     parser.add_argument("--clients", type=int, default=16)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
@@ -217,7 +236,7 @@ def main() -> int:
         one = DaemonProcess(made.root, "--budget", str(BUDGET), "--workers", "2", shm_dir=tmpfs)
         try:
             one.start()
-            soak = Soak(one, made, options.clients, options.seed, tmpfs is not None)
+            soak = Soak(one, made, options.clients, options.seed, tmpfs is not None, options.pace)
             try:
                 soak.run(options.minutes * 60)
             finally:
@@ -234,6 +253,7 @@ def main() -> int:
         json.dumps(
             {
                 "minutes": options.minutes,
+                "pace": options.pace,
                 "samples": soak.samples,
                 "events": soak.events,
                 "clients_killed": soak.deaths,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process that wanders over a map for ever, holding what is around it, and ends if a byte ever changes.
 
-As a program: ``python -m tests.support.wandering_client ENDPOINT SEED HALF_SIZE``.
+As a program: ``python -m tests.support.wandering_client ENDPOINT SEED HALF_SIZE PAUSE_S``.
 """
 
 from __future__ import annotations
@@ -13,15 +13,13 @@ import zlib
 
 __all__ = ["main"]
 
-PAUSE_S = 0.05
-
 
 def main() -> None:
     """Wander until killed."""
     import shmmap
 
     rng = random.Random(int(sys.argv[2]))
-    half = float(sys.argv[3])
+    half, pause_s = float(sys.argv[3]), float(sys.argv[4])
     while True:
         x, y = rng.uniform(-half, half), rng.uniform(-half, half)
         radius = rng.uniform(5.0, half / 3)
@@ -47,7 +45,7 @@ def main() -> None:
                     assert failure.code in ("over_budget", "no_space", "load_failed"), failure
                 del reply
                 cell = None  # type: ignore[assignment]
-                time.sleep(rng.expovariate(1 / PAUSE_S))
+                time.sleep(rng.expovariate(1 / pause_s))
             while held:
                 _check(*held.popitem()[1])
 
