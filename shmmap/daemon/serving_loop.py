@@ -125,6 +125,8 @@ class ServingLoop:
         self._breathe()
         self._look_after_the_rest(time.monotonic())
         self._breathe()
+        self._guarded("memory", self.scheduler.free, time.monotonic())
+        self._breathe()
         self._guarded("memory", self.scheduler.pump, time.monotonic())
         self._guarded("memory", self.cache.tell_all)
 

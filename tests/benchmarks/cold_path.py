@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells that are not in memory yet: how long clients wait for them.
 
-    python -m tests.benchmarks.cold_path [cell window] [--against ../other] [--pairs 20]
+    python -m tests.benchmarks.cold_path [cell step window] [--against ../other] [--pairs 20] [--shm-dir DIR]
 
 - ``cell``: one cold cell of 1 MB, from the request to its attached view; the loaders run already.
+- ``step``: two such cells at once.
 - ``window``: four consumers need the same 120 MB as soon as a daemon is READY, until the last one has read
   all points; against four that read the files into memory of their own.  Shown twice: as it is, and with the
   processor time that the loaders' processes had used before READY added.
 
+``--shm-dir`` is where segments lie: for huge pages a tmpfs mounted with ``huge=within_size``.
+
 With ``--against``, another checkout (see `tests.benchmarks.two_versions`) takes turns.  Printed are medians,
-and medians of the paired ratios.  Limits: the window in 0.65 of private copies on 4 KiB pages; a cell in
-3.5 ms, and in 0.8 of the time of version 0.2.0.
+and medians of the paired ratios.  Limits: the window in 0.65 of private copies on 4 KiB pages, 0.5 on huge
+ones; a cell in 3.5 ms, and in 0.8 of the time of version 0.2.0; a step in 5 ms on huge pages.
 """
 
 from __future__ import annotations
@@ -35,7 +38,8 @@ _CELL = """
 import sys, time
 import shmmap
 from tests.support.daemon_process import DaemonProcess
-one = DaemonProcess(sys.argv[1], "--budget", "1G").start()
+one = DaemonProcess(sys.argv[1], "--budget", "1G", shm_dir=sys.argv[2] or None).start()
+count = int(sys.argv[3])
 client = shmmap.connect(one.endpoint)
 names = [cell.id for cell in client.around(0, 0, radius=500)]
 print("up", flush=True)
@@ -44,13 +48,13 @@ for line in sys.stdin:
     while client.stats().counters["zombies"]:
         pass
     took = []
-    for name in names[:20]:
+    for first in range(20):
         before = time.perf_counter()
-        found = client.selected([name])
-        xyz = found[0].xyz
+        found = client.selected(names[count * first : count * (first + 1)])
+        clouds = [cell.xyz for cell in found]
         took.append(time.perf_counter() - before)
-        assert xyz.shape == (62500, 3)
-        del found, xyz
+        assert [cloud.shape for cloud in clouds] == [(62500, 3)] * count
+        del found, clouds
     print(sorted(took)[len(took) // 2] * 1e3, flush=True)
 client.close()
 one.stop()
@@ -112,7 +116,7 @@ for line in sys.stdin:
     if line.strip() == "private":
         print(json.dumps([served(waiting, "private"), 0.0]), flush=True)
         continue
-    one = DaemonProcess(sys.argv[1], "--budget", "1G").start()
+    one = DaemonProcess(sys.argv[1], "--budget", "1G", shm_dir=sys.argv[3] or None).start()
     before_s = sum(map(cpu_s, one.children()))
     took = served(waiting, one.endpoint)
     one.stop()
@@ -152,10 +156,10 @@ def ratio(some: list[float], others: list[float]) -> float:
     return statistics.median(mine / other for mine, other in zip(some, others, strict=True))
 
 
-def cold_cell(folder: Path, checkouts: list[Path], pairs: int) -> None:
-    """Measure and print how long one cold cell takes."""
+def cold_cells(folder: Path, checkouts: list[Path], pairs: int, shm_dir: str, count: int) -> None:
+    """Measure and print how long one cold cell takes, or two at once."""
     made = make_map(folder / "cells", columns=8, rows=8, points=POINTS)
-    programs = [Measuring(checkout, _CELL, str(made.root)) for checkout in checkouts]
+    programs = [Measuring(checkout, _CELL, str(made.root), shm_dir, str(count)) for checkout in checkouts]
     times: list[list[float]] = [[] for _ in checkouts]
     for number in range(pairs + 1):
         for at in range(len(programs))[:: -1 if number % 2 else 1]:
@@ -164,17 +168,18 @@ def cold_cell(folder: Path, checkouts: list[Path], pairs: int) -> None:
                 times[at].append(found)
     for program in programs:
         program.close()
-    print(f"one cold cell of 1 MB, medians of {pairs} times 20 (limit 3.5 ms, 0.8 of 0.2.0)")
+    limit = "3.5 ms, 0.8 of 0.2.0" if count == 1 else "5 ms on huge pages"
+    print(f"cold cells of 1 MB, {count} at once, medians of {pairs} times 20 (limit {limit})")
     for checkout, values in zip(checkouts, times, strict=True):
         line = f"  {statistics.median(values):6.2f} ms  least {min(values):5.2f}"
         line += f"  {ratio(times[0], values):5.2f} of it here" if checkout != ROOT else "  here"
         print(f"{line}  {checkout}")
 
 
-def first_window(folder: Path, checkouts: list[Path], pairs: int) -> None:
+def first_window(folder: Path, checkouts: list[Path], pairs: int, shm_dir: str) -> None:
     """Measure and print how long the first window of four consumers takes."""
     made = make_map(folder / "window", columns=12, rows=10, points=POINTS)
-    programs = [Measuring(checkout, _WINDOW, str(made.root), _CONSUMER) for checkout in checkouts]
+    programs = [Measuring(checkout, _WINDOW, str(made.root), _CONSUMER, shm_dir) for checkout in checkouts]
     shared: list[list[tuple[float, float]]] = [[] for _ in checkouts]
     private: list[float] = []
     for number in range(pairs + 1):
@@ -186,7 +191,7 @@ def first_window(folder: Path, checkouts: list[Path], pairs: int) -> None:
                 values.append((took, took + before))
     for program in programs:
         program.close()
-    print(f"first window of 120 MB, four consumers, medians of {pairs} (limit 0.65)")
+    print(f"first window of 120 MB, four consumers, medians of {pairs} (limit 0.65, on huge pages 0.5)")
     print(f"  {statistics.median(private):6.3f} s  private copies")
     for checkout, found in zip(checkouts, shared, strict=True):
         took, whole = [list(values) for values in zip(*found, strict=True)]
@@ -199,18 +204,20 @@ def first_window(folder: Path, checkouts: list[Path], pairs: int) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("what", nargs="*", default=["cell", "window"], metavar="cell window")
+    parser.add_argument("what", nargs="*", default=["cell", "step", "window"], metavar="cell step window")
     parser.add_argument("--against", type=Path, help="another checkout")
+    parser.add_argument("--shm-dir", default="", help="where segments lie (default: a directory in /dev/shm)")
     parser.add_argument("--pairs", type=int, default=20)
     args = parser.parse_args()
     checkouts = [ROOT, *([args.against.resolve()] if args.against else [])]
     print(f"load {os.getloadavg()[0]:.1f}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if "cell" in args.what:
-            cold_cell(folder, checkouts, args.pairs)
+        for count, what in enumerate(("cell", "step"), 1):
+            if what in args.what:
+                cold_cells(folder / what, checkouts, args.pairs, args.shm_dir, count)
         if "window" in args.what:
-            first_window(folder, checkouts, max(3, args.pairs // 3))
+            first_window(folder, checkouts, max(3, args.pairs // 3), args.shm_dir)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A warm differential request against a bare ZeroMQ echo of equal sizes, and while cells load.
+"""A warm differential request against a bare ZeroMQ echo of equal sizes.
 
     python -m tests.benchmarks.warm_request [--rounds 40] [--pin]
 
@@ -26,7 +26,7 @@ import zmq
 
 from shmmap.protocol.codec import decode_reply
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.divided_map import make_map
 from tests.support.message_pack import pack
 from tests.support.raw_client import RawClient, pack_versions
 
@@ -86,39 +86,44 @@ def pin(pid: int, processors: set[int]) -> None:
         os.sched_setaffinity(int(thread), processors)
 
 
-def heavy_cells(made: DividedMap, count: int, points: int) -> list[str]:
-    """Add cells far away whose loading is work."""
-    rng = np.random.default_rng(9)
-    names = []
-    for number in range(count):
-        corner = (10_000 + 20 * number, 0)
-        name = f"heavy_{number}.pcd"
-        made.write_cell(name, corner, random_points(rng, corner, points))
-        names.append(name)
-    made.write_metadata()
-    return names
+class Warm:
+    """A client that holds 256 cells, and its requests that bring 40 new ones and take 40 away.
 
+    Parameters
+    ----------
+    one
+        The daemon; has all cells around the place in memory afterwards.
+    x, y
+        Corner of a cell in the middle of at least 18 x 18 cells of 20 m.
+    """
 
-def while_loading(
-    one: DaemonProcess, client: RawClient, request: bytes, loader: RawClient, heavy: list[str], passes: int
-) -> list[float]:
-    """Round trips of warm requests, timed only while cold cells are being loaded for somebody else."""
-    times: list[float] = []
-    for number in range(passes + 1):
-        cold = loader.send("selected", heavy, ["points"], 60.0)
-        while not loader.readable():
-            start = time.perf_counter()
-            client.send_bytes(request)
-            client.receive_bytes()
-            if number:  # the first pass also starts the loaders
-                times.append((time.perf_counter() - start) * 1e6)
-        reply = loader.cells_reply(loader.wait_for(cold))
-        assert len(reply.cells) == len(heavy), reply.failed
-        loader.release()
-        loader.ask("evict", heavy)
-        while any(name.endswith(".zombie") for name in one.segments()):
-            loader.ask("stats")  # a cell asked for again before it is freed is only put back in service
-    return times
+    def __init__(self, one: DaemonProcess, x: float = 0.0, y: float = 0.0) -> None:
+        self.client = RawClient(one.endpoint, timeout=120.0)
+        area = ["box", x - 159.0, y - 159.0, x + 159.0, y + 159.0]  # 16 x 16 cells
+        inside = self.client.area(area).cells
+        around = self.client.area(["box", x - 179.0, y - 179.0, x + 179.0, y + 179.0]).cells
+        assert len(inside) == HELD
+        outside = [h for h in around if h.id not in {i.id for i in inside}]
+        held = inside[:: HELD // NEW][:NEW]
+        held = [h for h in inside if h not in held] + outside[:NEW]
+        assert len(held) == HELD
+        rows = [[h.id.removeprefix(self.client.id_prefix), h.version] for h in held]
+        versions = pack_versions([h.version for h in held])
+        self.requests = {
+            "named": pack(["differential", 1, area, ["points"], rows, b"", 10.0]),
+            "packed": pack(["differential", 1, area, ["points"], [], versions, 10.0]),
+        }
+        self.sizes = {}
+        for name, request in self.requests.items():
+            self.client.send_bytes(request)
+            reply = self.client.cells_reply(self.client.receive())
+            assert len(reply.cells) == NEW, reply.pending
+            assert len(reply.removed or reply.removed_versions) == NEW
+            self.sizes[name] = (len(request), reply.wire_bytes)
+
+    def echo(self, one: DaemonProcess, name: str) -> Echo:
+        """Return an echo of messages as long as those of a kind of request."""
+        return Echo(f"{one.runtime_dir}/echo-{name}.sock", *self.sizes[name])
 
 
 def main() -> None:
@@ -127,36 +132,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=40)
-    parser.add_argument("--passes", type=int, default=6)
     parser.add_argument("--pin", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
-        heavy = heavy_cells(made, 60, 60_000)
         one = DaemonProcess(made.root, "--budget", "2G").start()
-        client, loader = RawClient(one.endpoint), RawClient(one.endpoint)
-        area = ["box", -159.0, -159.0, 159.0, 159.0]  # 16 x 16 cells
-        inside = client.area(area).cells
-        everything = client.area(["box", -300.0, -300.0, 300.0, 300.0]).cells
-        assert len(inside) == HELD
-        assert len(everything) == 400
-        outside = [h for h in everything if h.id not in {i.id for i in inside}]
-        held = inside[:: HELD // NEW][:NEW]
-        held = [h for h in inside if h not in held] + outside[:NEW]
-        assert len(held) == HELD
-        rows = [[h.id.removeprefix(client.id_prefix), h.version] for h in held]
-        named = pack(["differential", 1, area, ["points"], rows, b"", 10.0])
-        packed = pack(
-            ["differential", 1, area, ["points"], [], pack_versions([h.version for h in held]), 10.0]
-        )
-        sizes = {}
-        for name, request in (("named", named), ("packed", packed)):
-            client.send_bytes(request)
-            reply = client.cells_reply(client.receive())
-            assert len(reply.cells) == NEW
-            assert len(reply.removed or reply.removed_versions) == NEW
-            sizes[name] = (len(request), reply.wire_bytes)
-        echoes = {n: Echo(f"{one.runtime_dir}/echo-{n}.sock", *sizes[n]) for n in sizes}
+        warm = Warm(one)
+        sizes = warm.sizes
+        echoes = {name: warm.echo(one, name) for name in sizes}
         if arguments.pin:
             first, *others = sorted(os.sched_getaffinity(0))
             pin(os.getpid(), {first})
@@ -165,22 +148,18 @@ def main() -> None:
         times: dict[str, list[float]] = {}
         try:
             for _ in range(arguments.rounds):
-                for name, request in (("named", named), ("packed", packed)):
+                for name, request in warm.requests.items():
                     times.setdefault(f"echo {name}", []).extend(
                         time_block(echoes[name].socket, echoes[name].request)
                     )
-                    times.setdefault(f"shmmap {name}", []).extend(time_block(client.socket, request))
+                    times.setdefault(f"shmmap {name}", []).extend(time_block(warm.client.socket, request))
                     times.setdefault(f"shmmap {name}, decoded", []).extend(
-                        time_block(client.socket, request, decode=True)
+                        time_block(warm.client.socket, request, decode=True)
                     )
-            times["shmmap packed, loading"] = while_loading(
-                one, client, packed, loader, heavy, arguments.passes
-            )
         finally:
             for echo in echoes.values():
                 echo.close()
-            client.close()
-            loader.close()
+            warm.client.close()
             one.stop()
             one.dispose()
     print(f"named: {sizes['named'][0]} bytes asked, {sizes['named'][1]} answered;", end=" ")
@@ -189,14 +168,13 @@ def main() -> None:
     for name, values in times.items():
         kind = "packed" if "packed" in name else "named"
         p50, p99 = np.percentile(values, [50, 99])
-        line = f"{name:34} p50 {p50:7.1f} us  p99 {p99:8.1f} us  n={len(values):6}"
-        if "loading" not in name:
-            # blocks that were timed next to each other: what disturbs one disturbs the other
-            blocks = [np.median(np.reshape(times[n], (-1, BLOCK)), axis=1) for n in (name, f"echo {kind}")]
-            line += f"  p50 is {np.median(blocks[0] / blocks[1]):.2f} x echo (median of paired blocks)"
-        print(line)
-    idle, busy = (np.percentile(times[n], 99) for n in ("shmmap packed", "shmmap packed, loading"))
-    print(f"p99 while cells load: {busy / idle:.2f} x idle")
+        # blocks that were timed next to each other: what disturbs one disturbs the other
+        blocks = [np.median(np.reshape(times[n], (-1, BLOCK)), axis=1) for n in (name, f"echo {kind}")]
+        ratio = np.median(blocks[0] / blocks[1])
+        print(
+            f"{name:34} p50 {p50:7.1f} us  p99 {p99:8.1f} us  n={len(values):6}"
+            f"  p50 is {ratio:.2f} x echo (median of paired blocks)"
+        )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ __all__ = ["Heights", "WarmIndex"]
 TABLES_BYTES: Final = 64 << 20
 """A table takes 8 bytes for every cell of the map, as far as they are in memory; so much for all of them."""
 LEAST_TABLES: Final = 4
-RETIRED_REMEMBERED: Final = 1 << 16
+RETIRED_REMEMBERED: Final = 1 << 14
 """Versions out of service; who holds an older one is told to drop it, as if the daemon had been restarted."""
 
 

@@ -6,6 +6,7 @@ The same idea as the ghost lists of ARC (Megiddo and Modha, FAST 2003), used for
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Final
 
 from shmmap.daemon.records import Key
@@ -19,7 +20,7 @@ class EvictionHistory:
     """The last keys that were evicted to make room, at most 16384 of them."""
 
     def __init__(self) -> None:
-        self._versions: dict[Key, int] = {}
+        self._versions: OrderedDict[Key, int] = OrderedDict()  # a dict finds its oldest one slowly
 
     def __len__(self) -> int:
         return len(self._versions)
@@ -29,7 +30,7 @@ class EvictionHistory:
         self._versions.pop(key, None)
         self._versions[key] = version
         if len(self._versions) > LIMIT:
-            del self._versions[next(iter(self._versions))]
+            self._versions.popitem(last=False)
 
     def loaded(self, key: Key, version: int) -> bool:
         """Whether a load brought back just what had been evicted to make room."""

@@ -11,6 +11,7 @@ is queued.
 from __future__ import annotations
 
 import heapq
+from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
@@ -158,7 +159,7 @@ class Loads:
         self._ledger = ledger
         self.by_key: dict[Key, Load] = {}
         self.failures: dict[Key, Failure] = {}
-        self._keys_failed: dict[str, dict[Key, None]] = {}  # by code, those that failed longest ago first
+        self._keys_failed: dict[str, OrderedDict[Key, None]] = {}  # by code, oldest first
         self._queue = LoadQueue()
         self._numbers = 0
 
@@ -254,12 +255,11 @@ class Loads:
 
     def _remember(self, key: Key, failure: Failure) -> None:
         self.failures[key] = failure
-        keys = self._keys_failed.setdefault(failure.code, {})
+        keys = self._keys_failed.setdefault(failure.code, OrderedDict())
         keys.pop(key, None)
         keys[key] = None
         if len(keys) > MOST_FAILURES:
-            oldest = next(iter(keys))
-            del keys[oldest]
+            oldest, _ = keys.popitem(last=False)
             self._forget_failure(oldest, failure.code)
 
     def cancel(self, key: Key) -> None:

@@ -35,8 +35,7 @@ from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
-LOOKS_A_PUMP: Final = 16
-HAND_OUT_S: Final = 0.0005
+LOOKS_A_PUMP, HAND_OUT_S = 16, 0.0005
 """Loads that one `pump` hands out or finds to be of no use any more, and time of the processor for that."""
 
 
@@ -45,8 +44,6 @@ class Scheduler:
 
     Parameters
     ----------
-    pool
-        The workers.
     clock
         The serving loop's clock, seconds.
 
@@ -114,11 +111,14 @@ class Scheduler:
 
     # --- handing out jobs -----------------------------------------------------------------------
 
-    def pump(self, now_s: float) -> None:
-        """Free what is due, hand queued loads to workers as far as memory and workers allow."""
+    def free(self, now_s: float) -> None:
+        """Free what is due: what was refused for lack of memory may fit now."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.forget_refusals()
         self._cache.look_for_some(now_s)
+
+    def pump(self, now_s: float) -> None:
+        """Hand queued loads to workers as far as memory and workers allow."""
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
         self._drop_some()
@@ -170,7 +170,7 @@ class Scheduler:
             load.adopted = None  # it was retired before its turn came
             if not load.wanted:
                 return None
-            load.estimate = self._cache.estimate(index, load.key.layer)
+            load.estimate = cache.estimate(index, load.key.layer)
         layer = load.key.layer
         around = cache.layers.neighbours(index, layer)
         load.sources = tuple(map(catalogue.stamp, (index, *around)))
@@ -198,11 +198,11 @@ class Scheduler:
         self.loads.forget_refusals()
 
     def next_event_s(self) -> float:
-        """When `pump` has something to do although nothing arrives; infinity for never."""
+        """When there is something to do although nothing arrives; infinity for never."""
         if self._doubtful or self._unfinished:
             return 0.0
-        cache = self._cache
-        return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())
+        sweep_s, room_s = self._cache.reclaimer.next_sweep_s(), self._cache.evictor.wake_s
+        return min(sweep_s, room_s, self.pool.next_deadline_s())
 
     # --- what workers say -----------------------------------------------------------------------
 

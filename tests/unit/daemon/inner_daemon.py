@@ -163,6 +163,7 @@ class InnerDaemon:
         now_s = self.now_s()
         self.scheduler.lost.end_overdue(now_s)
         self.cache.survey.turn(now_s)
+        self.scheduler.free(now_s)
         self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
         self.map_switch.turn(now_s)

@@ -90,7 +90,7 @@ def test_turns_are_measured(inner: Inner, small_map: DividedMap) -> None:
     read, write = os.pipe()
     one.watched.watch(read, compute, "loaders")
     nothing: Any = SimpleNamespace(
-        pump=lambda _now_s: None, tell_all=lambda: None,
+        free=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None,
         end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
     )  # fmt: skip
     nothing.lost = nothing

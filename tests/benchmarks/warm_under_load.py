@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warm requests while cells load and while others give way, in a full cache, and with very many segments.
+
+    python -m tests.benchmarks.warm_under_load [--passes 6] [--rounds 40] [--many 100000]
+
+The request is the packed one of `tests.benchmarks.warm_request`.
+
+- While 60 cells of 1 MB load for somebody else, and while cells load for which others have to give way: round
+  trips to the daemon and to a bare ZeroMQ echo in turn, so that both meet the same loads.  Printed are the
+  99th percentiles and how many took longer than 1 ms, a pass.  Limit: twice the echo's, and no more stalls.
+- Cache: in a daemon whose budget is full, against one that has room, in alternating rounds.  Limit: 1.1.
+- Segments: in a daemon with ``--many`` of them, against one with 1000.  Limit: 1.2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import zmq
+
+from tests.benchmarks.make_many_cells import make_many_cells
+from tests.benchmarks.warm_request import Echo, Warm, time_block
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.raw_client import RawClient
+
+__all__ = ["main"]
+
+LOADED = 60
+GIVING_WAY = 400
+STALL_US = 1000.0
+
+
+def heavy_cells(made: DividedMap, count: int, points: int, y: int) -> list[str]:
+    """Add cells far away whose loading is work."""
+    rng = np.random.default_rng(9)
+    names = []
+    for number in range(count):
+        corner = (10_000 + 20 * number, y)
+        name = f"heavy_{y}_{number}.pcd"
+        made.write_cell(name, corner, random_points(rng, corner, points))
+        names.append(name)
+    made.write_metadata()
+    return names
+
+
+class Meanwhile:
+    """Round trips of requests and of echoes in turn, microseconds."""
+
+    def __init__(self, warm: Warm, echo: Echo) -> None:
+        self._sockets: list[tuple[zmq.Socket[bytes], bytes]] = [
+            (warm.client.socket, warm.requests["packed"]),
+            (echo.socket, echo.request),
+        ]
+        self.times: tuple[list[float], list[float]] = ([], [])
+
+    def until(self, loader: RawClient, *, noted: bool = True) -> None:
+        """Until somebody has an answer; the loads that it waits for are under way."""
+        while not loader.readable():
+            for (socket, request), times in zip(self._sockets, self.times, strict=True):
+                start = time.perf_counter()
+                socket.send(request)
+                socket.recv()
+                if noted:
+                    times.append((time.perf_counter() - start) * 1e6)
+
+    def told(self, what: str, passes: int) -> None:
+        """Print it."""
+        ours, echo = (float(np.percentile(times, 99)) for times in self.times)
+        stalls, echoed = (sum(one > STALL_US for one in times) / passes for times in self.times)
+        print(
+            f"{what}: p99 {ours:.0f} us, echo {echo:.0f}: {ours / echo:.2f} x;"
+            f" over 1 ms a pass {stalls:.1f}, echo {echoed:.1f}; n={len(self.times[0])}",
+            flush=True,
+        )
+
+
+def while_loading(one: DaemonProcess, meanwhile: Meanwhile, heavy: list[str], passes: int) -> None:
+    """Time requests while cold cells are being loaded for somebody else."""
+    with RawClient(one.endpoint, timeout=120.0) as loader:
+        for number in range(passes + 1):
+            cold = loader.send("selected", heavy, ["points"], 60.0)
+            meanwhile.until(loader, noted=number > 0)  # the first pass also starts the loaders
+            reply = loader.cells_reply(loader.wait_for(cold))
+            assert len(reply.cells) == len(heavy), reply.failed
+            loader.release()
+            loader.ask("evict", heavy)
+            while any(name.endswith(".zombie") for name in one.segments()):
+                loader.ask("stats")  # a cell asked for again before it is freed is only put back in service
+
+
+def while_others_give_way(one: DaemonProcess, meanwhile: Meanwhile, cells: Iterator[str], passes: int) -> int:
+    """Time requests while cells are loaded for which others have to give way; returns how many gave way."""
+    with RawClient(one.endpoint, timeout=120.0) as loader:
+        before = loader.ask("stats")[4]["evictions"]
+        for _ in range(passes):
+            for _ in range(LOADED // 10):
+                cold = loader.send("selected", list(itertools.islice(cells, 10)), ["points"], 60.0)
+                meanwhile.until(loader)
+                assert len(loader.cells_reply(loader.wait_for(cold)).cells) == 10
+                loader.release()
+        evicted: int = loader.ask("stats")[4]["evictions"] - before
+        return evicted
+
+
+def compared(what: str, first: Warm, second: Warm, rounds: int) -> None:
+    """Print how much longer the second one's requests take."""
+    blocks: tuple[list[float], list[float]] = ([], [])
+    for _ in range(rounds):
+        for warm, medians in zip((first, second), blocks, strict=True):
+            medians.append(float(np.median(time_block(warm.client.socket, warm.requests["packed"]))))
+    ratio = np.median(np.divide(blocks[1], blocks[0]))
+    p50 = [np.median(medians) for medians in blocks]
+    print(
+        f"{what}: p50 {p50[1]:.1f} us against {p50[0]:.1f}: {ratio:.3f} x (median of paired blocks)",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--passes", type=int, default=6)
+    parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--many", type=int, default=100_000)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory, ExitStack() as stack:
+
+        def served(path: Path, *flags: str) -> DaemonProcess:
+            one = DaemonProcess(path, *flags)
+            stack.callback(one.dispose)
+            one.start()
+            stack.callback(one.stop)
+            return one
+
+        made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
+        heavy = heavy_cells(made, LOADED, 60_000, 0)
+        others = heavy_cells(made, GIVING_WAY, 10_000, 1000)
+        roomy, full = served(made.root, "--budget", "2G"), served(made.root, "--budget", "24M")
+        of_roomy, of_full = Warm(roomy), Warm(full)
+        echo = of_roomy.echo(roomy, "packed")
+        stack.callback(echo.close)
+        meanwhile = Meanwhile(of_roomy, echo)
+        while_loading(roomy, meanwhile, heavy, arguments.passes)
+        meanwhile.told(f"while {LOADED} cells of 1 MB load", arguments.passes)
+        meanwhile = Meanwhile(of_full, echo)
+        evicted = while_others_give_way(full, meanwhile, itertools.cycle(others), 2 * arguments.passes)
+        meanwhile.told(f"while {evicted} cells give way to others", 2 * arguments.passes)
+        compared("a full cache against one with room", of_roomy, of_full, arguments.rounds)
+
+        side = int(arguments.many**0.5) + 1
+        make_many_cells(Path(directory) / "many", side)
+        few, many = (served(Path(directory) / "many", "--budget", "4G") for _ in range(2))
+        middle = 20.0 * (side // 2)
+        for one, count in ((few, 1000), (many, arguments.many)):
+            with RawClient(one.endpoint, timeout=600.0) as client:
+                for row in range(-(-count // side)):
+                    client.area(
+                        ["box", 1.0, 20.0 * row + 1.0, 20.0 * side, 20.0 * row + 2.0, None, None], wait=600.0
+                    )
+                    client.release()
+        of_few, of_many = Warm(few, middle, middle), Warm(many, middle, middle)
+        counts = [len(one.segments()) for one in (many, few)]
+        compared(f"{counts[0]} segments against {counts[1]}", of_few, of_many, arguments.rounds)
+        for warm in (of_roomy, of_full, of_few, of_many):
+            warm.client.close()
+
+
+if __name__ == "__main__":
+    main()
