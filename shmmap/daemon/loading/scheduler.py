@@ -35,7 +35,8 @@ from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
-LOOKS_A_PUMP, HAND_OUT_S = 16, 0.0005
+LOOKS_A_PUMP: Final = 16
+HAND_OUT_S: Final = 0.0005
 """Loads that one `pump` hands out or finds to be of no use any more, and time of the processor for that."""
 
 
@@ -68,9 +69,8 @@ class Scheduler:
         pool.on_message = lambda worker: self.on_worker(worker, clock())
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
-        self._job_numbers = 0
         self._doubtful: deque[Key] = deque()
-        self._unfinished = False
+        self._job_numbers, self._unfinished = 0, False
         self.room = Room(cache, self.loads, pool)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
