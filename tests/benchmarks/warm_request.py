@@ -104,6 +104,7 @@ class Warm:
         around = self.client.area(["box", x - 179.0, y - 179.0, x + 179.0, y + 179.0]).cells
         assert len(inside) == HELD
         outside = [h for h in around if h.id not in {i.id for i in inside}]
+        self._open = [os.open(self.client.path(handle), os.O_RDONLY) for handle in around]  # as who maps them
         held = inside[:: HELD // NEW][:NEW]
         held = [h for h in inside if h not in held] + outside[:NEW]
         assert len(held) == HELD
@@ -120,6 +121,12 @@ class Warm:
             assert len(reply.cells) == NEW, reply.pending
             assert len(reply.removed or reply.removed_versions) == NEW
             self.sizes[name] = (len(request), reply.wire_bytes)
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self.client.close()
+        for fd in self._open:
+            os.close(fd)
 
     def echo(self, one: DaemonProcess, name: str) -> Echo:
         """Return an echo of messages as long as those of a kind of request."""
@@ -159,7 +166,7 @@ def main() -> None:
         finally:
             for echo in echoes.values():
                 echo.close()
-            warm.client.close()
+            warm.close()
             one.stop()
             one.dispose()
     print(f"named: {sizes['named'][0]} bytes asked, {sizes['named'][1]} answered;", end=" ")

@@ -3,7 +3,8 @@
 
     python -m tests.benchmarks.warm_under_load [--passes 6] [--rounds 40] [--many 100000]
 
-The request is the packed one of `tests.benchmarks.warm_request`.
+The request is the packed one of `tests.benchmarks.warm_request`.  This client has one processor and all
+servers have another, as with ``--pin`` there; loaders go where there is room.
 
 - While 60 cells of 1 MB load for somebody else, and while cells load for which others have to give way: round
   trips to the daemon and to a bare ZeroMQ echo in turn, so that both meet the same loads.  Printed are the
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import os
 import tempfile
 import time
 from collections.abc import Iterator
@@ -26,7 +28,7 @@ import numpy as np
 import zmq
 
 from tests.benchmarks.make_many_cells import make_many_cells
-from tests.benchmarks.warm_request import Echo, Warm, time_block
+from tests.benchmarks.warm_request import Echo, Warm, pin, time_block
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.raw_client import RawClient
@@ -140,7 +142,11 @@ def main() -> None:
             stack.callback(one.dispose)
             one.start()
             stack.callback(one.stop)
+            pin(one.pid, servers)
             return one
+
+        mine, *rest = sorted(os.sched_getaffinity(0))
+        servers = set(rest[:1]) or {mine}
 
         made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
         heavy = heavy_cells(made, LOADED, 60_000, 0)
@@ -149,6 +155,8 @@ def main() -> None:
         of_roomy, of_full = Warm(roomy), Warm(full)
         echo = of_roomy.echo(roomy, "packed")
         stack.callback(echo.close)
+        pin(echo.process.pid, servers)
+        pin(os.getpid(), {mine})
         meanwhile = Meanwhile(of_roomy, echo)
         while_loading(roomy, meanwhile, heavy, arguments.passes)
         meanwhile.told(f"while {LOADED} cells of 1 MB load", arguments.passes)
@@ -172,7 +180,7 @@ def main() -> None:
         counts = [len(one.segments()) for one in (many, few)]
         compared(f"{counts[0]} segments against {counts[1]}", of_few, of_many, arguments.rounds)
         for warm in (of_roomy, of_full, of_few, of_many):
-            warm.client.close()
+            warm.close()
 
 
 if __name__ == "__main__":
