@@ -76,6 +76,9 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
     with shmmap.connect(one.endpoint) as client:
         client.evict()
         assert not client.stats().unknown_holders
+        freed = Patience()
+        while freed(client.stats().counters["zombies"] > 0):
+            pass
     assert one.segments() == []
 
 
