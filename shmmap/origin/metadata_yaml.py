@@ -82,7 +82,10 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
         )
 
     if tag := _TAG_DIRECTIVE.search(data):
-        raise MapDataError("tag directives are not read", path=path, offset=tag.start(), cause="bad_yaml")
+        raise MapDataError(
+            "tag directives are not read", path=path, offset=tag.start(), cause="bad_yaml",
+            hint="metadata needs none: remove the line that begins with %TAG",
+        )  # fmt: skip
     try:
         for event in yaml.parse(data, Loader=_LOADER):
             if isinstance(event, yaml.AliasEvent):

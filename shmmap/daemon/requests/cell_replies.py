@@ -168,12 +168,13 @@ class CellReplies:
         holders: list[Holder] = []
         for _ in self.cache.holders.look(self.cache.ledger.segments.walk(), holders):
             yield from wanted.pause(self.cache)
-        del holders[MOST_HOLDERS:]
+        most = tuple(holders[:MOST_HOLDERS])
         failed, answer.failed, answer.short = answer.failed, [], False
         for number, part in enumerate(parts(failed)):
             if number:
                 yield from wanted.pause(self.cache)
-            for cell in part:
-                short = cell.holders is UNNAMED
-                answer.failed.append(msgspec.structs.replace(cell, holders=tuple(holders)) if short else cell)
+            answer.failed += [
+                msgspec.structs.replace(cell, holders=most) if cell.holders is UNNAMED else cell
+                for cell in part
+            ]
             answer.pack()
