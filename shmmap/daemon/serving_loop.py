@@ -29,6 +29,7 @@ from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["Chore", "ServingLoop"]
 
+CLIENTS: Final = "clients"
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
 ENOUGH_NS: Final = 300_000
@@ -122,6 +123,10 @@ class ServingLoop:
     def _turn(self, ready: list[int]) -> None:
         self._hear(ready)
         self._serve()
+        for fd in ready:
+            if self.watched.kinds.get(fd, CLIENTS) != CLIENTS:
+                self._breathe()
+                self._call(fd)
         self._breathe()
         self._look_after_the_rest(time.monotonic())
         self._breathe()
@@ -150,11 +155,15 @@ class ServingLoop:
             self._most_s, self._most_of_it = took_s, kind
 
     def _hear(self, ready: list[int]) -> None:
-        watched = self.watched
+        """Hear the clients; loaders, the kernel and others are heard when requests have been served."""
         for fd in ready:
-            callback = watched.callbacks.get(fd)
-            if callback is not None:  # another one's may have ended it
-                self._guarded(watched.kinds[fd], callback)
+            if self.watched.kinds.get(fd) == CLIENTS:
+                self._call(fd)
+
+    def _call(self, fd: int) -> None:
+        callback = self.watched.callbacks.get(fd)
+        if callback is not None:  # another one's may have ended it
+            self._guarded(self.watched.kinds[fd], callback)
 
     def _serve(self) -> None:
         """Serve those whose turn it is, for a bounded time; between any two of them hear who has come."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import time
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
 from shmmap.daemon.host.defects import Defects
-from shmmap.daemon.serving_loop import LONG_TURN_NS, ServingLoop
+from shmmap.daemon.serving_loop import ENOUGH_NS, LONG_TURN_NS, ServingLoop
 from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.daemon.transport.inbox import Inbox, Turn
 from shmmap.protocol.events import LongTurn, Recent, decode_event
@@ -116,3 +117,54 @@ def test_turns_are_measured(inner: Inner, small_map: DividedMap) -> None:
     event = decode_event(page.events[0])
     assert isinstance(event, LongTurn)
     assert (event.kind, event.cpu_ns >= LONG_TURN_NS) == ("loaders", True)
+
+
+def test_clients_are_served_before_anything_else_is_heard(inner: Inner, small_map: DividedMap) -> None:
+    """Of two loaders that have something to say each is heard in a turn of its own if the first took long."""
+    one = inner(small_map.root)
+    happened: list[str] = []
+    inbox = Inbox(one.statistics)
+
+    def handle(_turn: Turn) -> Iterator[None]:
+        happened.append("request")
+        yield from ()
+
+    def loader(fd: int) -> None:
+        os.read(fd, 1)
+        happened.append("loader")
+        end_s = time.thread_time() + 2e-9 * ENOUGH_NS
+        while time.thread_time() < end_s:
+            pass
+        os.write(asks, b"x")  # meanwhile somebody asks
+
+    def client() -> None:
+        os.read(asked, 1)
+        inbox.hear(cast("Connection", Client()), b"ask", False)
+
+    nothing: Any = SimpleNamespace(
+        free=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None, handle=handle,
+        end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
+    )  # fmt: skip
+    nothing.lost = nothing
+    loop = ServingLoop(
+        one.watched, inbox, nothing, nothing, nothing, nothing, nothing, deque(),
+        one.statistics, Defects(one.statistics), one.event_log,
+    )  # fmt: skip
+    with contextlib.ExitStack() as stack:
+
+        def pipe() -> tuple[int, int]:
+            ends = os.pipe()
+            for end in ends:
+                stack.callback(os.close, end)
+            return ends
+
+        loaders, (asked, asks) = [pipe(), pipe()], pipe()
+        for read, write in loaders:
+            one.watched.watch(read, lambda fd=read: loader(fd), "loaders")  # type: ignore[misc]
+            stack.callback(one.watched.unwatch, read)
+            os.write(write, b"x")
+        one.watched.watch(asked, client)
+        stack.callback(one.watched.unwatch, asked)
+        os.write(asks, b"x")
+        loop._turn(loop._poll(0))
+    assert happened == ["request", "loader", "request", "loader", "request"]
