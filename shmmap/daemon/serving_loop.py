@@ -32,7 +32,7 @@ __all__ = ["Chore", "ServingLoop"]
 CLIENTS: Final = "clients"
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
-ENOUGH_NS: Final = 300_000
+ENOUGH_NS: Final = 100_000
 """Processor time after which a turn begins no other kind of work."""
 LONG_TURN_NS: Final = 10_000_000
 """Processor time of a turn that is worth an event."""

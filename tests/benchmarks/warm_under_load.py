@@ -6,9 +6,9 @@
 The request is the packed one of `tests.benchmarks.warm_request`.  This client has one processor and all
 servers have another, as with ``--pin`` there; loaders go where there is room.
 
-- While 60 cells of 1 MB load for somebody else, and while cells load for which others have to give way: round
-  trips to the daemon and to a bare ZeroMQ echo in turn, so that both meet the same loads.  Printed are the
-  99th percentiles and how many took longer than 1 ms, a pass.  Limit: twice the echo's, and no more stalls.
+- While 60 cells of 1 MB load for another process, and while cells load for which others have to give way:
+  round trips to the daemon and to a bare ZeroMQ echo in turn, so that both meet the same loads.  Printed are
+  the 99th percentiles and how many took longer than 1 ms, a pass.  Limit: twice the echo's, no more stalls.
 - Cache: in a daemon whose budget is full, against one that has room, in alternating rounds.  Limit: 1.1.
 - Segments: in a daemon with ``--many`` of them, against one with 1000.  Limit: 1.2.
 """
@@ -17,15 +17,17 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import multiprocessing
 import os
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import zmq
 
 from tests.benchmarks.make_many_cells import make_many_cells
 from tests.benchmarks.warm_request import Echo, Warm, pin, time_block
@@ -53,25 +55,69 @@ def heavy_cells(made: DividedMap, count: int, points: int, y: int) -> list[str]:
     return names
 
 
+class Other:
+    """A client in a process of its own, for which cells are loaded."""
+
+    def __init__(self, endpoint: str, stack: ExitStack) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        process = context.Process(target=_serve_other, args=(endpoint, theirs))
+        process.start()
+        stack.callback(process.join)
+        stack.callback(self._pipe.send, None)
+        self.answer()  # it is connected
+
+    def send(self, tag: str, *elements: Any) -> None:
+        """Have it send a request."""
+        self._pipe.send((tag, *elements))
+
+    def answered(self) -> bool:
+        """Whether it has its reply."""
+        return self._pipe.poll()
+
+    def answer(self) -> Any:
+        """The reply; of cells, which it lets go, their number."""
+        return self._pipe.recv()
+
+    def ask(self, tag: str, *elements: Any) -> Any:
+        """Have it send a request, and give the reply."""
+        self.send(tag, *elements)
+        return self.answer()
+
+
+def _serve_other(endpoint: str, pipe: Connection) -> None:
+    with RawClient(endpoint, timeout=120.0, name="other") as client:
+        pipe.send(None)
+        while (request := pipe.recv()) is not None:
+            reply = client.ask(*request)
+            if reply[0] == "cells":
+                pipe.send(len(client.cells_reply(reply).cells))
+                client.release()
+            else:
+                pipe.send(reply)
+
+
 class Meanwhile:
     """Round trips of requests and of echoes in turn, microseconds."""
 
     def __init__(self, warm: Warm, echo: Echo) -> None:
-        self._sockets: list[tuple[zmq.Socket[bytes], bytes]] = [
-            (warm.client.socket, warm.requests["packed"]),
-            (echo.socket, echo.request),
-        ]
         self.times: tuple[list[float], list[float]] = ([], [])
+        self._in_turn = itertools.cycle(
+            [
+                (warm.client.socket, warm.requests["packed"], self.times[0]),
+                (echo.socket, echo.request, self.times[1]),
+            ]
+        )
 
-    def until(self, loader: RawClient, *, noted: bool = True) -> None:
+    def until(self, other: Other, *, noted: bool = True) -> None:
         """Until somebody has an answer; the loads that it waits for are under way."""
-        while not loader.readable():
-            for (socket, request), times in zip(self._sockets, self.times, strict=True):
-                start = time.perf_counter()
-                socket.send(request)
-                socket.recv()
-                if noted:
-                    times.append((time.perf_counter() - start) * 1e6)
+        while not other.answered():
+            socket, request, times = next(self._in_turn)
+            start = time.perf_counter()
+            socket.send(request)
+            socket.recv()
+            if noted:
+                times.append((time.perf_counter() - start) * 1e6)
 
     def told(self, what: str, passes: int) -> None:
         """Print it."""
@@ -84,32 +130,29 @@ class Meanwhile:
         )
 
 
-def while_loading(one: DaemonProcess, meanwhile: Meanwhile, heavy: list[str], passes: int) -> None:
+def while_loading(
+    one: DaemonProcess, other: Other, meanwhile: Meanwhile, heavy: list[str], passes: int
+) -> None:
     """Time requests while cold cells are being loaded for somebody else."""
-    with RawClient(one.endpoint, timeout=120.0) as loader:
-        for number in range(passes + 1):
-            cold = loader.send("selected", heavy, ["points"], 60.0)
-            meanwhile.until(loader, noted=number > 0)  # the first pass also starts the loaders
-            reply = loader.cells_reply(loader.wait_for(cold))
-            assert len(reply.cells) == len(heavy), reply.failed
-            loader.release()
-            loader.ask("evict", heavy)
-            while any(name.endswith(".zombie") for name in one.segments()):
-                loader.ask("stats")  # a cell asked for again before it is freed is only put back in service
+    for number in range(passes + 1):
+        other.send("selected", heavy, ["points"], 60.0)
+        meanwhile.until(other, noted=number > 0)  # the first pass also starts the loaders
+        assert other.answer() == len(heavy)
+        other.ask("evict", heavy)
+        while any(name.endswith(".zombie") for name in one.segments()):
+            other.ask("stats")  # a cell asked for again before it is freed is only put back in service
 
 
-def while_others_give_way(one: DaemonProcess, meanwhile: Meanwhile, cells: Iterator[str], passes: int) -> int:
+def while_others_give_way(other: Other, meanwhile: Meanwhile, cells: Iterator[str], passes: int) -> int:
     """Time requests while cells are loaded for which others have to give way; returns how many gave way."""
-    with RawClient(one.endpoint, timeout=120.0) as loader:
-        before = loader.ask("stats")[4]["evictions"]
-        for _ in range(passes):
-            for _ in range(LOADED // 10):
-                cold = loader.send("selected", list(itertools.islice(cells, 10)), ["points"], 60.0)
-                meanwhile.until(loader)
-                assert len(loader.cells_reply(loader.wait_for(cold)).cells) == 10
-                loader.release()
-        evicted: int = loader.ask("stats")[4]["evictions"] - before
-        return evicted
+    before = other.ask("stats")[4]["evictions"]
+    for _ in range(passes):
+        for _ in range(LOADED // 10):
+            other.send("selected", list(itertools.islice(cells, 10)), ["points"], 60.0)
+            meanwhile.until(other)
+            assert other.answer() == 10
+    evicted: int = other.ask("stats")[4]["evictions"] - before
+    return evicted
 
 
 def compared(what: str, first: Warm, second: Warm, rounds: int) -> None:
@@ -156,12 +199,14 @@ def main() -> None:
         echo = of_roomy.echo(roomy, "packed")
         stack.callback(echo.close)
         pin(echo.process.pid, servers)
+        others_of_roomy, others_of_full = (Other(one.endpoint, stack) for one in (roomy, full))
         pin(os.getpid(), {mine})
         meanwhile = Meanwhile(of_roomy, echo)
-        while_loading(roomy, meanwhile, heavy, arguments.passes)
+        while_loading(roomy, others_of_roomy, meanwhile, heavy, arguments.passes)
         meanwhile.told(f"while {LOADED} cells of 1 MB load", arguments.passes)
         meanwhile = Meanwhile(of_full, echo)
-        evicted = while_others_give_way(full, meanwhile, itertools.cycle(others), 2 * arguments.passes)
+        cells = itertools.cycle(others)
+        evicted = while_others_give_way(others_of_full, meanwhile, cells, 2 * arguments.passes)
         meanwhile.told(f"while {evicted} cells give way to others", 2 * arguments.passes)
         compared("a full cache against one with room", of_roomy, of_full, arguments.rounds)
 

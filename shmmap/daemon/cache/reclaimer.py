@@ -42,7 +42,7 @@ SHARE_S: Final = 0.0005
 """With very many of them each is looked at less often: at most one per this time (a look takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment just handed out is not evicted for this long, so that its reader can open it."""
-LOOKS_AT_ONCE: Final = 16
+LOOKS_AT_ONCE: Final = 8
 """Segments looked at, retired or freed per turn: a look takes 15 us, retiring 50."""
 
 

@@ -24,8 +24,8 @@ from shmmap.errors import Busy
 
 __all__ = ["Share", "Survey", "Usage"]
 
-LOOKS_AT_ONCE: Final = 16
-"""Half a millisecond of the serving loop."""
+LOOKS_AT_ONCE: Final = 8
+"""A fifth of a millisecond of the serving loop."""
 ASKING_S: Final = 0.2
 """Time of the processor that asking who holds what may take in one walk; 2048 segments take 0.03 s."""
 STEP_S: Final = 0.001

@@ -36,7 +36,7 @@ from shmmap.segment.version import Stamp
 __all__ = ["Scheduler"]
 
 LOOKS_A_PUMP: Final = 16
-HAND_OUT_S: Final = 0.0005
+HAND_OUT_S: Final = 0.0001
 """Loads that one `pump` hands out or finds to be of no use any more, and time of the processor for that."""
 
 

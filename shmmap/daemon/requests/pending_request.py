@@ -26,8 +26,8 @@ from shmmap.geometry import Area, distance_to_boxes
 
 __all__ = ["CELLS_A_STEP", "MOST_OF_A_SESSION", "MapChanged", "PendingRequest", "WaitingList", "parts"]
 
-CELLS_A_STEP: Final = 64
-"""Cells that are gone through in one turn: less than a millisecond, whatever is done with them."""
+CELLS_A_STEP: Final = 32
+"""Cells that are gone through in one turn: half a millisecond, whatever is done with them."""
 MOST_OF_A_SESSION: Final = 64
 """Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
 MOST_REQUESTS: Final = 16_384
@@ -36,7 +36,7 @@ MOST_CELLS: Final = 400_000
 """Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
 
 OVERDUE_AT_ONCE: Final = 256
-KEYS_A_STEP: Final = 64
+KEYS_A_STEP: Final = 32
 """Cells of requests and sessions that are over, and requests that a load was for, that one turn sees to."""
 
 Item = TypeVar("Item")

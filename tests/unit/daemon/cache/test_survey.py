@@ -10,13 +10,19 @@ import pytest
 from shmmap.daemon.cache import survey
 from shmmap.daemon.cache.holders import UNKNOWN_SLOT, Holders
 from shmmap.daemon.cache.ledger import Ledger, Segments
-from shmmap.daemon.cache.survey import LOOKS_AT_ONCE, MOST_ASKED, Survey, Usage
+from shmmap.daemon.cache.survey import MOST_ASKED, Survey, Usage
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import Busy
 from tests.support import connections
 
+LOOKS_AT_ONCE = 16
 SEGMENTS = 3 * LOOKS_AT_ONCE
+
+
+@pytest.fixture(autouse=True)
+def _looks_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(survey, "LOOKS_AT_ONCE", LOOKS_AT_ONCE)
 
 
 def resident(number: int) -> Resident:

@@ -72,8 +72,12 @@ def test_areas_at_the_end_of_the_world(
     assert (reply.pending, reply.failed) == ((), ())
     assert len(one.everything(2).cells) == 16
     one.offset_s += 2.0
-    one.evictor.free(one.ledger.budget_bytes, one.now_s())
-    one.run_until(lambda: one.ledger.used_bytes == one.ledger.overhead_bytes)
+
+    def empty() -> bool:
+        one.evictor.free(one.ledger.budget_bytes, one.now_s())
+        return one.ledger.used_bytes == one.ledger.overhead_bytes
+
+    one.run_until(empty)
 
 
 def test_nearest_cells_first(inner: Inner, small_map: DividedMap) -> None:
