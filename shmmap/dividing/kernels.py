@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.layers.compiling import compiled
+from shmmap.compiling import compiled
 
 __all__ = ["NOWHERE", "assign_cells", "count_cells", "scatter_rows"]
 

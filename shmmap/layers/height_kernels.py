@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import float32, float64, int32, types
 
-from shmmap.layers.compiling import compiled, read_only
+from shmmap.compiling import compiled, read_only
 
 __all__ = ["heights"]
 

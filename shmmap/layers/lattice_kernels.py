@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numba import float32, float64, int32, int64, types
 
-from shmmap.layers.compiling import compiled, read_only
+from shmmap.compiling import compiled, read_only
 
 __all__ = ["bounds", "count_points", "number_voxels"]
 

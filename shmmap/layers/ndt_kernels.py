@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import float32, float64, int32, int64, types
 
-from shmmap.layers.compiling import compiled, inlined, read_only
+from shmmap.compiling import compiled, inlined, read_only
 
 __all__ = ["inverse_covariances", "moments"]
 

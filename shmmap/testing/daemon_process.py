@@ -345,6 +345,6 @@ def _remove(directories: list[str], owner: int) -> None:
 
 
 def _kernels_dir() -> str:
-    """Where kernels are kept, see `shmmap.layers.compiling`, which loads numba."""
+    """Where kernels are kept, see `shmmap.compiling`, which loads numba."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return str(Path(base if base.startswith("/") else os.path.expanduser("~/.cache"), "shmmap", "kernels"))

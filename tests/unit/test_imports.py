@@ -30,6 +30,7 @@ BASE = {
     "geometry",
     "quantities",
     "optional_packages",
+    "compiling",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -44,6 +45,7 @@ PARTS = {
     "formats": {"errors", "columns", "geometry", "logfmt"},
     "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
     "protocol": {"errors", "columns", "geometry"},
+    "compiling": set[str](),
     "statistics": {"errors", "columns", "geometry", "logfmt", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
