@@ -34,7 +34,8 @@ class Resident:
 
     ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
     their checksums: until then nobody is handed it.  ``handle`` and ``stale_handle`` are encoded once,
-    to be used in every reply; ``sessions`` are the slots of those who hold it.
+    to be used in every reply; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
+    among all segments of its size.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Resident:
     hits: int = 0
     checked: bool = True
     sessions: set[int] = field(default_factory=set)
+    place: int = -1
 
 
 @dataclass(slots=True, eq=False)

@@ -20,6 +20,7 @@ from typing import Final
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
+from shmmap.sharded_dict import ShardedDict
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
 from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, TURN_KINDS
@@ -102,7 +103,7 @@ class StatisticsWriter:
         self._table_sequence = 0  # odd while rows change
         self._changes = CHANGES.pack(identity.epoch, 0)
         self._changes_due = True
-        self._slots: dict[Hashable, int] = {}
+        self._slots: ShardedDict[Hashable, int] = ShardedDict()
         self._free: list[int] = []
         self._used = 0
         self._allocated = 0

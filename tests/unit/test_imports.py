@@ -31,6 +31,7 @@ BASE = {
     "quantities",
     "optional_packages",
     "compiling",
+    "sharded_dict",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -46,7 +47,8 @@ PARTS = {
     "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
     "protocol": {"errors", "columns", "geometry"},
     "compiling": set[str](),
-    "statistics": {"errors", "columns", "geometry", "logfmt", "segment"},
+    "sharded_dict": set[str](),
+    "statistics": {"errors", "columns", "geometry", "logfmt", "sharded_dict", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 
 from shmmap.daemon.cache.eviction.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
+from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["Ledger", "Segments"]
 
@@ -24,23 +25,25 @@ class Segments:
 
     def __init__(self) -> None:
         self._by_size: list[list[Resident]] = [[] for _ in range(64)]
-        self._places: dict[Resident, int] = {}
+        self._count = 0
 
     def __len__(self) -> int:
-        return len(self._places)
+        return self._count
 
     def add(self, resident: Resident) -> None:
         """One more."""
         alike = self._by_size[resident.nbytes.bit_length()]
-        self._places[resident] = len(alike)
+        resident.place = len(alike)
         alike.append(resident)
+        self._count += 1
 
     def remove(self, resident: Resident) -> None:
         """One less."""
         alike = self._by_size[resident.nbytes.bit_length()]
-        at, last = self._places.pop(resident), alike.pop()
+        last = alike.pop()
         if last is not resident:  # it takes the empty place
-            alike[at], self._places[last] = last, at
+            alike[resident.place], last.place = last, resident.place
+        self._count -= 1
 
     def walk(self) -> Iterator[Resident]:
         """Go over all that are there now and stay, larger ones first (to a factor of two).
@@ -63,7 +66,7 @@ class Ledger:
 
     Attributes
     ----------
-    by_key : dict
+    by_key
         What can be handed out.
     retired : dict
         By the name they had, segments out of service.
@@ -83,7 +86,7 @@ class Ledger:
 
     def __init__(self, budget_bytes: int) -> None:
         self.budget_bytes = budget_bytes
-        self.by_key: dict[Key, Resident] = {}
+        self.by_key: ShardedDict[Key, Resident] = ShardedDict()
         self.retired: dict[str, Retired] = {}
         self.resident_bytes = 0
         self.segments = Segments()
@@ -94,7 +97,7 @@ class Ledger:
         self.reserved_bytes = 0
         self.overhead_bytes = 0
         self.unchecked_count = 0
-        self._by_name: dict[str, Resident] = {}
+        self._by_name: ShardedDict[str, Resident] = ShardedDict()
         self._needed: dict[Key, int] = {}
         self._layers: Counter[str] = Counter()
 
