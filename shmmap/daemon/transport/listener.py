@@ -34,7 +34,7 @@ LEAST_RESERVE: Final = 48
 """Descriptors kept for the daemon's own work: loaders, segments it looks at, the map."""
 LEAST_SHARE: Final = 8
 """A process with no more connections than this is never the culprit."""
-MEMORY_ALLOWANCE_BYTES: Final = 48 << 20
+MEMORY_ALLOWANCE_BYTES: Final = 32 << 20
 """What may be kept for all clients together."""
 
 
