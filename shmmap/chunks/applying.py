@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Marks change a chunk wholly or not at all, each scan once, whenever the writer dies.
+
+Before it changes anything, a writer copies what it is about to change into an *undo record*, in shared
+memory of its own that outlives it.  If it dies before the record is out of force, the next writer puts the
+copy back; the mapper, which has no answer yet, sends the scan again.  A chunk remembers the last scan of each
+mapper, so a scan that comes twice changes it once.
+
+Readers see a chunk whole by its sequence: odd while it is written (`ChunkView.state`).
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from shmmap.chunks import applying_kernels as kernels
+from shmmap.chunks.layout import (
+    BRICK_BYTES,
+    HEADER_BYTES,
+    MAPPERS,
+    MOST_BYTES,
+    STATE_AT,
+    ChunkView,
+)
+from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.errors import SegmentCorrupt
+from shmmap.failpoints import step
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container
+
+    from numpy.typing import NDArray
+
+__all__ = ["UNDO_BYTES", "ChunkWriter", "UndoRecord"]
+
+_MAGIC: Final = b"SHMUNDO\0"
+_UNDO: Final = struct.Struct("<8sQQ3iI")
+_IN_FORCE_AT: Final = 8
+_BODY_AT: Final = 64
+UNDO_BYTES: Final = _BODY_AT + 2 * BRICKS + MOST_BYTES
+
+
+class UndoRecord:
+    """What a chunk was before the writer began to change it; at most one is in force.
+
+    Parameters
+    ----------
+    data
+        `UNDO_BYTES` of memory that outlives the writer.
+    """
+
+    def __init__(self, data: Any) -> None:
+        self._data = memoryview(data).cast("B")
+        self._in_force: NDArray[np.uint64] = np.ndarray((1,), "<u8", self._data, _IN_FORCE_AT)
+        self._numbers: NDArray[np.uint16] = np.ndarray((BRICKS,), "<u2", self._data, _BODY_AT)
+        self._header: NDArray[np.uint8] = np.ndarray(
+            (HEADER_BYTES,), np.uint8, self._data, _BODY_AT + 2 * BRICKS
+        )
+        self._bricks: NDArray[np.uint8] = np.ndarray(
+            (BRICKS, BRICK_BYTES), np.uint8, self._data, _BODY_AT + 2 * BRICKS + HEADER_BYTES
+        )
+
+    @property
+    def of(self) -> tuple[ChunkKey, int] | None:
+        """Key and generation of the chunk that was being changed; None if none was."""
+        magic, in_force, generation, x, y, z, _ = _UNDO.unpack_from(self._data)
+        return (ChunkKey(x, y, z), generation) if magic == _MAGIC and in_force & 1 else None
+
+    def keep(self, view: ChunkView, touched: NDArray[np.uint16]) -> None:
+        """Copy a chunk's header and the bricks at these places, and be in force."""
+        identity = view.identity
+        count = len(touched)
+        _UNDO.pack_into(self._data, 0, _MAGIC, 0, identity.generation, *identity.key, count)
+        self._numbers[:count] = touched
+        self._header[:] = view.data[:HEADER_BYTES]
+        self._bricks[:count] = view.bricks[touched - 1].view(np.uint8)
+        step("live.copied")
+        kernels.begin_writing(self._in_force)
+
+    def drop(self) -> None:
+        """Be out of force: what was changed is whole."""
+        kernels.end_writing(self._in_force)
+
+    def restore(self, view: ChunkView) -> None:
+        """Put back what was kept, in the chunk that it is `of`.
+
+        Raises
+        ------
+        SegmentCorrupt
+            The record names bricks that the chunk has not.
+        """
+        count = _UNDO.unpack_from(self._data)[-1]
+        sequence = view.state["sequence"].reshape(1)
+        kernels.begin_writing(sequence)
+        old = ChunkView(self._header)
+        bricks = int(old.state["bricks"])
+        numbers = self._numbers[: min(count, BRICKS)]
+        if count > BRICKS or bricks > len(view.bricks) or (numbers == 0).any() or (numbers > bricks).any():
+            raise SegmentCorrupt("undo record: it is not one of this chunk")
+        view.bricks[numbers.astype(np.intp) - 1] = self._bricks[: len(numbers)].view("<i2")
+        view.bricks[bricks:] = 0
+        view.data[STATE_AT + 8 : HEADER_BYTES] = self._header[STATE_AT + 8 :].tobytes()
+        kernels.end_writing(sequence)
+        self.drop()
+
+
+class ChunkWriter:
+    """Changes chunks; one process and thread at a time.
+
+    Parameters
+    ----------
+    occupancy
+        How evidence is added up.
+    undo
+        Kept while a chunk is changed.
+    """
+
+    def __init__(self, occupancy: Occupancy, undo: UndoRecord) -> None:
+        self._limits = np.array([*occupancy.steps, *occupancy.thresholds], np.int64)
+        self._undo = undo
+        self._touched = np.zeros(BRICKS, np.uint16)
+
+    def apply(
+        self,
+        view: ChunkView,
+        words: NDArray[np.uint16],
+        bits: NDArray[np.uint64],
+        hits: int,
+        *,
+        mapper: int,
+        scan: int,
+        now_ns: int,
+        grow: Callable[[int], ChunkView],
+        known_mappers: Container[int] = (),
+    ) -> ChunkView:
+        """Add one scan's evidence to a chunk, unless it has it already.
+
+        Parameters
+        ----------
+        words, bits, hits
+            The chunk's part of `Marks`: checked.
+        mapper, scan
+            Whose and which; scans of one mapper rise.
+        now_ns
+            Time of the change, nanoseconds since 1970.
+        grow
+            Given a number of bricks, returns a view of the same chunk with room for as many; called before
+            anything changes.
+        known_mappers
+            Numbers of the map's mappers; the last scans of others may be forgotten.
+
+        Returns
+        -------
+        ChunkView
+            The chunk, grown if it had to.
+        """
+        row = self._row(view, mapper)
+        if row is not None and int(view.state["mappers"]["scan"][row]) >= scan:
+            return view
+        new = kernels.touched_bricks(view.index, words, self._touched)
+        bricks = int(view.state["bricks"])
+        if bricks + new > len(view.bricks):
+            view = grow(bricks + new)
+        self._undo.keep(view, self._touched[: np.count_nonzero(self._touched)])
+        state = view.state
+        sequence = state["sequence"].reshape(1)
+        counts = np.array([state[name] for name in _COUNTED], np.int64)
+        kernels.begin_writing(sequence)
+        step("live.odd")
+        kernels.add_evidence(view.index, view.bricks.reshape(-1), words, bits, hits, self._limits, counts)
+        step("live.applied")
+        for name, count in zip(_COUNTED, counts.tolist(), strict=True):
+            state[name] = count
+        state["version"] += 1
+        state["changed_ns"] = now_ns
+        if row is None:
+            row = self._row_for(view, known_mappers)
+            state["mappers"]["number"][row] = mapper
+        state["mappers"]["scan"][row] = scan
+        kernels.end_writing(sequence)
+        step("live.even")
+        self._undo.drop()
+        return view
+
+    @staticmethod
+    def _row(view: ChunkView, mapper: int) -> int | None:
+        """Where a chunk remembers the last scan of a mapper; None where it has none of it."""
+        found = np.flatnonzero(view.state["mappers"]["number"] == mapper)
+        return int(found[0]) if len(found) else None
+
+    @staticmethod
+    def _row_for(view: ChunkView, known: Container[int]) -> int:
+        """A row that is free, or of a mapper that the map does not know any more."""
+        numbers = view.state["mappers"]["number"].tolist()
+        for row, number in enumerate(numbers):
+            if number == 0 or number not in known:
+                return row
+        raise SegmentCorrupt(f"a chunk remembers {MAPPERS} mappers, and all of them are the map's")
+
+
+_COUNTED: Final = ("bricks", "active", "occupied", "free")

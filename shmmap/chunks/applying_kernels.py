@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled: marks change the voxels of a chunk."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numba import int16, int64, types, uint16, uint64
+from numba.cpython.unsafe import numbers
+from numba.extending import intrinsic
+
+from shmmap.chunks.voxels import BRICK_VOXELS
+from shmmap.compiling import compiled, inlined, read_only
+
+__all__ = ["add_evidence", "begin_writing", "end_writing", "touched_bricks"]
+
+_ONE: Final = np.uint64(1)
+_trailing_zeros: Any = numbers.trailing_zeros
+
+
+@compiled(types.int64(read_only(uint16, 1), read_only(uint16, 1), uint16[::1]))
+def touched_bricks(index: Any, words: Any, touched: Any) -> Any:
+    """Find the bricks that words lie in.
+
+    ``touched``, (1024,), receives the places of those that there are, each once, and then zeros.  Returns how
+    many there are not yet.
+    """
+    seen = np.zeros(index.shape[0], np.bool_)
+    there, new = 0, 0
+    touched[:] = 0
+    for word in words:
+        brick = word >> 2
+        if seen[brick]:
+            continue
+        seen[brick] = True
+        if index[brick]:
+            touched[there] = index[brick]
+            there += 1
+        else:
+            new += 1
+    return new
+
+
+@inlined
+def _add(index: Any, cells: Any, word: Any, bits: Any, step: Any, limits: Any, counts: Any) -> None:
+    low, high, occupied_above, free_below = limits[2], limits[3], limits[4], limits[5]
+    brick = word >> 2
+    if not index[brick]:
+        counts[0] += 1
+        index[brick] = counts[0]
+    base = (np.int64(index[brick]) - 1) * BRICK_VOXELS + (np.int64(word) & 3) * 64
+    active, occupied, free = 0, 0, 0
+    while bits:
+        at = base + np.int64(_trailing_zeros(bits))
+        bits &= bits - _ONE
+        before = np.int64(cells[at])
+        after = min(max(before + step, low), high)
+        cells[at] = after
+        active += np.int64(after != 0) - np.int64(before != 0)
+        occupied += np.int64(after > occupied_above) - np.int64(before > occupied_above)
+        free += np.int64(after < free_below) - np.int64(before < free_below)
+    counts[1] += active
+    counts[2] += occupied
+    counts[3] += free
+
+
+@compiled(
+    types.void(
+        uint16[::1], int16[::1], read_only(uint16, 1), read_only(uint64, 1), int64, read_only(int64, 1),
+        int64[::1],
+    )
+)  # fmt: skip
+def add_evidence(index: Any, cells: Any, words: Any, bits: Any, hits: Any, limits: Any, counts: Any) -> None:
+    """Add the evidence of one scan to a chunk; ``cells`` has room for the bricks that become known.
+
+    Parameters
+    ----------
+    index, cells
+        (1024,) where bricks lie, and (N * 256,) their voxels; both changed.
+    words, bits, hits
+        The chunk's marks, and how many of the words are hits; the rest are misses.
+    limits
+        What a hit and a miss add, the clamps, and beyond what a voxel is occupied or free.
+    counts
+        (4,): bricks, and voxels that are known, occupied and free; brought up to date.
+    """
+    for n in range(words.shape[0]):
+        _add(index, cells, words[n], bits[n], limits[0] if n < hits else limits[1], limits, counts)
+
+
+def _typed_fence(_context: Any) -> Any:
+    """Everything written before is seen before what is written after."""
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        builder.fence("seq_cst")
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+_fence: Any = intrinsic(_typed_fence)
+
+
+@compiled(types.void(uint64[::1]))
+def begin_writing(sequence: Any) -> None:
+    """Make the sequence, (1,), odd before anything else changes."""
+    sequence[0] |= _ONE
+    _fence()
+
+
+@compiled(types.void(uint64[::1]))
+def end_writing(sequence: Any) -> None:
+    """Make it the next even number after everything else has changed."""
+    _fence()
+    sequence[0] = (sequence[0] | _ONE) + _ONE

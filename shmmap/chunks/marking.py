@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan becomes marks: the voxels that its rays end in are hit, those on the way are passed through.
+
+Each voxel counts once a scan, and as hit if any ray ends in it, whatever the order of the points.  A ray that
+is longer than the greatest range is cut there, and ends in nothing.  To each voxel one ray is cast, from the
+sensor's; the walk is Bonxai's.  (Bonxai lets what comes first in a scan decide between a hit and the end of
+a ray that was cut; here it is the hit.)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import numpy as np
+
+from shmmap.chunks import marking_kernels as kernels
+from shmmap.chunks.marks import MOST_CHUNKS, Marks
+from shmmap.chunks.voxels import CHUNK_SHIFT, CHUNK_SIDE, WORDS, voxel_indices
+from shmmap.errors import BadRequest, ConfigError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["Counts", "Marker", "ScanFilter"]
+
+FIRST_SLOTS: Final = 64
+MOST_REACH: Final = 64
+"""Chunks from the sensor to the end of the longest ray; the window's table is then 9 MB."""
+
+
+class ScanFilter(msgspec.Struct, frozen=True):
+    """Which points of a scan count; metres, in the sensor's frame.
+
+    The defaults are those of Rolling-Bonxai's parameter file.
+
+    Attributes
+    ----------
+    min_range, max_range
+        Nearer points are left out; rays to further ones are cut at ``max_range`` and end in nothing.
+    min_z, max_z
+        Points below and above are left out.
+
+    Raises
+    ------
+    ConfigError
+        Nothing lies between two of them, or one is no finite number.
+    """
+
+    min_range: float = 0.5
+    max_range: float = 5.0
+    min_z: float = -2.0
+    max_z: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if not math.isfinite(value):
+                raise ConfigError(f"{name} = {value!r}: need a finite number of metres", key=name)
+        if self.min_range < 0.0:
+            raise ConfigError(f"min_range = {self.min_range!r}: it must not be negative", key="min_range")
+        for least, most in (("min_range", "max_range"), ("min_z", "max_z")):
+            low, high = getattr(self, least), getattr(self, most)
+            if not low < high:
+                raise ConfigError(f"{most} = {high!r}: need more than {least} = {low!r}", key=most)
+
+
+class Counts(msgspec.Struct, frozen=True):
+    """What became of a scan's points: in range, cut at the greatest range, and left out for what reason."""
+
+    near: int
+    far: int
+    too_near: int
+    outside_z: int
+    not_finite: int
+
+
+class Marker:
+    """Marks scans, and keeps the memory that takes.
+
+    Parameters
+    ----------
+    resolution
+        Edge of a voxel, metres.
+    scan_filter
+        Which points count.
+
+    Raises
+    ------
+    ConfigError
+        The greatest range is more than 64 chunks of 64 voxels.
+    """
+
+    def __init__(self, resolution: float, scan_filter: ScanFilter | None = None) -> None:
+        self.resolution = resolution
+        self.filter = scan_filter if scan_filter is not None else ScanFilter()
+        voxels = self.filter.max_range / resolution
+        self._reach = math.ceil(voxels / CHUNK_SIDE) + 1 if math.isfinite(voxels) else MOST_REACH + 1
+        if self._reach > MOST_REACH:
+            most = (MOST_REACH - 1) * CHUNK_SIDE * resolution
+            raise ConfigError(
+                f"max_range = {self.filter.max_range!r}: with voxels of {resolution} m at most {most:g} m",
+                key="max_range",
+            )
+        self._side = 2 * self._reach + 1
+        self._table = np.full(self._side**3, -1, np.int32)
+        self._ends = np.empty((0, 3), np.int32)
+        self._make_slots(FIRST_SLOTS)
+
+    def _make_slots(self, count: int) -> None:
+        self._slots = count
+        self._hits = np.zeros(count * WORDS, np.uint64)
+        self._misses = np.zeros(count * WORDS, np.uint64)
+        self._used = np.zeros(count + 1, np.int32)
+
+    def mark(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> tuple[Marks, Counts]:
+        """Mark a scan.
+
+        Parameters
+        ----------
+        points
+            (N, 3) float32 or float64, metres in the sensor's frame; those that are not finite are left out.
+        pose
+            (3, 4) or (4, 4): rotation and position of the sensor in the map's frame.
+
+        Raises
+        ------
+        BadRequest
+            A shape is wrong, the pose is not a rotation and a finite position, the sensor is further away
+            than voxels reach, or the scan touches more than 4096 chunks.
+        """
+        points = np.ascontiguousarray(points, None if points.dtype == np.float32 else np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise BadRequest(f"points: need the shape (N, 3), not {points.shape}")
+        rigid = _rigid(pose)
+        sensor = voxel_indices(rigid[None, :, 3], self.resolution)[0].astype(np.int64)
+        reach = self._reach * CHUNK_SIDE
+        voxel_indices(rigid[None, :, 3] + self.resolution * 2 * reach, self.resolution)
+        voxel_indices(rigid[None, :, 3] - self.resolution * 2 * reach, self.resolution)
+        corner = ((sensor >> CHUNK_SHIFT) - self._reach) << CHUNK_SHIFT
+        if len(self._ends) < len(points):
+            self._ends = np.empty((len(points), 3), np.int32)
+        while (counts := self._try(points, rigid, corner, sensor - corner)) is None:
+            self._forget()
+            if self._slots == MOST_CHUNKS:
+                raise BadRequest(
+                    f"the scan touches more than {MOST_CHUNKS} chunks",
+                    hint="lower max_range, or make the map with larger voxels",
+                )
+            self._make_slots(min(2 * self._slots, MOST_CHUNKS))
+        return self._collect(corner), counts
+
+    def _try(
+        self, points: NDArray[np.floating], pose: NDArray[np.float64], corner: NDArray[np.int64],
+        sensor: NDArray[np.int64],
+    ) -> Counts | None:  # fmt: skip
+        """Mark, if there are slots enough."""
+        wanted, counts = self.filter, np.zeros(5, np.int64)
+        limits = np.array(
+            [1.0 / self.resolution, wanted.min_range, wanted.max_range, wanted.min_z, wanted.max_z]
+        )
+        slots = (self._table, self._used, self._slots)
+        rays = kernels.mark_ends(
+            points, pose, limits, corner, self._side, *slots, self._hits, self._misses, self._ends, counts
+        )
+        if rays == kernels.NO_SLOTS:
+            return None
+        x, y, z = sensor.tolist()
+        if not kernels.mark_rays(self._ends, rays, x, y, z, self._side, *slots, self._misses):
+            return None
+        return Counts(*counts.tolist())
+
+    def _forget(self) -> None:
+        used = int(self._used[0])
+        kernels.clear(used, self._hits, self._misses)
+        self._table[self._used[1 : used + 1]] = -1
+        self._used[0] = 0
+
+    def _collect(self, corner: NDArray[np.int64]) -> Marks:
+        """Give what was marked as lists, chunks in the order of their keys, and forget it."""
+        used = int(self._used[0])
+        counts = np.zeros((used, 2), np.int32)
+        total = kernels.count_words(used, self._hits, self._misses, counts)
+        chunks = self._used[1 : used + 1].astype(np.int64)
+        side = self._side
+        keys = np.stack([chunks % side, chunks // side % side, chunks // side**2], axis=1)
+        keys += corner >> CHUNK_SHIFT
+        order = np.lexsort(keys.T[::-1])
+        bits, words = np.empty(total, np.uint64), np.empty(total, np.uint16)
+        kernels.write_words(order, self._hits, self._misses, bits, words)
+        self._table[chunks] = -1
+        self._used[0] = 0
+        counts = counts[order].astype(np.uint32)
+        return Marks(keys[order].astype(np.int32), counts[:, 0].copy(), counts[:, 1].copy(), bits, words)
+
+
+def _rigid(pose: NDArray[np.floating]) -> NDArray[np.float64]:
+    """A pose as (3, 4), checked."""
+    rigid = np.ascontiguousarray(np.asarray(pose, dtype=np.float64)[:3])
+    if rigid.shape != (3, 4):
+        raise BadRequest(f"pose: need the shape (3, 4) or (4, 4), not {np.shape(pose)}")
+    rotation = rigid[:, :3]
+    if not np.isfinite(rigid).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+        raise BadRequest("pose: need a rotation and a finite position")
+    if np.linalg.det(rotation) < 0:
+        raise BadRequest("pose: it mirrors what it should turn")
+    return rigid

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a hit and a miss are worth, and which voxels count as occupied or free.
+
+A voxel holds log-odds in thousandths, ``int16(1000 * ln(p / (1 - p)))`` cut towards zero, between two clamps;
+0 is *unknown*.  A hit adds, a miss takes away (Bonxai's ``ProbabilisticMap`` has the same in millionths).  A
+known voxel whose evidence comes to exactly 0 is unknown again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import msgspec
+
+from shmmap.errors import ConfigError
+
+__all__ = ["Occupancy", "log_odds", "probability"]
+
+UNIT: Final = 1000
+HARDLY: Final = 1e-9
+"""Probabilities nearer to 0 and 1 than this have log-odds that do not fit."""
+
+
+def log_odds(probability: float) -> int:
+    """Log-odds in thousandths, cut towards zero."""
+    return int(UNIT * math.log(probability / (1.0 - probability)))
+
+
+def probability(log_odds: float) -> float:
+    """The probability that log-odds in thousandths stand for."""
+    return 1.0 / (1.0 + math.exp(-log_odds / UNIT))
+
+
+class Occupancy(msgspec.Struct, frozen=True):
+    """How evidence is added up, fixed when a map is made; all are probabilities.
+
+    The defaults are those of Rolling-Bonxai's parameter file.
+
+    Attributes
+    ----------
+    hit, miss
+        What one hit and one miss say: above and below a half.
+    clamp_min, clamp_max
+        No voxel is surer than this.  (Rolling-Bonxai calls them ``m_occupancy_min_thresh`` and ``max``.)
+    occupied_above, free_below
+        Voxels beyond these count as occupied and as free.
+
+    Raises
+    ------
+    ConfigError
+        One is no probability, or on the wrong side of a half, or a step comes to nothing.
+    """
+
+    hit: float = 0.7
+    miss: float = 0.4
+    clamp_min: float = 0.12
+    clamp_max: float = 0.97
+    occupied_above: float = 0.5
+    free_below: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if not HARDLY <= value <= 1.0 - HARDLY:
+                raise ConfigError(f"{name} = {value!r}: need a probability between 0 and 1", key=name)
+        for name, upward in (("hit", True), ("clamp_max", True), ("miss", False), ("clamp_min", False)):
+            value = getattr(self, name)
+            worth = log_odds(value)
+            if (worth > 0) != upward or worth == 0:
+                side = "above" if upward else "below"
+                raise ConfigError(f"{name} = {value!r}: need more than 0.0005 {side} 0.5", key=name)
+        for name, right in (
+            ("occupied_above", 0.5 <= self.occupied_above < self.clamp_max),
+            ("free_below", self.clamp_min < self.free_below <= 0.5),
+        ):
+            if not right:
+                value = getattr(self, name)
+                raise ConfigError(f"{name} = {value!r}: it must lie between 0.5 and the clamp", key=name)
+
+    @property
+    def steps(self) -> tuple[int, int, int, int]:
+        """Hit, miss, lower and upper clamp, as log-odds in thousandths."""
+        return log_odds(self.hit), log_odds(self.miss), log_odds(self.clamp_min), log_odds(self.clamp_max)
+
+    @property
+    def thresholds(self) -> tuple[int, int]:
+        """A voxel above the first is occupied, one below the second is free; log-odds in thousandths."""
+        return log_odds(self.occupied_above), log_odds(self.free_below)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chunks in plain memory, and marks applied to them: what the daemon's worker does, without the worker."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shmmap.chunks.applying import UNDO_BYTES, ChunkWriter, UndoRecord
+from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent, chunk_bytes, new_header
+from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.voxels import ChunkKey, voxels_of
+
+MAP_ID = bytes(range(16))
+
+
+class ChunkMemory:
+    """A map's chunks by key, each as long as its bricks, and their writer."""
+
+    def __init__(self, resolution: float, occupancy: Occupancy | None = None) -> None:
+        self.resolution = resolution
+        self.occupancy = occupancy if occupancy is not None else Occupancy()
+        self.chunks: dict[ChunkKey, ChunkView] = {}
+        self.undo = UndoRecord(bytearray(UNDO_BYTES))
+        self.writer = ChunkWriter(self.occupancy, self.undo)
+
+    def chunk(self, key: ChunkKey) -> ChunkView:
+        """A chunk, a new one if there is none."""
+        if key not in self.chunks:
+            _, _, low, high = self.occupancy.steps
+            identity = ChunkIdentity(
+                MAP_ID, key, self.resolution, low, high, *self.occupancy.thresholds, 1, "map"
+            )
+            self.chunks[key] = ChunkView(new_header(identity))
+        return self.chunks[key]
+
+    def grown(self, key: ChunkKey, bricks: int) -> ChunkView:
+        """The same chunk with room for so many bricks."""
+        old = self.chunks[key].data
+        data = bytearray(chunk_bytes(bricks))
+        data[: len(old)] = old
+        self.chunks[key] = ChunkView(data)
+        return self.chunks[key]
+
+    def apply(self, marks: Marks, *, mapper: int = 1, scan: int, known: tuple[int, ...] = ()) -> None:
+        """Add a scan's evidence to all chunks that it touches."""
+        starts = marks.starts.tolist()
+        for number, (key, hits) in enumerate(zip(marks.chunks, marks.hits.tolist(), strict=True)):
+            part = slice(starts[number], starts[number + 1])
+            self.writer.apply(
+                self.chunk(key), marks.words[part], marks.bits[part], hits, mapper=mapper, scan=scan,
+                now_ns=scan, grow=lambda bricks, key=key: self.grown(key, bricks), known_mappers=known,  # type: ignore[misc]
+            )  # fmt: skip
+
+    def voxels(self) -> dict[tuple[int, int, int], int]:
+        """All known voxels; every chunk is consistent."""
+        found: dict[tuple[int, int, int], int] = {}
+        for key, view in self.chunks.items():
+            check_consistent(view, key.text)
+            dense = view.dense()
+            places = np.flatnonzero(dense)
+            for voxel, value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):
+                found[voxel[0], voxel[1], voxel[2]] = value
+        return found

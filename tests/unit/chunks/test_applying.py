@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence adds up as in a slow reference; whoever dies while writing leaves a chunk as it was."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from shmmap.chunks import applying
+from shmmap.chunks.layout import MAPPERS, ChunkView
+from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.errors import SegmentCorrupt
+from shmmap.failpoints import LIVE_STEPS
+from tests.support.chunk_memory import ChunkMemory
+from tests.support.slow_occupancy import SlowOccupancy
+
+FILTER = ScanFilter(0.2, 9.0, -5.0, 5.0)
+
+
+def drive(scans: int, *, seed: int = 1) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Scans with poses along a way that crosses chunks, comes back, and jumps."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for number in range(scans):
+        pose = np.eye(4)
+        yaw = 0.3 * number
+        pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+        pose[:3, 3] = [6.0 * math.sin(0.7 * number), -3.0 * number % 11.0, 0.1 * number]
+        if number % 5 == 4:
+            pose[:3, 3] -= 200.0
+        found.append((rng.normal(0.0, 4.0, (120, 3)), pose))
+    return found
+
+
+def one_word(key: ChunkKey, hits: dict[int, int], misses: dict[int, int]) -> Marks:
+    """Marks in one chunk, by word."""
+    return Marks(
+        np.array([key], np.int32), np.array([len(hits)], np.uint32), np.array([len(misses)], np.uint32),
+        np.array([*hits.values(), *misses.values()], np.uint64), np.array([*hits, *misses], np.uint16),
+    )  # fmt: skip
+
+
+def test_a_drive_equals_the_slow_one_voxel_by_voxel() -> None:
+    memory, marker = ChunkMemory(0.2), Marker(0.2, FILTER)
+    slow = SlowOccupancy(0.2, min_range=0.2, max_range=9.0, min_z=-5.0, max_z=5.0)
+    for number, (points, pose) in enumerate(drive(12), 1):
+        memory.apply(marker.mark(points, pose)[0], scan=number)
+        slow.insert(points.tolist(), pose.tolist()[:3])
+    assert memory.voxels() == slow.voxels
+    assert len(memory.chunks) > 20
+
+
+def test_evidence_stops_at_the_clamps_and_may_come_to_nothing() -> None:
+    """A miss, and so many hits that what they add up to is exactly as much: unknown again."""
+    memory = ChunkMemory(0.1, Occupancy(hit=1 / (1 + math.exp(-0.4055)), miss=1 / (1 + math.exp(0.4055))))
+    assert memory.occupancy.steps[:2] == (405, -405)
+    key, place = ChunkKey(0, 0, 0), {0: 1}
+    states = []
+    for number, (hits, misses) in enumerate([({}, place), (place, {}), (place, {}), *[({}, place)] * 9], 1):
+        memory.apply(one_word(key, hits, misses), scan=number)
+        state = memory.chunks[key].state
+        states.append(
+            (int(memory.chunks[key].dense()[0]), *(int(state[n]) for n in ("active", "occupied", "free")))
+        )
+        memory.voxels()
+    assert states[:3] == [(-405, 1, 0, 1), (0, 0, 0, 0), (405, 1, 1, 0)]
+    assert states[-1] == (-1992, 1, 0, 1)
+    for number in range(20):
+        memory.apply(one_word(key, place, {}), scan=100 + number)
+    assert int(memory.chunks[key].dense()[0]) == 3476
+
+
+def test_every_voxel_of_a_chunk() -> None:
+    memory, key = ChunkMemory(0.1), ChunkKey(-1, -1, -1)
+    everything = dict.fromkeys(range(4096), 2**64 - 1)
+    memory.apply(one_word(key, everything, {}), scan=1)
+    memory.apply(one_word(key, {}, everything), scan=2)
+    view = memory.chunks[key]
+    assert (view.dense() == 847 - 405).all()
+    assert (int(view.state["bricks"]), int(view.state["occupied"])) == (1024, 64**3)
+
+
+def test_thresholds_decide_what_counts() -> None:
+    memory = ChunkMemory(0.1, Occupancy(occupied_above=0.8, free_below=0.3))
+    key = ChunkKey(0, 0, 0)
+    for number in (1, 2, 3):
+        memory.apply(one_word(key, {0: 0b11}, {1: 0b111}), scan=number)
+        state = memory.chunks[key].state
+        counted = tuple(int(state[name]) for name in ("active", "occupied", "free"))
+        assert counted == (5, 2 * (number * 847 > 1386), 3 * (number * -405 < -847))
+
+
+def test_bricks_lie_in_the_order_in_which_they_were_touched() -> None:
+    memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
+    memory.apply(one_word(key, {4 * 9: 1, 4 * 700: 1}, {4 * 3: 1}), scan=1)
+    memory.apply(one_word(key, {4 * 3: 1, 4 * 5: 1}, {}), scan=2)
+    index = memory.chunks[key].index
+    assert {brick: int(index[brick]) for brick in np.flatnonzero(index).tolist()} == {
+        9: 1,
+        700: 2,
+        3: 3,
+        5: 4,
+    }
+
+
+def test_a_scan_that_comes_twice_counts_once() -> None:
+    memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
+    for mapper, scan in ((1, 5), (1, 5), (1, 4), (2, 5), (2, 5), (1, 6)):
+        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=scan)
+    state = memory.chunks[key].state
+    assert int(memory.chunks[key].dense()[0]) == 3 * 847
+    assert (int(state["version"]), int(state["sequence"]), int(state["changed_ns"])) == (3, 6, 6)
+
+
+def test_a_chunk_remembers_the_mappers_that_the_map_knows() -> None:
+    memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
+    everybody = tuple(range(1, MAPPERS + 1))
+    for mapper in everybody:
+        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=1, known=everybody)
+    with pytest.raises(SegmentCorrupt, match="32 mappers"):
+        memory.apply(one_word(key, {0: 1}, {}), mapper=99, scan=1, known=(*everybody, 99))
+    memory = ChunkMemory(0.1)
+    for mapper in everybody:
+        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=1, known=everybody)
+    known = (*everybody[:3], *everybody[4:], 99)
+    memory.apply(one_word(key, {0: 1}, {}), mapper=99, scan=1, known=known)
+    mappers = memory.chunks[key].state["mappers"]["number"].tolist()
+    assert mappers == [1, 2, 3, 99, *range(5, MAPPERS + 1)]
+
+
+class Died(BaseException):
+    """Stands for SIGKILL: nothing of ours runs after it."""
+
+
+def dies_at(monkeypatch: pytest.MonkeyPatch, label: str, time: int) -> None:
+    left = [time]
+
+    def step(here: str) -> None:
+        left[0] -= here == label
+        if left[0] == 0:
+            left[0] = -1
+            raise Died
+
+    monkeypatch.setattr(applying, "step", step)
+
+
+def interrupted(
+    monkeypatch: pytest.MonkeyPatch, label: str, *, undo: bool
+) -> tuple[ChunkMemory, ChunkMemory]:
+    """The same drive twice; in one the writer dies in its seventh scan, and the mapper sends that again."""
+    broken, whole, marker = ChunkMemory(0.2), ChunkMemory(0.2), Marker(0.2, FILTER)
+    for number, (points, pose) in enumerate(drive(9), 1):
+        marks, _ = marker.mark(points, pose)
+        whole.apply(marks, scan=number)
+        if number == 7:
+            dies_at(monkeypatch, label, 5)
+            with pytest.raises(Died):
+                broken.apply(marks, scan=number)
+            monkeypatch.setattr(applying, "step", lambda _label: None)
+            of = broken.undo.of
+            if of is not None and undo:
+                before = int(broken.chunks[of[0]].state["sequence"])
+                broken.undo.restore(broken.chunks[of[0]])
+                after = int(broken.chunks[of[0]].state["sequence"])
+                assert after % 2 == 0
+                assert after > before
+            assert (broken.undo.of is None) == (undo or of is None)
+        broken.apply(marks, scan=number)
+    return broken, whole
+
+
+@pytest.mark.parametrize("label", LIVE_STEPS)
+def test_a_writer_that_dies_loses_nothing(monkeypatch: pytest.MonkeyPatch, label: str) -> None:
+    broken, whole = interrupted(monkeypatch, label, undo=True)
+    assert broken.voxels() == whole.voxels()
+    for key, view in whole.chunks.items():
+        other = broken.chunks[key]
+        assert other.bricks.tobytes()[: view.bricks.nbytes] == view.bricks.tobytes()
+        assert np.array_equal(other.index, view.index)
+        assert np.array_equal(other.state["mappers"], view.state["mappers"])
+
+
+def test_without_the_undo_record_something_would_be_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken, whole = interrupted(monkeypatch, "live.applied", undo=False)
+    with pytest.raises((AssertionError, SegmentCorrupt)):
+        assert broken.voxels() == whole.voxels()
+
+
+def test_while_it_is_written_a_chunk_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
+    seen: dict[str, int] = {}
+    monkeypatch.setattr(
+        applying, "step", lambda label: seen.update({label: int(memory.chunk(key).state["sequence"])})
+    )
+    memory.apply(one_word(key, {0: 1}, {}), scan=1)
+    assert seen == {"live.copied": 0, "live.odd": 1, "live.applied": 1, "live.even": 2}
+
+
+def test_an_undo_record_of_something_else_is_refused() -> None:
+    memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
+    memory.apply(one_word(key, {4 * brick: 1 for brick in range(5)}, {}), scan=1)
+    view = memory.chunks[key]
+    memory.undo.keep(view, view.index[:5].copy())
+    assert memory.undo.of == (key, 1)
+    with pytest.raises(SegmentCorrupt, match="undo record"):
+        memory.undo.restore(ChunkView(bytearray(view.data[: 4096 + 3 * 512])))
+
+
+def test_versions_rise_by_one_a_scan() -> None:
+    memory, marker = ChunkMemory(0.2), Marker(0.2, FILTER)
+    versions: list[int] = [0]
+    for number, (points, pose) in enumerate(drive(4), 1):
+        memory.apply(marker.mark(points, pose)[0], scan=number)
+        versions.append(sum(int(view.state["version"]) for view in memory.chunks.values()))
+    assert all(before < after for before, after in pairwise(versions))

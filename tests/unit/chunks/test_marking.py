@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Marks equal those of a slow reference voxel by voxel, whatever the scan and wherever the sensor."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from shmmap.chunks import marking
+from shmmap.chunks.marking import Counts, Marker, ScanFilter
+from shmmap.chunks.marks import Marks
+from shmmap.chunks.voxels import voxels_of
+from shmmap.errors import BadRequest
+from tests.support.slow_occupancy import SlowOccupancy, Voxel
+
+Points = NDArray[np.floating]
+
+
+def pose_at(position: tuple[float, float, float], yaw: float = 0.0) -> NDArray[np.float64]:
+    """A sensor that has turned about the z axis."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    pose[:3, 3] = position
+    return pose
+
+
+def sets_of(marks: Marks) -> tuple[set[Voxel], set[Voxel]]:
+    """Voxels that are hit, and that are passed through."""
+    found: tuple[set[Voxel], set[Voxel]] = (set(), set())
+    starts = marks.starts.tolist()
+    for number, (key, hits) in enumerate(zip(marks.chunks, marks.hits.tolist(), strict=True)):
+        for at in range(starts[number], starts[number + 1]):
+            word, bits = int(marks.words[at]), int(marks.bits[at])
+            places = [word * 64 + bit for bit in range(64) if bits >> bit & 1]
+            which = found[0 if at < starts[number] + hits else 1]
+            which.update((x, y, z) for x, y, z in voxels_of(key, np.array(places)).tolist())
+    return found
+
+
+def assert_equal_to_the_slow_one(marker: Marker, points: Points, pose: NDArray[np.float64]) -> Marks:
+    wanted = marker.filter
+    slow = SlowOccupancy(
+        marker.resolution, min_range=wanted.min_range, max_range=wanted.max_range, min_z=wanted.min_z,
+        max_z=wanted.max_z,
+    )  # fmt: skip
+    marks, counts = marker.mark(points, pose)
+    hits, misses = sets_of(marks)
+    expected = slow.marks(points.tolist(), pose.tolist()[:3])
+    assert hits == expected[0]
+    assert misses == expected[1]
+    assert sum(getattr(counts, name) for name in counts.__struct_fields__) == len(points)
+    return marks
+
+
+SENSORS = [
+    (0.0, 0.0, 0.0), (0.01, -0.01, 0.0), (12.8, -12.8, 6.4), (-1000.05, 2000.15, -30.0),
+    (89571.3, 42301.7, 12.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize(("resolution", "max_range"), [(0.2, 30.0), (0.05, 5.0), (1.0, 9.0)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_scan(sensor: tuple[float, float, float], resolution: float, max_range: float, dtype: type) -> None:
+    """Near, far and near the greatest range; the same marker again and again."""
+    rng = np.random.default_rng(int(100 * resolution))
+    marker = Marker(resolution, ScanFilter(0.5, max_range, -3.0, 3.0))
+    for yaw in (0.0, 0.7, math.pi):
+        points: Points = rng.normal(0.0, max_range / 2, (150, 3)).astype(dtype)
+        points[:, 2] /= max_range / 3
+        assert_equal_to_the_slow_one(marker, points, pose_at(sensor, yaw))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_points_on_the_borders_of_voxels_and_chunks(dtype: type) -> None:
+    rng = np.random.default_rng(3)
+    marker = Marker(0.1, ScanFilter(0.0, 20.0, -20.0, 20.0))
+    points: Points = (rng.integers(-70, 70, (300, 3)) * 0.1).astype(dtype)
+    for sensor in ((0.0, 0.0, 0.0), (6.4, 6.4, 6.4), (-6.4, 0.1, -0.1), (0.3, 0.7, 0.6)):
+        assert_equal_to_the_slow_one(marker, points, pose_at(sensor))
+
+
+SMALL = st.integers(-40, 40).map(lambda number: number * 0.25)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.tuples(SMALL, SMALL, SMALL), max_size=25),
+    st.tuples(SMALL, SMALL, SMALL),
+    st.sampled_from([0.0, math.pi / 2, 1.0]),
+)
+def test_any_scan(
+    points: list[tuple[float, float, float]], sensor: tuple[float, float, float], yaw: float
+) -> None:
+    scan = np.array(points, np.float64).reshape(-1, 3)
+    assert_equal_to_the_slow_one(Marker(0.5, ScanFilter(0.0, 7.0, -9.0, 9.0)), scan, pose_at(sensor, yaw))
+
+
+def test_the_order_of_points_does_not_count() -> None:
+    """A ray that is cut may end in a voxel that another one hits: in Bonxai whichever comes first counts."""
+    marker = Marker(0.5, ScanFilter(0.0, 4.1, -9.0, 9.0))
+    hit, cut = [4.05, 0.1, 0.1], [8.0, 0.1, 0.1]
+    one, _ = marker.mark(np.array([hit, cut]), pose_at((0.0, 0.0, 0.0)))
+    other, _ = marker.mark(np.array([cut, hit]), pose_at((0.0, 0.0, 0.0)))
+    assert sets_of(one) == sets_of(other)
+    assert sets_of(one)[0] == {(8, 0, 0)}
+    points = np.random.default_rng(1).normal(0, 3, (400, 3))
+    straight, _ = marker.mark(points, pose_at((1.0, 2.0, 3.0)))
+    turned, _ = marker.mark(points[::-1], pose_at((1.0, 2.0, 3.0)))
+    assert all(
+        np.array_equal(getattr(straight, name), getattr(turned, name)) for name in straight.__struct_fields__
+    )
+
+
+def test_what_becomes_of_each_point_is_counted() -> None:
+    points = np.array(
+        [
+            [1, 0, 0],
+            [9, 0, 0],
+            [0.1, 0, 0],
+            [1, 0, 3],
+            [np.nan, 0, 0],
+            [0, np.inf, 0],
+            [5, 0, 0],
+            [0, -np.inf, 9],
+        ],
+        np.float32,
+    )
+    marks, counts = Marker(0.1).mark(points, pose_at((0.0, 0.0, 0.0)))
+    assert counts == Counts(near=1, far=2, too_near=1, outside_z=1, not_finite=3)
+    assert sets_of(marks)[0] == {(10, 0, 0)}
+
+
+def test_a_scan_of_nothing() -> None:
+    marker = Marker(0.1)
+    for points in (np.empty((0, 3)), np.full((4, 3), np.nan)):
+        marks, _ = marker.mark(points, pose_at((0.0, 0.0, 0.0)))
+        assert (len(marks.keys), len(marks.words)) == (0, 0)
+
+
+def test_a_ray_within_one_voxel_passes_through_nothing() -> None:
+    marks, _ = Marker(1.0, ScanFilter(0.0, 5.0)).mark(np.array([[0.3, 0.3, 0.3]]), pose_at((0.1, 0.1, 0.1)))
+    assert sets_of(marks) == ({(0, 0, 0)}, set())
+
+
+def test_more_chunks_than_there_was_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(marking, "FIRST_SLOTS", 1)
+    points = np.random.default_rng(2).normal(0, 12, (60, 3))
+    marker = Marker(0.1, ScanFilter(0.5, 30.0, -30.0, 30.0))
+    marks = assert_equal_to_the_slow_one(marker, points, pose_at((0.0, 0.0, 0.0)))
+    assert len(marks.keys) > 8
+    monkeypatch.setattr(marking, "MOST_CHUNKS", 4)
+    small = Marker(0.1, ScanFilter(0.5, 30.0, -30.0, 30.0))
+    with pytest.raises(BadRequest, match="more than 4 chunks"):
+        small.mark(points, pose_at((0.0, 0.0, 0.0)))
+    assert_equal_to_the_slow_one(small, points[:1] / 100 + 0.5, pose_at((0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("points", "pose", "said"),
+    [
+        (np.zeros((3, 2)), np.eye(4), r"shape \(N, 3\)"),
+        (np.zeros((3, 3)), np.eye(3), r"shape \(3, 4\)"),
+        (np.zeros((3, 3)), 2 * np.eye(4), "a rotation"),
+        (np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0, 1.0]), "mirrors"),
+        (np.zeros((3, 3)), pose_at((np.nan, 0.0, 0.0)), "a rotation and a finite position"),
+        (np.zeros((3, 3)), pose_at((1.0737417e8, 0.0, 0.0)), "further than"),
+    ],
+)
+def test_what_is_no_scan_is_refused(points: Points, pose: NDArray[np.float64], said: str) -> None:
+    with pytest.raises(BadRequest, match=said):
+        Marker(0.1).mark(points, pose)
+
+
+def test_marks_come_in_the_order_of_their_chunks() -> None:
+    points = np.random.default_rng(4).normal(0, 8, (300, 3))
+    marks, _ = Marker(0.1, ScanFilter(0.5, 12.0, -30.0, 30.0)).mark(points, pose_at((-3.0, 5.0, 0.0)))
+    keys = [tuple(key) for key in marks.keys.tolist()]
+    assert keys == sorted(keys)
+    assert len(keys) > 8
