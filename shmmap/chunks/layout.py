@@ -55,6 +55,7 @@ MOST_FRAME_BYTES: Final = 40
 _CONSTANT: Final = struct.Struct("<8sHHI16s3iId4hQ8x40s")
 _CRC: Final = struct.Struct("<II")
 STATE_AT: Final = 128
+MAPPERS_AT: Final = 256
 INDEX_AT: Final = 2048
 
 STATE: Final = np.dtype(
