@@ -104,6 +104,7 @@ class Marker:
                 key="max_range",
             )
         self._side = 2 * self._reach + 1
+        self._codes = kernels.window_codes(self._side)
         self._table = np.full(self._side**3, -1, np.int32)
         self._ends = np.empty((0, 3), np.int32)
         self._make_slots(FIRST_SLOTS)
@@ -160,14 +161,12 @@ class Marker:
         limits = np.array(
             [1.0 / self.resolution, wanted.min_range, wanted.max_range, wanted.min_z, wanted.max_z]
         )
-        slots = (self._table, self._used, self._slots)
-        rays = kernels.mark_ends(
-            points, pose, limits, corner, self._side, *slots, self._hits, self._misses, self._ends, counts
-        )
+        ends, slots = self._ends[: len(points)], (self._codes, self._table, self._used, self._slots)
+        rays = kernels.mark_ends(points, pose, limits, corner, *slots, self._hits, self._misses, ends, counts)
         if rays == kernels.NO_SLOTS:
             return None
         x, y, z = sensor.tolist()
-        if not kernels.mark_rays(self._ends, rays, x, y, z, self._side, *slots, self._misses):
+        if not kernels.mark_rays(ends, rays, x, y, z, *slots, self._misses):
             return None
         return Counts(*counts.tolist())
 
