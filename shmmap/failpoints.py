@@ -43,7 +43,17 @@ DAEMON_STEPS: Final = (
     "daemon.unlinked",
     "daemon.accept",
 )
-LIVE_STEPS: Final = ("live.copied", "live.odd", "live.applied", "live.even")
+LIVE_STEPS: Final = (
+    "live.copied",
+    "live.odd",
+    "live.applied",
+    "live.even",
+    "live.map",
+    "live.written",
+    "live.synced",
+    "live.renamed",
+    "live.flushed",
+)
 CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.map")
 
 

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 __all__ = [
     "CHUNK_FILE_VERSION",
     "CODECS",
+    "FILE_HEADER_BYTES",
     "ChunkFileHeader",
+    "check_file",
     "decode_chunk",
     "encode_chunk",
     "read_file_header",
@@ -196,6 +198,26 @@ def read_file_header(data: bytes | memoryview, path: str = "") -> ChunkFileHeade
     )
 
 
+def check_file(data: bytes, path: str = "") -> ChunkFileHeader:
+    """Check the length and the checksums of a whole file; returns its header.
+
+    Raises
+    ------
+    MapDataError
+        One of them is wrong, or see `read_file_header`.
+    """
+    header = read_file_header(data, path)
+    stored = memoryview(data)[FILE_HEADER_BYTES:]
+    if len(stored) != header.stored_bytes:
+        raise MapDataError(
+            f"{len(stored)} bytes of body where there should be {header.stored_bytes}",
+            path=path, offset=FILE_HEADER_BYTES, cause="truncated",
+        )  # fmt: skip
+    if xxh3_64_intdigest(stored) != header.body_hash:
+        raise MapDataError("the body's checksum is wrong", path=path, offset=FILE_HEADER_BYTES)
+    return header
+
+
 def decode_chunk(data: bytes, identity: ChunkIdentity, path: str = "") -> bytearray:
     """Return the bytes in memory of a chunk that was saved, as good as new.
 
@@ -226,14 +248,8 @@ def decode_chunk(data: bytes, identity: ChunkIdentity, path: str = "") -> bytear
         raise MapDataError(
             f"its voxels are {header.resolution} m a side, not {identity.resolution} m", path=path, offset=104
         )
+    check_file(data, path)
     stored = memoryview(data)[FILE_HEADER_BYTES:]
-    if len(stored) != header.stored_bytes:
-        raise MapDataError(
-            f"{len(stored)} bytes of body where there should be {header.stored_bytes}",
-            path=path, offset=FILE_HEADER_BYTES, cause="truncated",
-        )  # fmt: skip
-    if xxh3_64_intdigest(stored) != header.body_hash:
-        raise MapDataError("the body's checksum is wrong", path=path, offset=FILE_HEADER_BYTES)
     expected = _FIXED_BYTES + header.bricks * BRICK_BYTES
     try:
         body = _decompress(header.codec, stored, expected)

@@ -57,7 +57,9 @@ PARTS = {
         "errors", "columns", "failpoints", "geometry", "optional_packages", "segment", "protocol",
         "statistics.layout",
     },
-    "daemon": BASE | {"formats", "segment", "protocol", "statistics", "layers", "origin", "dividing"},
+    "daemon": BASE | {
+        "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
+    },
     "prepare": BASE | {"formats", "layers", "origin"},
     "service": BASE,
     "doctor": BASE | {
@@ -79,7 +81,7 @@ PARTS = {
 """What stands below what; a dotted name allows that module or package alone."""
 ROOMS = [
     {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
-    {"telemetry"}, {"loading"}, {"cache"}, {"events"}, {"transport"}, {"map", "pins"},
+    {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"map", "pins"},
     {"host", "service_manager"}, {"config"}, {"config_file", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live maps: chunks that are written while others read them, kept in memory and on disk."""

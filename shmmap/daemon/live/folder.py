@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The few things that are done with the files of a live map, one system call each.
+
+What is written is on the disk after `Folder.sync`, and a file's name after `Folder.sync_names`; before that
+a power cut may leave either as it was, or, of a file, any part of it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from typing import Protocol
+
+from shmmap.errors import InstanceBusy
+
+__all__ = ["Files", "Folder"]
+
+
+class Files(Protocol):
+    """Files in one directory, by name."""
+
+    def names(self) -> list[str]:
+        """All names."""
+
+    def size(self, name: str) -> int:
+        """Bytes of a file."""
+
+    def read(self, name: str, most: int = -1) -> bytes:
+        """The first ``most`` bytes of a file, or all."""
+
+    def write(self, name: str, data: bytes) -> None:
+        """Make a file of a new name."""
+
+    def sync(self, name: str) -> None:
+        """Have what was written on the disk."""
+
+    def rename(self, old: str, new: str) -> None:
+        """Give a file another name, in the place of what has it."""
+
+    def remove(self, name: str) -> None:
+        """Remove a file."""
+
+    def sync_names(self) -> None:
+        """Have all names on the disk as they are now."""
+
+
+class Folder:
+    """Files of a directory that nobody else works with: there is a lock on it while this lives.
+
+    Parameters
+    ----------
+    path
+        Made if it is missing, for this user alone.
+
+    Raises
+    ------
+    InstanceBusy
+        Somebody else has it open.
+    OSError
+        It cannot be made or opened.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        os.makedirs(self.path, mode=0o700, exist_ok=True)
+        self._fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._fd)
+            raise InstanceBusy(
+                f"another process works with the live map in {self.path}",
+                hint="stop it, or choose another directory",
+            ) from None
+
+    def close(self) -> None:
+        """Let others have it."""
+        os.close(self._fd)
+
+    def names(self) -> list[str]:
+        """All names."""
+        return os.listdir(self._fd)
+
+    def size(self, name: str) -> int:
+        """Bytes of a file."""
+        return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_size
+
+    def _open(self, name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600, dir_fd=self._fd)
+
+    def read(self, name: str, most: int = -1) -> bytes:
+        """The first ``most`` bytes of a file, or all."""
+        with open(self._open(name, os.O_RDONLY), "rb") as file:
+            return file.read(most)
+
+    def write(self, name: str, data: bytes) -> None:
+        """Make a file of a new name."""
+        with open(self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb", buffering=0) as file:
+            left = memoryview(data)
+            while left:
+                left = left[file.write(left) :]
+
+    def sync(self, name: str) -> None:
+        """Have what was written on the disk."""
+        fd = self._open(name, os.O_RDONLY)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+
+    def rename(self, old: str, new: str) -> None:
+        """Give a file another name, in the place of what has it."""
+        os.rename(old, new, src_dir_fd=self._fd, dst_dir_fd=self._fd)
+
+    def remove(self, name: str) -> None:
+        """Remove a file."""
+        os.unlink(name, dir_fd=self._fd)
+
+    def sync_names(self) -> None:
+        """Have all names on the disk as they are now."""
+        os.fsync(self._fd)

@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live map on disk: what it is, who maps it, and a file for each of its chunks.
+
+- ``map.json`` says what the map is, and never forgets a mapper's number; it is on the disk before any of
+  that is used.
+- ``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name, is on the disk
+  before it takes the place of an older one, and only then may its memory be freed.  It is *durable* after
+  `MapFiles.flush`.
+- ``manifest.json`` lists the chunks that are durable.  It is written last, and only says what somebody may
+  have taken away; all else is read from the chunks' headers.
+- What cannot be read is put aside as ``3_-1_0.chunk.damaged.1``, told, and never overwritten.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from typing import Final
+
+import msgspec
+
+from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, check_file, read_file_header
+from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.folder import Files
+from shmmap.errors import BadRequest, ConfigError, MapDataError
+from shmmap.failpoints import step
+from shmmap.logfmt import log
+
+__all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
+
+MAP_FILE: Final = "map.json"
+MANIFEST: Final = "manifest.json"
+MAP_FORMAT: Final = 1
+MOST_MAPPERS: Final = 32
+SCANS_AHEAD: Final = 256
+"""Numbers of scans that ``map.json`` leaves to a mapper before it is written again."""
+
+_CHUNK: Final = ".chunk"
+_DAMAGED: Final = ".chunk.damaged."
+_INTERIM: Final = ".tmp"
+
+
+class MapSettings(msgspec.Struct, frozen=True):
+    """What is fixed when a map is made.
+
+    Attributes
+    ----------
+    resolution
+        Edge of a voxel, metres.
+    occupancy
+        What a hit and a miss are worth.
+    frame_id
+        Frame of the map.
+    """
+
+    resolution: float = 0.05
+    occupancy: Occupancy = Occupancy()
+    frame_id: str = "map"
+
+
+class Mapper(msgspec.Struct):
+    """Who maps: a user and the name that a program of theirs chose.
+
+    Attributes
+    ----------
+    number
+        Stands for it in chunks, and is never given to another.
+    scans
+        All scans that it sent have smaller numbers; true on disk before one is applied.
+    """
+
+    number: int
+    uid: int
+    name: str
+    scans: int = 0
+
+
+class Row(msgspec.Struct, frozen=True):
+    """What is known of a chunk's file without opening it."""
+
+    version: int
+    bytes: int
+    active: int
+    occupied: int
+    free: int
+
+
+class _MapFile(msgspec.Struct):
+    """``map.json``."""
+
+    format: int
+    map_id: str
+    settings: MapSettings
+    mappers: list[Mapper] = []
+    next_mapper: int = 1
+    lives: int = 0
+
+
+class MapFiles:
+    """The files of one live map.
+
+    Parameters
+    ----------
+    files
+        Of a directory that is this map's alone.
+    settings
+        What a new map is to be; an old one must be the same.
+
+    Attributes
+    ----------
+    rows : dict
+        The chunks on disk.
+    damaged : dict
+        Files that were put aside since the start, and why.
+    missing : dict
+        Chunks that were durable and are not there any more, or only in an older version.
+
+    Raises
+    ------
+    ConfigError
+        The map was made with other settings.
+    MapDataError
+        ``map.json`` is not what it should be, or is missing although there are chunks.
+    OSError
+        A file cannot be read or written.
+    """
+
+    def __init__(self, files: Files, settings: MapSettings) -> None:
+        self.files = files
+        self.rows: dict[ChunkKey, Row] = {}
+        self.damaged: dict[str, str] = {}
+        self.missing: dict[ChunkKey, Row] = {}
+        self._unflushed = False
+        names = files.names()
+        if MAP_FILE in names:
+            self._map = self._read_map(settings)
+        elif any(name.endswith(_CHUNK) for name in names):
+            raise MapDataError(
+                "there are chunks, but the file that says what they are is missing",
+                path=MAP_FILE, hint="choose another directory, or bring the file back",
+            )  # fmt: skip
+        else:
+            self._map = _MapFile(MAP_FORMAT, secrets.token_hex(16), settings)
+            self._write_map()
+        self._adopt_interim(names)
+        self._read_rows()
+
+    # --- what the map is ------------------------------------------------------------------------
+
+    @property
+    def map_id(self) -> bytes:
+        """16 bytes that no other map has."""
+        return bytes.fromhex(self._map.map_id)
+
+    @property
+    def settings(self) -> MapSettings:
+        """What was fixed when it was made."""
+        return self._map.settings
+
+    @property
+    def mappers(self) -> list[Mapper]:
+        """Who maps, the one that was first heard of first."""
+        return self._map.mappers
+
+    def begin_life(self) -> int:
+        """Return how many times the map was in memory, this time included; on disk when this returns."""
+        self._map.lives += 1
+        self._write_map()
+        return self._map.lives
+
+    def add_mapper(self, uid: int, name: str) -> Mapper:
+        """Give a new mapper its number; it is on the disk when this returns."""
+        mapper = Mapper(self._map.next_mapper, uid, name)
+        self._map.next_mapper += 1
+        self._map.mappers.append(mapper)
+        self._write_map()
+        return mapper
+
+    def forget_mapper(self, mapper: Mapper) -> None:
+        """A mapper gives way; nobody gets its number."""
+        self._map.mappers.remove(mapper)
+        self._write_map()
+
+    def expect_scan(self, mapper: Mapper, scan: int) -> None:
+        """Make sure that the disk knows that a mapper's scans may have come to this number."""
+        if scan >= mapper.scans:
+            mapper.scans = scan + SCANS_AHEAD
+            self._write_map()
+
+    def _read_map(self, settings: MapSettings) -> _MapFile:
+        try:
+            found = msgspec.json.decode(self.files.read(MAP_FILE), type=_MapFile)
+            bytes.fromhex(found.map_id)
+        except (msgspec.MsgspecError, ValueError, ConfigError) as error:
+            raise MapDataError(f"it does not say what the map is: {error}", path=MAP_FILE) from error
+        if found.format != MAP_FORMAT or len(found.map_id) != 32:
+            raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
+        for name in settings.__struct_fields__:
+            old, new = getattr(found.settings, name), getattr(settings, name)
+            if old != new:
+                raise ConfigError(
+                    f"{name} = {new!r}: the map was made with {old!r}",
+                    key=name, hint="leave it as it was, or choose another directory for a new map",
+                )  # fmt: skip
+        return found
+
+    def _write_map(self) -> None:
+        self._replace(MAP_FILE, msgspec.json.format(msgspec.json.encode(self._map), indent=1) + b"\n")
+        self.files.sync_names()
+        step("live.map")
+
+    # --- chunks ---------------------------------------------------------------------------------
+
+    def load(self, key: ChunkKey) -> bytes | None:
+        """Read the file of a chunk; None where there is none.  Raises OSError."""
+        if key not in self.rows:
+            return None
+        return self.files.read(key.text + _CHUNK)
+
+    def put_aside(self, key: ChunkKey, why: str) -> str:
+        """Keep a file that cannot be read under another name, which is returned."""
+        taken = set(self.files.names())
+        number = 1
+        while (name := f"{key.text}{_DAMAGED}{number}") in taken:
+            number += 1
+        self.files.rename(key.text + _CHUNK, name)
+        self.files.sync_names()
+        self.rows.pop(key, None)
+        self.damaged[name] = why
+        log.error("chunk put aside", chunk=key.text, file=name, reason=why)
+        return name
+
+    def save(self, key: ChunkKey, data: bytes) -> None:
+        """Write the file of a chunk in the place of an older one; durable after `flush`.
+
+        When this returns, the chunk's memory may be freed: no death of a process loses it.
+        """
+        header = read_file_header(data)
+        self._replace(key.text + _CHUNK, data)
+        self.rows[key] = _row(header, len(data))
+        self._unflushed = True
+
+    def flush(self) -> None:
+        """Make durable what was saved."""
+        if self._unflushed:
+            self._unflushed = False
+            self.files.sync_names()
+            step("live.flushed")
+
+    def write_manifest(self) -> None:
+        """Make durable what was saved, and list it."""
+        self.flush()
+        rows = {key.text: row for key, row in self.rows.items()}
+        self._replace(MANIFEST, msgspec.json.encode({"format": MAP_FORMAT, "chunks": rows}))
+        self.files.sync_names()
+
+    def _replace(self, name: str, data: bytes) -> None:
+        interim = f".{name}.{secrets.token_hex(4)}{_INTERIM}"
+        try:
+            self.files.write(interim, data)
+            step("live.written")
+            self.files.sync(interim)
+            step("live.synced")
+            self.files.rename(interim, name)
+            step("live.renamed")
+        except OSError:
+            with contextlib.suppress(OSError):
+                self.files.remove(interim)
+            raise
+
+    # --- the start ------------------------------------------------------------------------------
+
+    def _header(self, name: str, *, whole: bool = False) -> ChunkFileHeader | None:
+        """What a file of this map says of its chunk, if its length is right, and, if ``whole``, its body."""
+        with contextlib.suppress(OSError, MapDataError):
+            if whole:
+                header = check_file(self.files.read(name), name)
+            else:
+                header = read_file_header(self.files.read(name, FILE_HEADER_BYTES), name)
+            right = self.files.size(name) == FILE_HEADER_BYTES + header.stored_bytes
+            if right and header.map_id == self.map_id:
+                return header
+        return None
+
+    def _adopt_interim(self, names: list[str]) -> None:
+        """A file that was written and had not got its name may be the newest of its chunk; others go."""
+        for name in names:
+            if not (name.startswith(".") and name.endswith(_INTERIM)):
+                continue
+            header = self._header(name, whole=True)
+            if header is not None:
+                place = header.key.text + _CHUNK
+                old = self._header(place)
+                if name.startswith(f".{place}.") and (old is None or old.version < header.version):
+                    if old is None and place in names:
+                        self.put_aside(header.key, "it cannot be read, and a whole one was beside it")
+                    self.files.rename(name, place)
+                    self._unflushed = True
+                    continue
+            self.files.remove(name)
+
+    def _read_rows(self) -> None:
+        """Find the chunks, and what is missing of those that the manifest lists."""
+        names = self.files.names()
+        for name in names:
+            if not name.endswith(_CHUNK):
+                continue
+            try:
+                key = ChunkKey.from_text(name.removesuffix(_CHUNK))
+            except BadRequest:
+                log.warning("not a chunk of this map", file=name)
+                continue
+            header = self._header(name)
+            if header is None or header.key != key:
+                self.put_aside(key, "its header or its length is wrong")
+            else:
+                self.rows[key] = _row(header, FILE_HEADER_BYTES + header.stored_bytes)
+        self.flush()
+        listed: dict[str, Row] = {}
+        if MANIFEST in names:
+            with contextlib.suppress(msgspec.MsgspecError):  # it is written anew
+                listed = msgspec.json.decode(self.files.read(MANIFEST), type=_Manifest).chunks
+        for text, row in listed.items():
+            with contextlib.suppress(BadRequest):
+                key = ChunkKey.from_text(text)
+                if key not in self.rows or self.rows[key].version < row.version:
+                    self.missing[key] = row
+                    log.error("chunk missing", chunk=text, version=row.version)
+
+
+class _Manifest(msgspec.Struct):
+    """``manifest.json``."""
+
+    format: int
+    chunks: dict[str, Row]
+
+
+def _row(header: ChunkFileHeader, nbytes: int) -> Row:
+    return Row(header.version, nbytes, header.active, header.occupied, header.free)

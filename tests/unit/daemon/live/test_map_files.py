@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live map on disk: durable when it says so, whatever the power does; damaged files are kept."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
+from shmmap.chunks.layout import ChunkIdentity, ChunkView, new_header
+from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.folder import Folder
+from shmmap.daemon.live.map_files import MapFiles, MapSettings, Row
+from shmmap.errors import ConfigError, InstanceBusy, MapDataError
+from tests.support.cut_disk import CutDisk, PowerCut
+
+SETTINGS = MapSettings(resolution=0.1)
+KEYS = [ChunkKey(0, 0, 0), ChunkKey(-1, 2, 0), ChunkKey(5, 5, -5)]
+
+
+def identity(made: MapFiles, key: ChunkKey) -> ChunkIdentity:
+    return ChunkIdentity(made.map_id, key, 0.1, -1992, 3476, 0, 0, 1, "map")
+
+
+def chunk(made: MapFiles, key: ChunkKey, version: int) -> bytes:
+    """The file of an empty chunk of this version."""
+    view = ChunkView(new_header(identity(made, key)))
+    view.state["version"] = version
+    return encode_chunk(view, "raw")
+
+
+def version_of(made: MapFiles, key: ChunkKey) -> int:
+    """The version that a chunk's file holds, read whole; 0 where there is none."""
+    data = made.load(key)
+    return int(ChunkView(decode_chunk(data, identity(made, key))).state["version"]) if data is not None else 0
+
+
+def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
+    folder = Folder(tmp_path / "state" / "lidar")
+    made = MapFiles(folder, SETTINGS)
+    assert (made.settings, made.mappers, made.rows) == (SETTINGS, [], {})
+    assert made.begin_life() == 1
+    mapper = made.add_mapper(1000, "front")
+    made.expect_scan(mapper, 0)
+    made.save(KEYS[0], chunk(made, KEYS[0], 3))
+    made.save(KEYS[1], chunk(made, KEYS[1], 1))
+    made.write_manifest()
+    folder.close()
+    assert (tmp_path / "state" / "lidar").stat().st_mode & 0o777 == 0o700
+    again = MapFiles(folder := Folder(tmp_path / "state" / "lidar"), SETTINGS)
+    assert again.map_id == made.map_id
+    assert again.begin_life() == 2
+    assert [(m.number, m.uid, m.name, m.scans) for m in again.mappers] == [(1, 1000, "front", 256)]
+    assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0)}
+    assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
+    assert not again.missing
+    assert not again.damaged
+    folder.close()
+
+
+def test_the_number_of_a_mapper_is_never_given_again() -> None:
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    first = made.add_mapper(0, "a")
+    made.forget_mapper(first)
+    assert MapFiles(disk, SETTINGS).add_mapper(0, "a").number == 2
+
+
+def test_scans_are_expected_ahead() -> None:
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    mapper = made.add_mapper(0, "a")
+    for scan in range(1, 600):
+        made.expect_scan(mapper, scan)
+        assert MapFiles(disk, SETTINGS).mappers[0].scans > scan
+
+
+@pytest.mark.parametrize(
+    ("other", "key"),
+    [
+        (MapSettings(resolution=0.2), "resolution"),
+        (MapSettings(resolution=0.1, frame_id="odom"), "frame_id"),
+        (MapSettings(resolution=0.1, occupancy=Occupancy(hit=0.8)), "occupancy"),
+    ],
+)
+def test_other_settings_are_refused(other: MapSettings, key: str) -> None:
+    disk = CutDisk()
+    MapFiles(disk, SETTINGS)
+    with pytest.raises(ConfigError, match="was made with") as caught:
+        MapFiles(disk, other)
+    assert caught.value.key == key
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"{", b'{"format": 2, "map_id": "00", "settings": {}}', b'{"format":1,"map_id":"x","settings":{}}'],
+)
+def test_a_file_that_does_not_say_what_the_map_is_is_refused(text: bytes) -> None:
+    disk = CutDisk()
+    disk.write("map.json", text)
+    with pytest.raises(MapDataError, match=r"map\.json"):
+        MapFiles(disk, SETTINGS)
+    assert disk.read("map.json") == text
+
+
+def test_chunks_without_a_map_are_left_alone() -> None:
+    disk = CutDisk()
+    disk.write("0_0_0.chunk", b"whatever")
+    with pytest.raises(MapDataError, match="missing"):
+        MapFiles(disk, SETTINGS)
+    assert disk.names() == ["0_0_0.chunk"]
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    folder = Folder(tmp_path)
+    with pytest.raises(InstanceBusy, match=str(tmp_path)):
+        Folder(tmp_path)
+    folder.close()
+    Folder(tmp_path).close()
+
+
+def test_a_damaged_file_is_put_aside_and_never_overwritten(tmp_path: Path) -> None:
+    folder = Folder(tmp_path)
+    made = MapFiles(folder, SETTINGS)
+    for key in KEYS:
+        made.save(key, chunk(made, key, 2))
+    made.write_manifest()
+    first = tmp_path / "0_0_0.chunk"
+    first.write_bytes(b"CORRUPTED DATA")
+    with (tmp_path / "-1_2_0.chunk").open("r+b") as file:
+        file.truncate(1000)
+    os.rename(tmp_path / "5_5_-5.chunk", tmp_path / "7_7_7.chunk")
+    again = MapFiles(folder, SETTINGS)
+    assert sorted(again.damaged) == [
+        "-1_2_0.chunk.damaged.1",
+        "0_0_0.chunk.damaged.1",
+        "7_7_7.chunk.damaged.1",
+    ]
+    assert again.rows == {}
+    assert set(again.missing) == set(KEYS)
+    again.save(KEYS[0], chunk(again, KEYS[0], 1))
+    assert again.put_aside(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
+    assert (tmp_path / "0_0_0.chunk.damaged.1").read_bytes() == b"CORRUPTED DATA"
+    assert again.load(KEYS[0]) is None
+    folder.close()
+
+
+def test_a_file_that_did_not_get_its_name_is_taken_if_it_is_newer() -> None:
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 5))
+    disk.write(".0_0_0.chunk.aaaa.tmp", chunk(made, KEYS[0], 7))
+    disk.write(".0_0_0.chunk.bbbb.tmp", chunk(made, KEYS[0], 6))
+    disk.write(".0_0_0.chunk.cccc.tmp", chunk(made, KEYS[0], 9)[:-1])
+    disk.write(".-1_2_0.chunk.dddd.tmp", chunk(made, KEYS[1], 1))
+    disk.write(".-1_2_0.chunk.eeee.tmp", chunk(made, KEYS[0], 99))
+    disk.write(".map.json.ffff.tmp", b"{}")
+    again = MapFiles(disk, SETTINGS)
+    assert [version_of(again, key) for key in KEYS] == [7, 1, 0]
+    assert sorted(disk.names()) == ["-1_2_0.chunk", "0_0_0.chunk", "map.json"]
+
+
+def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = Folder(tmp_path)
+    made = MapFiles(folder, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 1))
+    names = sorted(folder.names())
+    for what in ("write", "sync", "rename"):
+        with monkeypatch.context() as patch:
+            patch.setattr(folder, what, _full)
+            with pytest.raises(OSError, match="No space"):
+                made.save(KEYS[0], chunk(made, KEYS[0], 2))
+        assert sorted(folder.names()) == names, what
+        assert version_of(made, KEYS[0]) == 1
+    made.save(KEYS[0], chunk(made, KEYS[0], 2))
+    assert version_of(made, KEYS[0]) == 2
+    folder.close()
+
+
+def _full(*_: object) -> None:
+    raise OSError(28, os.strerror(28))
+
+
+class Drive:
+    """A map that is written for a while; it knows what it was promised."""
+
+    def __init__(self, disk: CutDisk) -> None:
+        self.durable: dict[ChunkKey, int] = {}
+        self.mappers = 0
+        self.lives = 0
+        self._disk = disk
+
+    def go(self, rng: random.Random) -> None:
+        made = MapFiles(self._disk, SETTINGS)
+        self.map_id = made.map_id
+        saved: dict[ChunkKey, int] = {key: row.version for key, row in made.rows.items()}
+        self.lives = made.begin_life()
+        for _ in range(30):
+            what = rng.random()
+            key = rng.choice(KEYS)
+            if what < 0.6:
+                version = saved.get(key, 0) + rng.randint(1, 3)
+                made.save(key, chunk(made, key, version))
+                saved[key] = version
+            elif what < 0.8:
+                made.flush()
+                self.durable.update(saved)
+            elif what < 0.9:
+                made.write_manifest()
+                self.durable.update(saved)
+            else:
+                self.mappers = made.add_mapper(0, "m").number
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int) -> None:
+    """The disk may then be in any state that is allowed; and the power may fail again in the next life."""
+    rng = random.Random(seed)
+    disk = CutDisk(operations=rng.randint(0, 70))
+    durable: dict[ChunkKey, int] = {}
+    mappers = lives = 0
+    for _ in range(4):
+        drive = Drive(disk)
+        with contextlib.suppress(PowerCut):
+            drive.go(rng)
+        durable = {**durable, **{key: max(v, durable.get(key, 0)) for key, v in drive.durable.items()}}
+        mappers, lives = max(mappers, drive.mappers), max(lives, drive.lives)
+        disk = disk.after(lambda: rng.random() < 0.5, lambda size: rng.randint(-size, size))
+        made = MapFiles(disk, SETTINGS)
+        assert not made.missing
+        assert not made.damaged
+        for key, version in durable.items():
+            assert version_of(made, key) >= version
+        for key in made.rows:
+            assert version_of(made, key) == made.rows[key].version
+        assert not [name for name in disk.names() if name.endswith(".tmp")]
+        assert made.add_mapper(0, "next").number > mappers
+        assert made.begin_life() > lives
+        mappers += 1
+        disk.operations = rng.randint(0, 70)
+
+
+@pytest.mark.parametrize("skipped", ["sync", "sync_names"])
+def test_such_a_cut_would_lose_something_if_nobody_waited_for_the_disk(
+    monkeypatch: pytest.MonkeyPatch, skipped: str
+) -> None:
+    """What the tests above find is not nothing."""
+    monkeypatch.setattr(CutDisk, skipped, lambda *_: None)
+
+    def fails(seed: int) -> bool:
+        try:
+            test_a_power_cut_at_any_operation_loses_nothing_durable(seed)
+        except (AssertionError, MapDataError):
+            return True
+        return False
+
+    assert sum(map(fails, range(20))) > 5
+
+
+def test_the_manifest_lists_what_is_durable() -> None:
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 4))
+    made.write_manifest()
+    listed = msgspec.json.decode(disk.read("manifest.json"))
+    assert listed == {
+        "format": 1,
+        "chunks": {"0_0_0": {"version": 4, "bytes": 2688, "active": 0, "occupied": 0, "free": 0}},
+    }
+    disk.remove("0_0_0.chunk")
+    assert list(MapFiles(disk, SETTINGS).missing) == [KEYS[0]]
