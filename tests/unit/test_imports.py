@@ -48,7 +48,7 @@ PARTS = {
     "protocol": {"errors", "columns", "geometry"},
     "compiling": set[str](),
     "sharded_dict": set[str](),
-    "chunks": {"errors", "failpoints", "compiling"},
+    "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "sharded_dict", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},

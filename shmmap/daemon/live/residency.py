@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which chunks of a live map are in memory: what is loaded, written, saved and given up, and in which order.
+
+Pure: clock and bytes are injected, and nothing is done here.  Whoever has the memory asks what is to be done
+next (`next_load`, `ready`, `next_save`, `next_eviction`) and tells when it was done.
+
+- A chunk is loaded because a scan waits for it, or because it is near a client; it is given up when neither
+  holds any more, or when memory is short: the furthest first.
+- A scan is never dropped: for a chunk that is not in memory it waits, and scans are applied in the order in
+  which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
+- A chunk that was written is saved before it is given up, and after `Limits.checkpoint_s` at the latest.  It
+  may be written while it is saved: then it is dirty again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from itertools import islice, takewhile
+from typing import Final
+
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan, State
+from shmmap.daemon.live.windows import Windows
+
+__all__ = ["Residency"]
+
+RETRY_S: Final = 1.0
+"""How long after a file could not be read or written it is tried again."""
+REVIEW_S: Final = 0.1
+"""How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
+
+
+class Residency:
+    """Decides for one map.
+
+    Parameters
+    ----------
+    limits
+        What it may take.
+    new_bytes
+        Memory of a chunk in which nothing is known.
+
+    Attributes
+    ----------
+    chunks
+        All that are in memory, or wanted there.
+    leases
+        What is out of service and may still be mapped.
+    chunk_bytes, leased_bytes, waiting_bytes
+        Memory of the two, and what waiting scans take.
+    active
+        Known voxels in memory.
+    windows
+        What is near a client.
+    """
+
+    def __init__(self, limits: Limits, *, new_bytes: int = 4096) -> None:
+        self.limits = limits
+        self.chunks: dict[ChunkKey, Chunk] = {}
+        self.leases: dict[int, Lease] = {}
+        self.chunk_bytes = self.leased_bytes = self.waiting_bytes = self.active = 0
+        self.loading = self.saving = 0
+        self._new_bytes = new_bytes
+        self._sizes: dict[ChunkKey, int] = {}
+        self.windows = Windows(limits.radius, limits.hysteresis)
+        self._missing: list[ChunkKey] = []  # near, not in memory; the nearest last
+        self._needing: dict[ChunkKey, Chunk] = {}
+        self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
+        self._victims: list[Chunk] = []  # the first to give up last
+        self._review_s = -math.inf
+        self._leases_given = 0
+        self._flushable: list[tuple[Chunk, int]] = []
+
+    # --- sums -----------------------------------------------------------------------------------
+
+    def _fits(self, more_bytes: int) -> bool:
+        chunks = self.chunk_bytes + more_bytes
+        return chunks + self.leased_bytes <= self.limits.budget_bytes or chunks <= self.limits.reserve_bytes
+
+    def _resize(self, chunk: Chunk, nbytes: int, active: int) -> None:
+        self.chunk_bytes += nbytes - chunk.nbytes
+        self.active += active - chunk.active
+        chunk.nbytes, chunk.active = nbytes, active
+
+    # --- clients --------------------------------------------------------------------------------
+
+    def move(self, client: object, position: tuple[float, float, float]) -> None:
+        """A client is somewhere, in chunks; see `Windows.move`."""
+        if self.windows.move(client, position):
+            self._look_around()
+
+    def leave(self, client: object) -> None:
+        """A client has gone."""
+        if self.windows.leave(client):
+            self._look_around()
+
+    def _look_around(self) -> None:
+        near = self.windows.near
+        missing = (key for key in near if key not in self.chunks)
+        self._missing = sorted(missing, key=near.__getitem__, reverse=True)
+        self._review_s = -math.inf
+
+    def is_wanted(self, chunk: Chunk, now_s: float) -> bool:
+        """Whether a chunk is to stay: a scan waits for it, it is near a client, or was just changed."""
+        near = chunk.key in self.windows.near
+        return near or bool(chunk.waiting) or now_s < chunk.changed_s + self.limits.linger_s
+
+    # --- scans ----------------------------------------------------------------------------------
+
+    def has_room(self, nbytes: int) -> bool:
+        """Whether a scan may come: what waits is bounded, and a single one may always wait."""
+        return not self.waiting_bytes or self.waiting_bytes + nbytes <= self.limits.waiting_bytes
+
+    def add(self, scan: Scan) -> None:
+        """A scan has come: every chunk that it touches is wanted until it has taken it in."""
+        if scan.to_apply:
+            self.waiting_bytes += scan.nbytes
+        for key in scan.to_apply:
+            chunk = self.chunks.get(key) or self.chunks.setdefault(key, Chunk(key))
+            chunk.waiting.append(scan)
+            self._needing[key] = chunk
+
+    def ready(self) -> list[tuple[Chunk, Scan]]:
+        """What can be applied now: of each chunk in memory the scan that comes next."""
+        there = (chunk for chunk in self._needing.values() if chunk.state is not State.LOADING)
+        return [(chunk, chunk.waiting[0]) for chunk in there]
+
+    def may_grow(self, chunk: Chunk, more_bytes: int) -> bool:
+        """Whether a chunk may take so much more memory now; if not, others are given up for it."""
+        fits = self._fits(more_bytes)
+        chunk.missing_bytes = 0 if fits else more_bytes
+        return fits
+
+    def applied(
+        self, chunk: Chunk, scan: Scan, *, version: int, nbytes: int, active: int, now_s: float
+    ) -> None:
+        """A chunk has taken in the scan that it waited for first.
+
+        Raises
+        ------
+        ValueError
+            Another one comes first.
+        """
+        if chunk.waiting[0] is not scan:
+            raise ValueError("scans of a chunk are applied in the order in which they came")
+        chunk.waiting.popleft()
+        if not chunk.waiting:
+            del self._needing[chunk.key]
+        self._resize(chunk, nbytes, active)
+        chunk.missing_bytes, chunk.changed_s = 0, now_s
+        if version > chunk.version:
+            chunk.version = version
+            if chunk.state is State.CLEAN:
+                self._soil(chunk, now_s)
+        scan.to_apply.discard(chunk.key)
+        if version > chunk.durable:
+            scan.to_save[chunk.key] = version
+            chunk.unsaved.append((version, scan))
+        if scan.applied:
+            self.waiting_bytes -= scan.nbytes
+
+    def _soil(self, chunk: Chunk, now_s: float) -> None:
+        chunk.state, chunk.dirty_since_s = State.DIRTY, now_s
+        self._dirty[chunk.key] = chunk
+
+    # --- loading --------------------------------------------------------------------------------
+
+    def note_size(self, key: ChunkKey, nbytes: int) -> None:
+        """A chunk on disk takes so much memory."""
+        self._sizes[key] = nbytes
+
+    def _size(self, key: ChunkKey) -> int:
+        return self._sizes.get(key, self._new_bytes)
+
+    def next_load(self, now_s: float) -> Chunk | None:
+        """The chunk to load now: those that scans wait for first, then what is nearest to a client."""
+        if self.loading >= self.limits.loads:
+            return None
+        kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # room was made for these
+        for chunk in self._needing.values():
+            if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes):
+                return self._begin_load(chunk)
+        if self._is_short(now_s):
+            return None
+        while self._missing:
+            key = self._missing[-1]
+            if key in self.chunks:
+                self._missing.pop()
+            elif self._fits(self._size(key) + kept_bytes):
+                self._missing.pop()
+                return self._begin_load(self.chunks.setdefault(key, Chunk(key)))
+            else:
+                break
+        return None
+
+    def _can_load(self, chunk: Chunk, now_s: float) -> bool:
+        return chunk.state is State.LOADING and not chunk.under_way and chunk.retry_s <= now_s
+
+    def _begin_load(self, chunk: Chunk) -> Chunk:
+        chunk.under_way = True
+        self._resize(chunk, self._size(chunk.key), 0)
+        self.loading += 1
+        return chunk
+
+    def loaded(self, chunk: Chunk, *, version: int, nbytes: int, active: int) -> None:
+        """A chunk is in memory as it is on disk, or new: version 0."""
+        self.loading -= 1
+        chunk.under_way = False
+        chunk.state = State.CLEAN
+        self._resize(chunk, nbytes, active)
+        chunk.version = chunk.saved = version
+        if any(other.key == chunk.key for other, _ in self._flushable):
+            self._flushable.append((chunk, version))  # it was given up before its file was durable
+        else:
+            chunk.durable = version
+
+    def load_failed(self, chunk: Chunk, now_s: float) -> None:
+        """A file could not be read just now: what waits for it goes on waiting."""
+        self.loading -= 1
+        chunk.under_way = False
+        self._resize(chunk, 0, 0)
+        chunk.retry_s = now_s + RETRY_S
+        if not chunk.waiting:
+            del self.chunks[chunk.key]
+
+    # --- saving ---------------------------------------------------------------------------------
+
+    def _is_short(self, now_s: float) -> bool:
+        """Whether a scan waits for memory, or there are more known voxels than there may be."""
+        if self.limits.most_active and self.active > self.limits.most_active:
+            return True
+        for chunk in self._needing.values():
+            if chunk.missing_bytes:
+                if not self._fits(chunk.missing_bytes):
+                    return True
+            elif self._can_load(chunk, now_s) and not self._fits(self._size(chunk.key)):
+                return True
+        return False
+
+    def _next_victim(self, now_s: float, state: State) -> Chunk | None:
+        """What to give up next: unwanted ones, and where memory is short others, the furthest first."""
+        short = self._is_short(now_s)
+
+        def may_go(chunk: Chunk) -> bool:
+            return (
+                chunk.state is not State.LOADING
+                and self.chunks.get(chunk.key) is chunk
+                and (short or not self.is_wanted(chunk, now_s))
+            )
+
+        self._victims = [chunk for chunk in self._victims if may_go(chunk)]
+        if not self._victims and now_s >= self._review_s:
+            self._review_s = now_s + REVIEW_S
+            self._victims = sorted(
+                (chunk for chunk in self.chunks.values() if may_go(chunk)),
+                key=lambda chunk: (
+                    not chunk.waiting, not self.is_wanted(chunk, now_s), self.windows.distance(chunk.key),
+                    chunk.state is State.CLEAN, -chunk.active,
+                ),
+            )  # fmt: skip
+        for chunk in reversed(self._victims):
+            if chunk.state is state and chunk.retry_s <= now_s:
+                return chunk
+        return None
+
+    def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
+        """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
+        if self.saving >= self.limits.saves:
+            return None
+        due_s = math.inf if everything else now_s - self.limits.checkpoint_s
+        old = takewhile(lambda one: one.dirty_since_s <= due_s, self._dirty.values())
+        due = next((one for one in old if one.retry_s <= now_s), None)
+        best = self._next_victim(now_s, State.DIRTY) or due
+        if best is not None:
+            best.state = State.SAVING
+            del self._dirty[best.key]
+            self.saving += 1
+        return best
+
+    def saved(self, chunk: Chunk, version: int, now_s: float) -> None:
+        """A chunk's file has this version; it may have been written since."""
+        self.saving -= 1
+        chunk.saved = version
+        self._sizes[chunk.key] = chunk.nbytes
+        self._flushable.append((chunk, version))
+        chunk.state = State.CLEAN
+        if chunk.version > version:
+            self._soil(chunk, now_s)
+
+    def save_failed(self, chunk: Chunk, now_s: float) -> None:
+        """A file could not be written: the chunk stays in memory, and is tried again."""
+        self.saving -= 1
+        chunk.retry_s = now_s + RETRY_S
+        self._soil(chunk, now_s)
+
+    @property
+    def flush_is_due(self) -> bool:
+        """Whether files have been written that are not durable yet, and enough of them or no more to come."""
+        return bool(self._flushable) and (not self.saving or len(self._flushable) >= self.limits.saves)
+
+    def flushed(self) -> list[Scan]:
+        """All files that were written are durable; returns the scans that are so by that."""
+        done: list[Scan] = []
+        for chunk, version in self._flushable:
+            chunk.durable = max(chunk.durable, version)
+            while chunk.unsaved and chunk.unsaved[0][0] <= version:
+                _, scan = chunk.unsaved.popleft()
+                del scan.to_save[chunk.key]
+                if scan.durable:
+                    done.append(scan)
+        self._flushable.clear()
+        return done
+
+    # --- giving up ------------------------------------------------------------------------------
+
+    def next_eviction(self, now_s: float) -> Lease | None:
+        """Give up a chunk that is as its file; its memory counts until `released`."""
+        chunk = self._next_victim(now_s, State.CLEAN)
+        if chunk is None:
+            return None
+        self._leases_given += 1
+        lease = self.leases[self._leases_given] = Lease(chunk.key, self._leases_given, chunk.nbytes)
+        self.leased_bytes += lease.nbytes
+        self._resize(chunk, 0, 0)
+        del self.chunks[chunk.key]
+        if chunk.waiting:  # for another that comes first it gave way: later it is loaded again
+            again = self.chunks[chunk.key] = self._needing[chunk.key] = Chunk(
+                chunk.key, waiting=chunk.waiting
+            )
+            chunk.waiting = deque()
+            again.changed_s = chunk.changed_s
+        elif chunk.key in self.windows.near:
+            self._missing.insert(0, chunk.key)
+        return lease
+
+    def released(self, lease: Lease) -> None:
+        """Nobody maps what was given up any more."""
+        del self.leases[lease.number]
+        self.leased_bytes -= lease.nbytes
+
+    # --- times ----------------------------------------------------------------------------------
+
+    def next_event_s(self, now_s: float) -> float:
+        """When there is something to do although nothing happens; infinity for never."""
+        times = [chunk.dirty_since_s + self.limits.checkpoint_s for chunk in islice(self._dirty.values(), 1)]
+        times += [chunk.retry_s for chunk in self._needing.values() if chunk.state is State.LOADING]
+        if len(self.chunks) > sum(key in self.chunks for key in self.windows.near):
+            times.append(now_s + REVIEW_S)
+        return max(now_s, min(times, default=math.inf))

@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which chunks are loaded, saved and given up, and when; the model test next door has the whole."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.records import Chunk, Limits, Scan, State
+from shmmap.daemon.live.residency import RETRY_S, REVIEW_S, Residency
+
+HERE = ChunkKey(0, 0, 0)
+PLENTY = Limits(budget_bytes=10**9, radius=0, loads=100, saves=100)
+
+
+def scan_of(*keys: ChunkKey, number: int = 1, nbytes: int = 10) -> Scan:
+    return Scan(1, number, nbytes, set(keys))
+
+
+def load(one: Residency, now_s: float = 0.0, **content: int) -> Chunk:
+    """Load what comes next."""
+    chunk = one.next_load(now_s)
+    assert chunk is not None
+    one.loaded(chunk, version=content.get("version", 0), nbytes=content.get("nbytes", 10), active=0)
+    return chunk
+
+
+def apply(one: Residency, chunk: Chunk, now_s: float = 0.0, *, grows: int = 0) -> Scan:
+    """Have a chunk take in its next scan."""
+    scan = chunk.waiting[0]
+    one.applied(
+        chunk,
+        scan,
+        version=chunk.version + 1,
+        nbytes=chunk.nbytes + grows,
+        active=chunk.active + 1,
+        now_s=now_s,
+    )
+    return scan
+
+
+def written(one: Residency, key: ChunkKey, now_s: float = 0.0) -> Chunk:
+    """A chunk in memory that a scan has changed."""
+    one.add(scan_of(key))
+    chunk = load(one, now_s)
+    apply(one, chunk, now_s)
+    return chunk
+
+
+# --- windows ------------------------------------------------------------------------------------
+
+
+def test_a_client_has_the_chunks_around_it_the_nearest_first() -> None:
+    one = Residency(Limits(10**9, radius=1, loads=100))
+    one.move("a", (0.5, 0.5, 0.5))
+    order = []
+    while (chunk := one.next_load(0.0)) is not None:
+        order.append(chunk.key.distance(HERE))
+    assert order == [0, *[1] * 26]
+
+
+@pytest.mark.parametrize(
+    ("position", "center"),
+    [
+        ((1.19, 0.5, 0.5), (0, 0, 0)),  # not far enough over the border
+        ((1.21, 0.5, 0.5), (1, 0, 0)),
+        ((-0.19, 0.5, 0.5), (0, 0, 0)),
+        ((-0.21, 0.5, 0.5), (-1, 0, 0)),
+        ((1.3, 1.1, 0.5), (0, 0, 0)),  # over a corner: on every axis that changes
+        ((1.3, 1.3, 0.5), (1, 1, 0)),
+        ((1.3, 1.3, -0.3), (1, 1, -1)),
+        ((2.01, 0.5, 0.5), (2, 0, 0)),  # more than a chunk away: at once
+        ((-70.0, 3.0, 0.0), (-70, 3, 0)),
+    ],
+)
+def test_a_window_follows_with_hysteresis(
+    position: tuple[float, float, float], center: tuple[int, int, int]
+) -> None:
+    one = Residency(PLENTY)
+    one.move("a", (0.5, 0.5, 0.5))
+    one.move("a", position)
+    assert one.windows.center("a") == center
+
+
+def test_jitter_at_a_border_moves_nothing() -> None:
+    one = Residency(PLENTY)
+    one.move("a", (0.9, 0.5, 0.5))
+    load(one)
+    for number in range(100):
+        one.move("a", (1.0 + 0.1 * math.sin(number), 0.5, 0.5))
+        assert one.next_load(float(number)) is None
+        assert one.next_eviction(float(number)) is None
+
+
+def test_several_clients_have_all_their_windows() -> None:
+    one = Residency(Limits(10**9, radius=1, loads=100))
+    one.move("a", (0.5, 0.5, 0.5))
+    one.move("b", (1.5, 0.5, 0.5))
+    while one.next_load(0.0) is not None:
+        pass
+    assert len(one.chunks) == 27 + 9
+    for chunk in one.chunks.values():
+        one.loaded(chunk, version=0, nbytes=10, active=0)
+    one.leave("b")
+    gone = 0
+    while one.next_eviction(1.0) is not None:
+        gone += 1
+    assert gone == 9
+
+
+# --- scans --------------------------------------------------------------------------------------
+
+
+def test_what_waits_is_bounded() -> None:
+    one = Residency(Limits(10**9, waiting_bytes=25))
+    assert one.has_room(1000), "a single one may always wait"
+    one.add(scan_of(HERE, number=1))
+    one.add(scan_of(HERE, number=2))
+    assert one.waiting_bytes == 20
+    assert not one.has_room(10)
+    chunk = load(one)
+    apply(one, chunk)
+    assert one.has_room(10)
+
+
+def test_scans_of_a_chunk_come_in_order() -> None:
+    one = Residency(PLENTY)
+    first, second = scan_of(HERE, number=1), scan_of(HERE, number=2)
+    one.add(first)
+    one.add(second)
+    assert one.ready() == []
+    chunk = load(one)
+    assert one.ready() == [(chunk, first)]
+    with pytest.raises(ValueError, match="in the order"):
+        one.applied(chunk, second, version=1, nbytes=10, active=0, now_s=0.0)
+    apply(one, chunk)
+    assert one.ready() == [(chunk, second)]
+
+
+def test_a_scan_that_touches_nothing_is_applied() -> None:
+    one = Residency(PLENTY)
+    scan = scan_of()
+    one.add(scan)
+    assert (scan.applied, scan.durable, one.waiting_bytes) == (True, True, 0)
+
+
+# --- saving -------------------------------------------------------------------------------------
+
+
+def test_a_change_is_saved_in_time_the_oldest_first() -> None:
+    one = Residency(PLENTY)
+    one.move("a", (0.5, 0.5, 0.5))
+    chunks = []
+    for number in range(3):
+        one.move(number, (number + 0.5, 0.5, 0.5))
+        chunks.append(written(one, ChunkKey(number, 0, 0), float(number)))
+    assert one.next_save(9.9) is None
+    assert one.next_event_s(9.9) == 10.0
+    assert one.next_save(10.0) is chunks[0]
+    assert one.next_save(10.0) is None
+    assert one.next_save(10.0, everything=True) is chunks[1]
+
+
+def test_a_chunk_that_is_written_while_it_is_saved_is_dirty_again() -> None:
+    one = Residency(PLENTY)
+    one.move("a", (0.5, 0.5, 0.5))
+    chunk = written(one, HERE)
+    assert one.next_save(20.0) is chunk
+    one.add(scan_of(HERE, number=2))
+    apply(one, chunk, 20.0)
+    assert one.next_save(99.0, everything=True) is None, "one save of a chunk at a time"
+    one.saved(chunk, 1, 21.0)
+    assert one.next_save(30.9) is None
+    assert one.next_save(31.0) is chunk
+    one.saved(chunk, 2, 31.0)
+    assert one.next_save(99.0, everything=True) is None, "it is clean"
+
+
+def test_durable_is_what_was_flushed() -> None:
+    one = Residency(PLENTY)
+    first = scan_of(HERE, ChunkKey(1, 0, 0))
+    one.add(first)
+    for _ in range(2):
+        apply(one, load(one))
+    assert first.applied
+    assert not first.durable
+    for _ in range(2):
+        chunk = one.next_save(0.0, everything=True)
+        assert chunk is not None
+        one.saved(chunk, 1, 0.0)
+    assert one.flush_is_due
+    assert len(first.to_save) == 2
+    assert one.flushed() == [first]
+    assert first.to_save == {}
+    assert one.flushed() == []
+
+
+def test_what_was_given_up_before_it_was_durable_is_not_durable_when_it_comes_back() -> None:
+    """A file that has its name, and may lose it: a scan that comes again is durable after the flush."""
+    one = Residency(PLENTY)
+    chunk = written(one, HERE)
+    assert one.next_save(50.0) is chunk
+    one.saved(chunk, 1, 50.0)
+    lease = one.next_eviction(50.0)
+    assert lease is not None
+    again = scan_of(HERE)
+    one.add(again)
+    back = load(one, version=1)
+    one.applied(back, again, version=1, nbytes=10, active=1, now_s=50.0)
+    assert again.applied
+    assert not again.durable
+    assert again in one.flushed()
+    assert again.durable
+
+
+def test_a_disk_that_is_full_is_tried_again() -> None:
+    one = Residency(PLENTY)
+    chunk = written(one, HERE)
+    assert one.next_save(50.0) is chunk
+    one.save_failed(chunk, 50.0)
+    assert one.next_save(50.0 + RETRY_S / 2, everything=True) is None
+    assert one.next_eviction(50.0 + RETRY_S / 2) is None
+    assert one.next_save(50.0 + RETRY_S, everything=True) is chunk
+
+
+def test_a_file_that_cannot_be_read_just_now_is_tried_again() -> None:
+    one = Residency(PLENTY)
+    one.add(scan_of(HERE))
+    chunk = one.next_load(0.0)
+    assert chunk is not None
+    one.load_failed(chunk, 0.0)
+    assert one.next_load(RETRY_S / 2) is None
+    assert 0.0 < one.next_event_s(0.0) <= RETRY_S
+    assert one.next_load(RETRY_S) is chunk
+
+
+# --- giving up ----------------------------------------------------------------------------------
+
+
+def test_what_nobody_wants_is_given_up_the_furthest_first() -> None:
+    one = Residency(Limits(10**9, radius=1, loads=100))
+    one.move("a", (0.5, 0.5, 0.5))
+    for x in (0, 1, 2, 9, 4):
+        one.add(scan_of(ChunkKey(x, 0, 0)))
+        chunk = load(one, version=3)
+        one.applied(chunk, chunk.waiting[0], version=3, nbytes=10, active=1, now_s=0.0)
+    assert one.next_eviction(1.0) is None, "it was just changed"
+    gone = [lease.key.x for _ in range(5) if (lease := one.next_eviction(2.0)) is not None]
+    assert gone == [9, 4, 2]
+
+
+def test_a_dirty_chunk_is_saved_before_it_is_given_up() -> None:
+    one = Residency(PLENTY)
+    chunk = written(one, HERE)
+    assert one.next_eviction(5.0) is None
+    assert one.next_save(5.0) is chunk, "before its time"
+    one.saved(chunk, 1, 5.0)
+    lease = one.next_eviction(5.0)
+    assert lease is not None
+    assert (lease.key, lease.nbytes, one.chunk_bytes, one.leased_bytes) == (HERE, 10, 0, 10)
+    one.released(lease)
+    assert (one.leased_bytes, one.leases) == (0, {})
+
+
+def test_too_many_known_voxels_are_too_many() -> None:
+    one = Residency(Limits(10**9, radius=1, most_active=2, loads=100))
+    one.move("a", (0.5, 0.5, 0.5))
+    for x in (0, 1):
+        written(one, ChunkKey(x, 0, 0))
+    assert one.next_save(5.0) is None
+    written(one, ChunkKey(-1, 0, 0))
+    assert one.active == 3
+    now_s = 5.0 + REVIEW_S
+    chunk = one.next_save(now_s)
+    assert chunk is not None
+    one.saved(chunk, 1, now_s)
+    assert one.next_eviction(now_s) is not None
+    assert one.active == 2
+    assert one.next_eviction(now_s + REVIEW_S) is None
+
+
+def test_room_that_was_made_for_one_is_not_another_s() -> None:
+    """What is near a client is not loaded into the room that a chunk needs to take in a scan."""
+    one = Residency(Limits(40, radius=1, loads=100), new_bytes=10)
+    one.move("a", (0.5, 0.5, 0.5))
+    one.add(scan_of(HERE))
+    chunk = load(one)
+    for _ in range(3):
+        load(one)
+    assert not one.may_grow(chunk, 15)
+    for number in range(2):
+        lease = one.next_eviction(5.0)
+        assert lease is not None
+        one.released(lease)
+        assert one.next_load(5.0) is None, number
+    assert one.may_grow(chunk, 15)
+    apply(one, chunk, 5.0, grows=15)
+    assert one.chunk_bytes == 35
+
+
+def test_readers_cannot_keep_a_map_from_being_written() -> None:
+    one = Residency(Limits(20, reserve_bytes=20, radius=0, loads=100), new_bytes=10)
+    for number in range(1, 5):
+        chunk = written(one, ChunkKey(number, 0, 0), 10.0 * number)
+        assert one.next_save(10.0 * number + 5.0) is chunk
+        one.saved(chunk, 1, 10.0 * number + 5.0)
+        assert one.next_eviction(10.0 * number + 5.0) is not None
+    assert one.leased_bytes == 40
+
+
+def test_where_all_chunks_wait_for_room_some_give_way() -> None:
+    """What they have to take in still waits for them."""
+    one = Residency(Limits(40, radius=0, loads=100), new_bytes=10)
+    keys = [HERE, ChunkKey(1, 0, 0), ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)]
+    for number, key in enumerate(keys, 1):
+        one.add(scan_of(key, number=number))
+    chunks = [load(one) for _ in keys]
+    assert not any(one.may_grow(chunk, 20) for chunk in chunks)
+    gone = []
+    for _ in range(2):
+        lease = one.next_eviction(5.0)
+        assert lease is not None
+        one.released(lease)
+        gone.append(lease.key)
+    stays = next(chunk for chunk in chunks if chunk.key not in gone)
+    assert one.may_grow(stays, 20)
+    assert all(one.chunks[key].state is State.LOADING and one.chunks[key].waiting for key in gone)
