@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chunks in shared memory: made, grown, given up, and found again after the writer died.
+
+A chunk is a file on a tmpfs.  It is mapped once, as long as it can ever get; only as much of that as the file
+has may be touched.  Memory is taken from the kernel before it is touched: where there is none, that is an
+error here and not a signal later.  A file never gets shorter.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from shmmap.chunks.layout import (
+    BRICK_BYTES,
+    HEADER_BYTES,
+    MOST_BYTES,
+    OUT_OF_SERVICE,
+    ChunkView,
+    chunk_bytes,
+    read_identity,
+)
+from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.errors import BadRequest, SegmentCorrupt
+
+__all__ = ["ChunkFile", "ChunkMemory", "live_prefix"]
+
+_PROT: Final = 0x1 | 0x2  # PROT_READ | PROT_WRITE
+_MAP_SHARED: Final = 0x1
+_FAILED: Final = ctypes.c_void_p(-1).value
+_GROWTH_BRICKS: Final = 8
+"""A page: memory comes in pages."""
+
+_libc: Any = ctypes.CDLL(None, use_errno=True)
+_libc.mmap.restype = ctypes.c_void_p
+_libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+_libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
+
+
+def live_prefix(instance: str, map_name: str) -> str:
+    """Return what the names of a live map's chunks start with, slash included; no segment's name does."""
+    return f"/shmmap-live.{instance}.{map_name}."
+
+
+@dataclass(eq=False)
+class ChunkFile:
+    """One chunk in memory, mapped for writing.
+
+    Attributes
+    ----------
+    name
+        Of the shared memory, slash included: prefix, key, generation.
+    view
+        Arrays over as much as there is.
+    """
+
+    name: str
+    _fd: int
+    _address: int
+    view: ChunkView
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return os.fstat(self._fd).st_blocks * 512
+
+    def grow(self, bricks: int) -> ChunkView:
+        """Make room for so many bricks, at least.
+
+        Raises
+        ------
+        OSError
+            The file system is full; the chunk is as it was.
+        """
+        size = chunk_bytes(min(BRICKS, -(-bricks // _GROWTH_BRICKS) * _GROWTH_BRICKS))
+        if size > len(self.view.data):
+            os.posix_fallocate(self._fd, 0, size)
+            self.view = _view(self._address, size)
+        return self.view
+
+    def close(self) -> None:
+        """Unmap it; nothing of ``view`` may be used any more."""
+        self.view = ChunkView(bytearray(HEADER_BYTES))
+        _libc.munmap(self._address, MOST_BYTES)
+        os.close(self._fd)
+
+
+def _view(address: int, size: int) -> ChunkView:
+    return ChunkView((ctypes.c_char * size).from_address(address))
+
+
+class ChunkMemory:
+    """The chunks of one live map in a directory for shared memory.
+
+    Parameters
+    ----------
+    path
+        A directory on a tmpfs, without huge pages: a chunk would take 2 MiB there.
+    prefix
+        What its names start with, see `live_prefix`.
+    mode, gid
+        Who may read the chunks; a group of -1 is the process's own.
+    """
+
+    def __init__(self, path: str, prefix: str, *, mode: int = 0o600, gid: int = -1) -> None:
+        self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
+        self.prefix = prefix
+        self._mode, self._gid = mode, gid
+
+    def close(self) -> None:
+        """Leave the directory; what is in it stays."""
+        os.close(self._fd)
+
+    def name(self, key: ChunkKey, generation: int) -> str:
+        """Return the name of a chunk of one generation."""
+        return f"{self.prefix}{key.text}.{generation}"
+
+    def create(self, content: bytes | bytearray) -> ChunkFile:
+        """Put a chunk into memory; it has its name when it is whole.
+
+        Parameters
+        ----------
+        content
+            Its header and bricks.
+
+        Raises
+        ------
+        OSError
+            There is no memory, or the name is taken.
+        """
+        identity = read_identity(content)
+        name = self.name(identity.key, identity.generation)
+        fd = os.open(".", os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600, dir_fd=self._fd)
+        try:
+            os.posix_fallocate(fd, 0, len(content))
+            os.pwrite(fd, content, 0)
+            if self._gid >= 0:
+                os.fchown(fd, -1, self._gid)
+            os.fchmod(fd, self._mode)
+            os.link(
+                f"/proc/self/fd/{fd}", name.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd,
+                follow_symlinks=True,
+            )  # fmt: skip
+            return self._mapped(name, fd, len(content))
+        except BaseException:
+            os.close(fd)
+            raise
+
+    def open(self, name: str) -> ChunkFile:
+        """Map a chunk that an earlier writer left.
+
+        Raises
+        ------
+        SegmentCorrupt
+            It is not the chunk that its name says.
+        OSError
+            It cannot be opened.
+        """
+        flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        fd = os.open(name.lstrip("/"), flags, dir_fd=self._fd)
+        try:
+            size = os.fstat(fd).st_size
+            if not HEADER_BYTES <= size <= MOST_BYTES or (size - HEADER_BYTES) % BRICK_BYTES:
+                raise SegmentCorrupt(f"{name}: {size} bytes cannot be a chunk")
+            identity = read_identity(os.pread(fd, HEADER_BYTES, 0), name)
+            if name != self.name(identity.key, identity.generation):
+                raise SegmentCorrupt(f"{name}: it is chunk {identity.key.text} {identity.generation}")
+            return self._mapped(name, fd, size)
+        except BaseException:
+            os.close(fd)
+            raise
+
+    def _mapped(self, name: str, fd: int, size: int) -> ChunkFile:
+        address = _libc.mmap(None, MOST_BYTES, _PROT, _MAP_SHARED, fd, 0)
+        if address == _FAILED:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), name)
+        return ChunkFile(name, fd, address, _view(address, size))
+
+    def give_up(self, chunk: ChunkFile) -> int:
+        """Take a chunk out of service and remove its name; returns a descriptor of what readers still map.
+
+        Whoever has it mapped sees by its ``state`` that it does not change any more.
+        """
+        chunk.view.state["state"] = OUT_OF_SERVICE
+        os.unlink(chunk.name.lstrip("/"), dir_fd=self._fd)
+        kept = os.dup(chunk._fd)
+        chunk.close()
+        return kept
+
+    def names(self) -> Iterator[tuple[str, ChunkKey, int]]:
+        """Chunks that there are, with key and generation; what has no such name is left out."""
+        pattern = re.compile(re.escape(self.prefix.lstrip("/")) + r"(-?\d+_-?\d+_-?\d+)\.(\d+)")
+        for name in sorted(os.listdir(self._fd)):
+            if found := pattern.fullmatch(name):
+                try:
+                    key = ChunkKey.from_text(found[1])
+                except BadRequest:
+                    continue
+                yield "/" + name, key, int(found[2])
+
+    def remove(self, name: str) -> None:
+        """Remove the name of what is of no use."""
+        os.unlink(name.lstrip("/"), dir_fd=self._fd)

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chunks in shared memory: they grow in place, readers keep what is given up, the next writer finds them."""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import resource
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from shmmap.chunks.layout import (
+    HEADER_BYTES,
+    MOST_BYTES,
+    OUT_OF_SERVICE,
+    ChunkIdentity,
+    ChunkView,
+    chunk_bytes,
+    new_header,
+)
+from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
+from shmmap.errors import SegmentCorrupt
+
+PREFIX = live_prefix("test", "lidar")
+IDENTITY = ChunkIdentity(bytes(16), ChunkKey(3, -1, 0), 0.1, -1992, 3476, 0, 0, 7, "map")
+NAME = f"{PREFIX}3_-1_0.7"
+
+
+@pytest.fixture
+def directory() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        yield Path(path)
+        assert os.listdir(path) == []
+
+
+@pytest.fixture
+def memory(directory: Path) -> Iterator[ChunkMemory]:
+    before = len(os.listdir("/proc/self/fd"))
+    one = ChunkMemory(str(directory), PREFIX)
+    yield one
+    for name, _, _ in list(one.names()):
+        one.remove(name)
+    one.close()
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert not [line for line in Path("/proc/self/maps").read_text().splitlines() if str(directory) in line]
+
+
+def fill(chunk: ChunkFile, bricks: int) -> None:
+    """So many bricks, each with its number in all voxels."""
+    view = chunk.grow(bricks)
+    for number in range(bricks):
+        view.bricks[number] = number + 1
+        view.index[number] = number + 1
+    view.state["bricks"] = bricks
+
+
+def test_a_chunk_is_made_grows_and_is_found_again(memory: ChunkMemory, directory: Path) -> None:
+    chunk = memory.create(new_header(IDENTITY))
+    assert chunk.name == NAME
+    assert list(memory.names()) == [(NAME, IDENTITY.key, 7)]
+    assert (chunk.nbytes, len(chunk.view.bricks)) == (HEADER_BYTES, 0)
+    fill(chunk, 5)
+    assert (chunk.nbytes, len(chunk.view.bricks)) == (2 * 4096, 8)
+    fill(chunk, BRICKS)
+    assert chunk.nbytes == MOST_BYTES
+    chunk.close()
+    again = memory.open(NAME)
+    assert again.view.identity == IDENTITY
+    assert (again.view.bricks == np.arange(1, BRICKS + 1)[:, None]).all()
+    again.close()
+    assert (directory / NAME[1:]).stat().st_size == MOST_BYTES
+
+
+def test_a_reader_sees_it_grow_and_keeps_what_is_given_up(memory: ChunkMemory, directory: Path) -> None:
+    chunk = memory.create(new_header(IDENTITY))
+    fill(chunk, 1)
+    with (directory / NAME[1:]).open("rb") as file:
+        seen = ChunkView(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
+        assert int(seen.bricks[0, 0]) == 1
+        chunk.view.bricks[0] = 9
+        assert int(seen.bricks[0, 0]) == 9
+        kept = memory.give_up(chunk)
+        assert list(memory.names()) == []
+        assert int(seen.state["state"]) == OUT_OF_SERVICE
+        assert int(seen.bricks[0, 0]) == 9
+        assert os.fstat(kept).st_nlink == 0
+        os.close(kept)
+
+
+def test_who_may_read_it(directory: Path) -> None:
+    memory = ChunkMemory(str(directory), PREFIX, mode=0o640, gid=os.getgid())
+    memory.create(new_header(IDENTITY)).close()
+    status = (directory / NAME[1:]).stat()
+    assert (stat.S_IMODE(status.st_mode), status.st_gid) == (0o640, os.getgid())
+    memory.remove(NAME)
+    memory.close()
+
+
+def test_a_name_that_is_taken_is_not_taken_over(memory: ChunkMemory, directory: Path) -> None:
+    (directory / NAME[1:]).write_bytes(b"somebody's")
+    with pytest.raises(FileExistsError):
+        memory.create(new_header(IDENTITY))
+    assert (directory / NAME[1:]).read_bytes() == b"somebody's"
+
+
+def test_where_there_is_no_memory_nothing_changes(memory: ChunkMemory, directory: Path) -> None:
+    """A full file system, or a limit: an error, no signal, and the chunk is as it was."""
+    chunk = memory.create(new_header(IDENTITY))
+    fill(chunk, 8)
+    program = f"""
+import os, resource, signal, sys
+from shmmap.daemon.live.chunk_memory import ChunkMemory
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+memory = ChunkMemory({str(directory)!r}, {PREFIX!r})
+chunk = memory.open({NAME!r})
+resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
+try:
+    chunk.grow(500)
+except OSError as error:
+    print(error.errno, len(chunk.view.bricks), int(chunk.view.bricks[7, 0]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split() == [str(errno.EFBIG), "8", "8"], done.stderr
+    chunk.close()
+    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "0 bytes"),
+        (bytes(HEADER_BYTES), "no chunk"),
+        (bytes(new_header(IDENTITY)) + b"x", "4097 bytes"),
+        (bytes(new_header(IDENTITY)) + bytes(chunk_bytes(BRICKS)), "bytes cannot be a chunk"),
+        (bytes(new_header(replace(IDENTITY, generation=8))), "it is chunk 3_-1_0 8"),
+        (bytes(new_header(replace(IDENTITY, key=ChunkKey(0, 0, 0)))), "it is chunk 0_0_0 7"),
+    ],
+)
+def test_what_is_no_chunk_is_not_taken_for_one(
+    memory: ChunkMemory, directory: Path, content: bytes, said: str
+) -> None:
+    (directory / NAME[1:]).write_bytes(content)
+    with pytest.raises(SegmentCorrupt, match=said):
+        memory.open(NAME)
+
+
+def test_what_has_another_name_is_not_looked_at(memory: ChunkMemory, directory: Path) -> None:
+    others = ["shmmap.test.0123456789abcdef", NAME[1:] + ".x", f"{PREFIX[1:]}1_2.3", f"{PREFIX[1:]}01_2_3.4"]
+    for name in others:
+        (directory / name).touch()
+    assert list(memory.names()) == []
+    for name in others:
+        (directory / name).unlink()
+
+
+def test_a_link_or_a_pipe_of_that_name_is_refused(memory: ChunkMemory, directory: Path) -> None:
+    (directory / NAME[1:]).symlink_to("/etc/passwd")
+    with pytest.raises(OSError, match="symbolic links"):
+        memory.open(NAME)
+    (directory / NAME[1:]).unlink()
+    os.mkfifo(directory / NAME[1:])
+    with pytest.raises(SegmentCorrupt, match="0 bytes"):
+        memory.open(NAME)
