@@ -52,6 +52,7 @@ class LiveMap(RuleBasedStateMachine):
         self.loads: list[Chunk] = []
         self.saves: list[tuple[Chunk, Content]] = []
         self.scans: list[Scan] = []
+        self.flushing: dict[ChunkKey, Content] | None = None
         self.durable: list[Scan] = []
         self.sent = 0
 
@@ -162,8 +163,19 @@ class LiveMap(RuleBasedStateMachine):
     @rule()
     def flush(self) -> None:
         if self.map.flush_is_due:
-            self.safe = {key: content.copy() for key, content in self.disk.items()}
-            self.durable += self.map.flushed()
+            self.map.durability.begin()
+            self.flushing = {key: content.copy() for key, content in self.disk.items()}
+
+    @precondition(lambda self: self.flushing is not None)
+    @rule(fails=st.booleans())
+    def end_flush(self, *, fails: bool) -> None:
+        """Names that are as they were when it began are safe; or none more than before."""
+        flushing, self.flushing = self.flushing, None
+        if fails or flushing is None:
+            self.map.durability.failed()
+        else:
+            self.safe = flushing
+            self.durable += self.map.durability.flushed()
 
     @rule()
     def evict(self) -> None:
@@ -216,7 +228,8 @@ class LiveMap(RuleBasedStateMachine):
         if not hasattr(self, "map"):
             return
         for _ in range(2000):
-            if all(scan.durable for scan in self.scans) and not self.loads and not self.saves:
+            at_rest = not self.loads and not self.saves and self.flushing is None
+            if at_rest and all(scan.durable for scan in self.scans):
                 break
             if not self.limits.reserve_bytes:  # else what readers keep does not matter
                 for lease in list(self.map.leases.values()):
@@ -231,6 +244,8 @@ class LiveMap(RuleBasedStateMachine):
             if self.saves:
                 self._end_save(*self.saves.pop(), fails=False)
             self.flush()
+            if self.flushing is not None:
+                self.end_flush(fails=False)
             self.evict()
             self.now_s += RETRY_S / 10
             self.the_books_are_right()

@@ -20,6 +20,7 @@ from itertools import islice, takewhile
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.durability import Durability
 from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan, State
 from shmmap.daemon.live.windows import Windows
 
@@ -51,8 +52,8 @@ class Residency:
         Memory of the two, and what waiting scans take.
     active
         Known voxels in memory.
-    windows
-        What is near a client.
+    windows, durability
+        What is near a client; which scans are safe from power cuts.
     """
 
     def __init__(self, limits: Limits, *, new_bytes: int = 4096) -> None:
@@ -70,7 +71,7 @@ class Residency:
         self._victims: list[Chunk] = []  # the first to give up last
         self._review_s = -math.inf
         self._leases_given = 0
-        self._flushable: list[tuple[Chunk, int]] = []
+        self.durability = Durability()
 
     # --- sums -----------------------------------------------------------------------------------
 
@@ -154,9 +155,7 @@ class Residency:
             if chunk.state is State.CLEAN:
                 self._soil(chunk, now_s)
         scan.to_apply.discard(chunk.key)
-        if version > chunk.durable:
-            scan.to_save[chunk.key] = version
-            chunk.unsaved.append((version, scan))
+        self.durability.note_applied(chunk, scan)
         if scan.applied:
             self.waiting_bytes -= scan.nbytes
 
@@ -165,6 +164,16 @@ class Residency:
         self._dirty[chunk.key] = chunk
 
     # --- loading --------------------------------------------------------------------------------
+
+    def adopt(
+        self, key: ChunkKey, *, version: int, saved: int, nbytes: int, active: int, now_s: float
+    ) -> Chunk:
+        """A chunk is in memory since an earlier life of the writer; its file has the version ``saved``."""
+        chunk = self.chunks[key] = Chunk(key, State.CLEAN, version=version, saved=saved, durable=saved)
+        self._resize(chunk, nbytes, active)
+        if version > saved:
+            self._soil(chunk, now_s)
+        return chunk
 
     def note_size(self, key: ChunkKey, nbytes: int) -> None:
         """A chunk on disk takes so much memory."""
@@ -210,10 +219,7 @@ class Residency:
         chunk.state = State.CLEAN
         self._resize(chunk, nbytes, active)
         chunk.version = chunk.saved = version
-        if any(other.key == chunk.key for other, _ in self._flushable):
-            self._flushable.append((chunk, version))  # it was given up before its file was durable
-        else:
-            chunk.durable = version
+        self.durability.note_loaded(chunk)
 
     def load_failed(self, chunk: Chunk, now_s: float) -> None:
         """A file could not be read just now: what waits for it goes on waiting."""
@@ -283,7 +289,7 @@ class Residency:
         self.saving -= 1
         chunk.saved = version
         self._sizes[chunk.key] = chunk.nbytes
-        self._flushable.append((chunk, version))
+        self.durability.written.append((chunk, version))
         chunk.state = State.CLEAN
         if chunk.version > version:
             self._soil(chunk, now_s)
@@ -296,21 +302,9 @@ class Residency:
 
     @property
     def flush_is_due(self) -> bool:
-        """Whether files have been written that are not durable yet, and enough of them or no more to come."""
-        return bool(self._flushable) and (not self.saving or len(self._flushable) >= self.limits.saves)
-
-    def flushed(self) -> list[Scan]:
-        """All files that were written are durable; returns the scans that are so by that."""
-        done: list[Scan] = []
-        for chunk, version in self._flushable:
-            chunk.durable = max(chunk.durable, version)
-            while chunk.unsaved and chunk.unsaved[0][0] <= version:
-                _, scan = chunk.unsaved.popleft()
-                del scan.to_save[chunk.key]
-                if scan.durable:
-                    done.append(scan)
-        self._flushable.clear()
-        return done
+        """Whether enough files were written that are not durable yet, or no more are to come for now."""
+        written, flushing = self.durability.written, self.durability.flushing
+        return bool(written) and not flushing and (not self.saving or len(written) >= self.limits.saves)
 
     # --- giving up ------------------------------------------------------------------------------
 
