@@ -78,6 +78,7 @@ class ServingLoop:
     _most_s: float = 0.0
     _most_of_it: str = "statistics"
     _told_s: float = float("-inf")
+    _others: dict[int, None] = field(default_factory=dict)
 
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
@@ -99,7 +100,7 @@ class ServingLoop:
 
     def _patience_s(self) -> float:
         """How long nothing has to be done if nothing comes."""
-        if len(self.inbox):
+        if len(self.inbox) or self._others:
             return 0
         until_s = min(
             self.scheduler.next_event_s(),
@@ -123,10 +124,10 @@ class ServingLoop:
     def _turn(self, ready: list[int]) -> None:
         self._hear(ready)
         self._serve()
-        for fd in ready:
-            if self.watched.kinds.get(fd, CLIENTS) != CLIENTS:
-                self._breathe()
-                self._call(fd)
+        for fd in list(self._others):
+            self._breathe()
+            self._others.pop(fd, None)
+            self._call(fd)
         self._breathe()
         self._look_after_the_rest(time.monotonic())
         self._breathe()
@@ -159,6 +160,8 @@ class ServingLoop:
         for fd in ready:
             if self.watched.kinds.get(fd) == CLIENTS:
                 self._call(fd)
+            else:
+                self._others[fd] = None
 
     def _call(self, fd: int) -> None:
         callback = self.watched.callbacks.get(fd)

@@ -24,10 +24,10 @@ from shmmap.chunks.layout import (
     chunk_bytes,
     read_identity,
 )
-from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, SegmentCorrupt
 
-__all__ = ["ChunkFile", "ChunkMemory", "live_prefix"]
+__all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "memory_bytes"]
 
 _PROT: Final = 0x1 | 0x2  # PROT_READ | PROT_WRITE
 _MAP_SHARED: Final = 0x1
@@ -44,6 +44,11 @@ _libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 def live_prefix(instance: str, map_name: str) -> str:
     """Return what the names of a live map's chunks start with, slash included; no segment's name does."""
     return f"/shmmap-live.{instance}.{map_name}."
+
+
+def memory_bytes(bricks: int) -> int:
+    """Memory of a chunk of so many bricks, in whole pages."""
+    return chunk_bytes(-(-bricks // _GROWTH_BRICKS) * _GROWTH_BRICKS)
 
 
 @dataclass(eq=False)
@@ -76,7 +81,7 @@ class ChunkFile:
         OSError
             The file system is full; the chunk is as it was.
         """
-        size = chunk_bytes(min(BRICKS, -(-bricks // _GROWTH_BRICKS) * _GROWTH_BRICKS))
+        size = memory_bytes(bricks)
         if size > len(self.view.data):
             os.posix_fallocate(self._fd, 0, size)
             self.view = _view(self._address, size)

@@ -84,6 +84,7 @@ class Row(msgspec.Struct, frozen=True):
     active: int
     occupied: int
     free: int
+    bricks: int
 
 
 class _MapFile(msgspec.Struct):
@@ -337,4 +338,4 @@ class _Manifest(msgspec.Struct):
 
 
 def _row(header: ChunkFileHeader, nbytes: int) -> Row:
-    return Row(header.version, nbytes, header.active, header.occupied, header.free)
+    return Row(header.version, nbytes, header.active, header.occupied, header.free, header.bricks)

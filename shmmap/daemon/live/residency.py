@@ -301,6 +301,11 @@ class Residency:
         self._soil(chunk, now_s)
 
     @property
+    def all_durable(self) -> bool:
+        """Whether no change is in memory alone."""
+        return not self._dirty and not self.saving and not self.durability.written + self.durability.flushing
+
+    @property
     def flush_is_due(self) -> bool:
         """Whether enough files were written that are not durable yet, or no more are to come for now."""
         written, flushing = self.durability.written, self.durability.flushing

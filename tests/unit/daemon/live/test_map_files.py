@@ -57,7 +57,7 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     assert again.map_id == made.map_id
     assert again.begin_life() == 2
     assert [(m.number, m.uid, m.name, m.scans) for m in again.mappers] == [(1, 1000, "front", 256)]
-    assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0)}
+    assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0, 0)}
     assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
     assert not again.missing
     assert not again.damaged
@@ -271,7 +271,9 @@ def test_the_manifest_lists_what_is_durable() -> None:
     listed = msgspec.json.decode(disk.read("manifest.json"))
     assert listed == {
         "format": 1,
-        "chunks": {"0_0_0": {"version": 4, "bytes": 2688, "active": 0, "occupied": 0, "free": 0}},
+        "chunks": {
+            "0_0_0": {"version": 4, "bytes": 2688, "active": 0, "occupied": 0, "free": 0, "bricks": 0}
+        },
     }
     disk.remove("0_0_0.chunk")
     assert list(MapFiles(disk, SETTINGS).missing) == [KEYS[0]]

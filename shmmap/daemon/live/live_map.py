@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One live map at work: scans are applied, chunks loaded, saved and given up, as `Residency` says.
+
+Everything that changes a chunk happens in the thread that calls `LiveMap.turn`; files are read, written and
+flushed in others.  After the death of this process the next one finds the chunks in shared memory: what was
+*applied* is there, what a scan had half done is undone, and the mapper sends it again.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from shmmap.chunks.applying import ChunkWriter, UndoRecord
+from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
+from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent, chunk_bytes, new_header
+from shmmap.chunks.marks import Marks
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
+from shmmap.daemon.live.map_files import MapFiles
+from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan
+from shmmap.daemon.live.residency import Residency
+from shmmap.errors import MapDataError, SegmentCorrupt
+from shmmap.logfmt import log
+
+__all__ = ["LiveMap"]
+
+CHUNKS_A_TURN: Final = 64
+"""Chunks that take in a scan in one turn: 37 us each."""
+
+
+@dataclass(eq=False, slots=True)
+class _Part:
+    """What a scan says of its chunks, by key."""
+
+    marks: Marks
+    places: dict[ChunkKey, tuple[int, int, int]]  # first word, end, hits
+
+
+@dataclass(eq=False)
+class LiveMap:
+    """A map, its memory and its files.
+
+    Parameters
+    ----------
+    files, memory
+        Where it is on disk and in shared memory.
+    undo
+        Memory that outlives this process.
+    limits
+        What it may take.
+    codec
+        How chunks are compressed on disk.
+    on_applied, on_durable
+        Called with scans that are in memory, and on the disk.
+    """
+
+    files: MapFiles
+    memory: ChunkMemory
+    undo: UndoRecord
+    limits: Limits
+    codec: str = "zlib"
+    on_applied: Callable[[Scan], None] = lambda _scan: None
+    on_durable: Callable[[Scan], None] = lambda _scan: None
+    residency: Residency = field(init=False)
+    chunks: dict[ChunkKey, ChunkFile] = field(default_factory=dict)
+    _kept: dict[int, int] = field(default_factory=dict)
+    _parts: dict[Scan, _Part] = field(default_factory=dict)
+    _running: dict[Future[Any], Callable[[Future[Any], float], None]] = field(default_factory=dict)
+    _generation: int = 0
+
+    def __post_init__(self) -> None:
+        self.residency = Residency(self.limits, new_bytes=memory_bytes(0))
+        self._writer = ChunkWriter(self.files.settings.occupancy, self.undo)
+        self._threads = ThreadPoolExecutor(self.limits.loads + self.limits.saves, "live-files")
+        self._generation = self.files.begin_life() << 32
+        for key, row in self.files.rows.items():
+            self.residency.note_size(key, memory_bytes(row.bricks))
+
+    # --- the start ------------------------------------------------------------------------------
+
+    def adopt(self, now_s: float) -> int:
+        """Take over what an earlier process left in memory; returns how many chunks."""
+        newest: dict[ChunkKey, tuple[int, str]] = {}
+        for name, key, generation in list(self.memory.names()):
+            if key not in newest or newest[key][0] < generation:
+                newest[key] = (generation, name)
+        undone = self.undo.of
+        for name, key, generation in list(self.memory.names()):
+            chunk = self._adopted(name) if newest[key] == (generation, name) else None
+            if chunk is None:
+                self.memory.remove(name)
+                continue
+            saved = self.files.rows[key].version if key in self.files.rows else 0
+            try:
+                if undone == (key, generation):
+                    self.undo.restore(chunk.view)
+                check_consistent(chunk.view, name)
+                if int(chunk.view.state["version"]) < saved:
+                    raise SegmentCorrupt(f"{name}: older than its file")
+            except SegmentCorrupt as error:
+                log.warning("chunk not adopted", chunk=key.text, reason=error.message)
+                os.close(self.memory.give_up(chunk))
+                continue
+            state = chunk.view.state
+            self.chunks[key] = chunk
+            self.residency.adopt(
+                key, version=int(state["version"]), saved=saved, nbytes=chunk.nbytes,
+                active=int(state["active"]), now_s=now_s,
+            )  # fmt: skip
+        if undone is not None:
+            self.undo.drop()
+        return len(self.chunks)
+
+    def _adopted(self, name: str) -> ChunkFile | None:
+        try:
+            chunk = self.memory.open(name)
+        except (SegmentCorrupt, OSError) as error:
+            log.warning("chunk not adopted", file=name, reason=str(error))
+            return None
+        if chunk.view.identity != self._identity(chunk.view.identity.key, chunk.view.identity.generation):
+            log.warning("chunk not adopted", file=name, reason="of another map, or of other settings")
+            chunk.close()
+            return None
+        return chunk
+
+    def _identity(self, key: ChunkKey, generation: int) -> ChunkIdentity:
+        settings = self.files.settings
+        _, _, low, high = settings.occupancy.steps
+        return ChunkIdentity(
+            self.files.map_id, key, settings.resolution, low, high, *settings.occupancy.thresholds,
+            generation, settings.frame_id,
+        )  # fmt: skip
+
+    # --- what comes -----------------------------------------------------------------------------
+
+    def add(self, mapper: int, number: int, marks: Marks, nbytes: int) -> Scan:
+        """Take a scan in; it is applied in this and the next turns."""
+        starts = marks.starts.tolist()
+        keys = marks.chunks
+        places = {
+            key: (starts[at], starts[at + 1], hits)
+            for at, (key, hits) in enumerate(zip(keys, marks.hits.tolist(), strict=True))
+        }
+        scan = Scan(mapper, number, nbytes, set(keys))
+        self._parts[scan] = _Part(marks, places)
+        self.residency.add(scan)
+        if scan.applied:
+            self._tell_applied(scan)
+        return scan
+
+    def move(self, client: object, xyz: tuple[float, float, float]) -> None:
+        """A client is somewhere; metres."""
+        side = 64 * self.files.settings.resolution
+        self.residency.move(client, (xyz[0] / side, xyz[1] / side, xyz[2] / side))
+
+    def released(self, lease: Lease) -> None:
+        """Nobody maps what was given up any more."""
+        os.close(self._kept.pop(lease.number))
+        self.residency.released(lease)
+
+    # --- a turn ---------------------------------------------------------------------------------
+
+    @property
+    def all_durable(self) -> bool:
+        """Whether everything that came is on the disk, and no file is being read or written."""
+        return not self._parts and not self._running and self.residency.all_durable
+
+    def turn(self, now_s: float, now_ns: int, *, save_all: bool = False) -> None:
+        """Do what can be done now, without waiting for the disk."""
+        for future in [future for future in self._running if future.done()]:
+            self._running.pop(future)(future, now_s)
+        residency = self.residency
+        for chunk, scan in residency.ready()[:CHUNKS_A_TURN]:
+            self._apply(chunk, scan, now_s, now_ns)
+        while (cold := residency.next_load(now_s)) is not None:
+            self._start(self.files.load, cold.key, then=partial(self._loaded, cold))
+        while (dirty := residency.next_save(now_s, everything=save_all)) is not None:
+            view = self.chunks[dirty.key].view
+            copy = ChunkView(bytes(view.data[: chunk_bytes(int(view.state["bricks"]))]))
+            self._start(self._save, dirty.key, copy, then=partial(self._saved, dirty, dirty.version))
+        if residency.flush_is_due:
+            residency.durability.begin()
+            self._start(self.files.flush, then=self._flushed)
+        while (lease := residency.next_eviction(now_s)) is not None:
+            self._kept[lease.number] = self.memory.give_up(self.chunks.pop(lease.key))
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a file was read or written, at most so long; not at all if there is none."""
+        wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
+
+    def _start(self, work: Callable[..., Any], *arguments: Any, then: Callable[..., None]) -> None:
+        self._running[self._threads.submit(work, *arguments)] = then
+
+    # --- applying -------------------------------------------------------------------------------
+
+    def _apply(self, chunk: Chunk, scan: Scan, now_s: float, now_ns: int) -> None:
+        part, file = self._parts[scan], self.chunks[chunk.key]
+        begin, end, hits = part.places[chunk.key]
+        words, bits = part.marks.words[begin:end], part.marks.bits[begin:end]
+        new = np.count_nonzero(file.view.index[np.unique(words >> 2)] == 0)
+        more = memory_bytes(int(file.view.state["bricks"]) + new) - chunk.nbytes
+        if more > 0 and not self.residency.may_grow(chunk, more):
+            return
+        try:
+            self._writer.apply(
+                file.view, words, bits, hits, mapper=scan.mapper, scan=scan.number, now_ns=now_ns,
+                grow=file.grow, known_mappers={mapper.number for mapper in self.files.mappers},
+            )  # fmt: skip
+        except OSError as error:  # no memory: as if the budget did not allow it
+            log.warning("chunk cannot grow", chunk=chunk.key.text, reason=error.strerror)
+            self.residency.may_grow(chunk, self.limits.budget_bytes)
+            return
+        state = file.view.state
+        self.residency.applied(
+            chunk, scan, version=int(state["version"]), nbytes=file.nbytes, active=int(state["active"]),
+            now_s=now_s,
+        )  # fmt: skip
+        if scan.applied:
+            self._tell_applied(scan)
+
+    def _tell_applied(self, scan: Scan) -> None:
+        del self._parts[scan]
+        self.on_applied(scan)
+        if scan.durable:
+            self.on_durable(scan)
+
+    # --- files ----------------------------------------------------------------------------------
+
+    def _loaded(self, chunk: Chunk, future: Future[bytes | None], now_s: float) -> None:
+        self._generation += 1
+        identity = self._identity(chunk.key, self._generation)
+        content: bytes | bytearray = new_header(identity)
+        try:
+            data = future.result()
+            if data is not None:
+                try:
+                    content = decode_chunk(data, identity, chunk.key.text)
+                except MapDataError as error:
+                    self.files.put_aside(chunk.key, error.message)
+            file = self.memory.create(content)
+        except OSError as error:
+            log.warning("chunk not loaded", chunk=chunk.key.text, reason=error.strerror)
+            self.residency.load_failed(chunk, now_s)
+            return
+        self.chunks[chunk.key] = file
+        state = file.view.state
+        self.residency.loaded(
+            chunk, version=int(state["version"]), nbytes=file.nbytes, active=int(state["active"])
+        )
+
+    def _save(self, key: ChunkKey, view: ChunkView) -> None:
+        self.files.save(key, encode_chunk(view, self.codec))
+
+    def _saved(self, chunk: Chunk, version: int, future: Future[None], now_s: float) -> None:
+        try:
+            future.result()
+        except OSError as error:
+            log.warning("chunk not saved", chunk=chunk.key.text, reason=error.strerror)
+            self.residency.save_failed(chunk, now_s)
+            return
+        self.residency.saved(chunk, version, now_s)
+        self.chunks[chunk.key].view.state["saved_version"] = version
+
+    def _flushed(self, future: Future[None], now_s: float) -> None:
+        del now_s
+        try:
+            future.result()
+        except OSError as error:
+            log.warning("chunks not flushed", reason=error.strerror)
+            self.residency.durability.failed()
+            return
+        for scan in self.residency.durability.flushed():
+            self.on_durable(scan)
+
+    def close(self) -> None:
+        """Leave memory and files as they are."""
+        self._threads.shutdown()
+        for file in self.chunks.values():
+            file.close()
+        for fd in self._kept.values():
+            os.close(fd)
+        self.chunks.clear()
+        self._kept.clear()

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive for live maps, and a program that takes it in: it is killed, and says what was applied before.
+
+    python -m tests.support.live_drive SHM_DIRECTORY MAP_DIRECTORY BUDGET CHECKPOINT_S FIRST_SCAN
+
+It prints ``applied N`` and ``durable N`` for each scan; when all of it is on the disk how many chunks were
+given up and the most bytes that all took, and ``done``.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
+from shmmap.chunks.chunk_file import decode_chunk
+from shmmap.chunks.layout import ChunkView, check_consistent
+from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marks import Marks
+from shmmap.chunks.voxels import voxels_of
+from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
+from shmmap.daemon.live.folder import Folder
+from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.map_files import MapFiles, MapSettings
+from shmmap.daemon.live.records import Limits
+from tests.support.slow_occupancy import Voxel
+
+RESOLUTION = 0.2
+SETTINGS = MapSettings(resolution=RESOLUTION)
+FILTER = ScanFilter(0.2, 9.0, -5.0, 5.0)
+SCANS = 24
+
+
+def drive(scans: int = SCANS) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Points and poses along a way that crosses chunks, comes back, and jumps."""
+    rng = np.random.default_rng(8)
+    found = []
+    for number in range(scans):
+        pose, yaw = np.eye(4), 0.3 * number
+        pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+        pose[:3, 3] = [20.0 * math.sin(0.5 * number), -7.0 * number % 31.0, 0.2 * number]
+        if number % 6 == 5:
+            pose[:3, 3] -= 300.0
+        found.append((rng.normal(0.0, 4.0, (150, 3)), pose))
+    return found
+
+
+def marked(scans: int = SCANS) -> list[Marks]:
+    """The same as marks."""
+    marker = Marker(RESOLUTION, FILTER)
+    return [marker.mark(points, pose)[0] for points, pose in drive(scans)]
+
+
+def undo_in(shm: Path) -> UndoRecord:
+    """The undo record in shared memory, made if there is none."""
+    fd = os.open(shm / "undo", os.O_RDWR | os.O_CREAT, 0o600)
+    os.ftruncate(fd, UNDO_BYTES)
+    data = mmap.mmap(fd, UNDO_BYTES)
+    os.close(fd)
+    return UndoRecord(data)
+
+
+def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tuple[LiveMap, Folder]:
+    """The map, with what an earlier process left."""
+    folder = Folder(disk)
+    limits = Limits(budget, linger_s=0.05, checkpoint_s=checkpoint_s, waiting_bytes=1)
+    made = LiveMap(
+        MapFiles(folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")), undo_in(shm), limits
+    )
+    made.adopt(time.monotonic())
+    return made, folder
+
+
+def voxels_on_disk(files: MapFiles, made: LiveMap) -> dict[Voxel, int]:
+    """All known voxels, by the chunks' files; every one of them can be read."""
+    found: dict[Voxel, int] = {}
+    for key in files.rows:
+        data = files.load(key)
+        assert data is not None
+        view = ChunkView(decode_chunk(data, made._identity(key, 1)))
+        check_consistent(view)
+        dense = view.dense()
+        places = np.flatnonzero(dense)
+        for voxel, value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):
+            found[voxel[0], voxel[1], voxel[2]] = value
+    return found
+
+
+def main() -> None:
+    """Take in the drive from a scan on, and save everything."""
+    shm, disk = map(Path, sys.argv[1:3])
+    made, folder = opened(shm, disk, int(sys.argv[3]), float(sys.argv[4]))
+    first = int(sys.argv[5])
+    made.on_applied = lambda scan: print(f"applied {scan.number}", flush=True)
+    made.on_durable = lambda scan: print(f"durable {scan.number}", flush=True)
+    waiting = list(enumerate(marked(), 1))[first - 1 :]
+    evicted = most = 0
+    poses = [pose for _, pose in drive()]
+    while waiting or not made.all_durable:
+        if waiting and made.residency.has_room(1):
+            number, marks = waiting.pop(0)
+            made.move("mapper", tuple(poses[number - 1][:3, 3].tolist()))
+            made.add(1, number, marks, 1)
+        made.turn(time.monotonic(), time.time_ns(), save_all=not waiting)
+        most = max(most, made.residency.chunk_bytes + made.residency.leased_bytes)
+        for lease in list(made.residency.leases.values()):
+            made.released(lease)
+            evicted += 1
+        made.wait(0.05)
+    made.files.write_manifest()
+    made.close()
+    folder.close()
+    print(f"evicted {evicted}\nmost {most}\ndone", flush=True)
+
+
+if __name__ == "__main__":
+    main()

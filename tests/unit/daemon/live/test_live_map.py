@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live map with little memory equals an unbounded one, and whoever kills its writer loses nothing of it."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.chunks.voxels import ChunkKey
+from tests.support.chunk_memory import ChunkMemory as Unbounded
+from tests.support.live_drive import RESOLUTION, SCANS, marked, opened, voxels_on_disk
+from tests.support.slow_occupancy import Voxel
+
+LITTLE = "1500000", "0.05"
+"""Of about eight megabytes that the whole map takes, and more than one chunk can; saved all the time."""
+PLENTY = "30000000", "1e9"
+"""Nothing is saved that stays in memory: what a scan said is there alone until the end."""
+
+
+@pytest.fixture(scope="module")
+def reference() -> dict[Voxel, int]:
+    """The voxels of a map that has memory for everything."""
+    unbounded = Unbounded(RESOLUTION)
+    for number, marks in enumerate(marked(), 1):
+        unbounded.apply(marks, scan=number)
+    return unbounded.voxels()
+
+
+@pytest.fixture
+def shm() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        yield Path(path)
+
+
+def run(
+    shm: Path, disk: Path, first: int, memory: tuple[str, str] = LITTLE, **environment: str
+) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.support.live_drive", str(shm), str(disk), *memory, str(first)],
+        stdout=subprocess.PIPE, text=True, env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+def said(lines: str, word: str) -> list[int]:
+    """Numbers of the scans of which somebody said that they are applied, or durable."""
+    return [int(line.split()[1]) for line in lines.splitlines() if line.startswith(word + " ")]
+
+
+def assert_equal_to(reference: dict[Voxel, int], shm: Path, disk: Path) -> None:
+    """Everything is on the disk, and all memory is given back but what is clean."""
+    made, folder = opened(shm, disk, 10**9)
+    assert voxels_on_disk(made.files, made) == reference
+    assert not made.files.missing
+    assert not made.files.damaged
+    assert all(
+        view.view.state["version"] == view.view.state["saved_version"] for view in made.chunks.values()
+    )
+    assert not [name for name in os.listdir(disk) if name.endswith(".tmp")]
+    made.close()
+    folder.close()
+
+
+def test_a_drive_with_little_memory(shm: Path, tmp_path: Path, reference: dict[Voxel, int]) -> None:
+    process = run(shm, tmp_path, 1)
+    lines, _ = process.communicate(timeout=120)
+    assert said(lines, "evicted")[0] > 20
+    assert said(lines, "most")[0] <= int(LITTLE[0])
+    assert said(lines, "applied") == list(range(1, SCANS + 1))
+    assert sorted(said(lines, "durable")) == list(range(1, SCANS + 1))
+    assert_equal_to(reference, shm, tmp_path)
+
+
+def finish(shm: Path, disk: Path, lines: str) -> str:
+    """The mapper sends again what it has no answer for."""
+    applied = said(lines, "applied")
+    more, _ = run(shm, disk, (max(applied) if applied else 0) + 1).communicate(timeout=120)
+    assert more.endswith("done\n")
+    return more
+
+
+@pytest.mark.parametrize(
+    ("label", "times"),
+    [
+        ("live.copied", 60), ("live.odd", 61), ("live.applied", 1), ("live.applied", 90), ("live.even", 97),
+        ("live.map", 1), ("live.written", 9), ("live.synced", 11), ("live.renamed", 12), ("live.flushed", 1),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("memory", [LITTLE, PLENTY])
+def test_a_writer_that_is_killed_at_any_step_loses_nothing(
+    shm: Path, tmp_path: Path, reference: dict[Voxel, int], label: str, times: int, memory: tuple[str, str]
+) -> None:
+    process = run(shm, tmp_path, 1, memory, SHMMAP_TEST_CRASH=f"{label}:{times}")
+    lines, _ = process.communicate(timeout=120)
+    assert process.returncode == -signal.SIGKILL, "it came to that step"
+    finish(shm, tmp_path, lines)
+    assert_equal_to(reference, shm, tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_writer_that_is_killed_at_any_time_loses_nothing(
+    shm: Path, tmp_path: Path, reference: dict[Voxel, int], seed: int
+) -> None:
+    """Several times in a row, each after it has said something at random."""
+    rng = random.Random(seed)
+    lines = ""
+    for _ in range(4):
+        applied = said(lines, "applied")
+        process = run(shm, tmp_path, (max(applied) if applied else 0) + 1)
+        assert process.stdout is not None
+        for _ in range(rng.randint(0, 12)):
+            lines += process.stdout.readline()
+        process.kill()
+        lines += process.stdout.read()
+        process.wait()
+        process.stdout.close()
+    finish(shm, tmp_path, lines)
+    assert_equal_to(reference, shm, tmp_path)
+
+
+def test_what_is_damaged_on_disk_is_kept_and_mapping_goes_on(shm: Path, tmp_path: Path) -> None:
+    run(shm, tmp_path, 1).communicate(timeout=120)
+    for name in os.listdir(shm):
+        (shm / name).unlink()
+    victim = max(tmp_path.glob("*.chunk"), key=lambda path: path.stat().st_size)
+    damaged = bytearray(victim.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    victim.write_bytes(damaged)
+    made, folder = opened(shm, tmp_path, 10**9)
+    key = ChunkKey.from_text(victim.name.removesuffix(".chunk"))
+    made.add(1, 99, next(marks for marks in marked() if key in marks.chunks), 1)
+    for number in range(200):
+        made.turn(float(number), number, save_all=True)
+        made.wait(0.05)
+    assert (tmp_path / f"{victim.name}.damaged.1").read_bytes() == damaged
+    assert key in made.files.rows
+    made.close()
+    folder.close()
