@@ -14,7 +14,7 @@ import resource
 from collections.abc import Iterator
 from typing import Final
 
-from shmmap.daemon.host.inotify import CLOSED, OVERFLOW, Inotify
+from shmmap.daemon.host.inotify import CLOSED, ENDED, OVERFLOW, Inotify
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import holders, in_use
@@ -50,6 +50,7 @@ class PinWatch:
         self._directory = directory
         self._kept: dict[str, tuple[int, int]] = {}
         self._names: dict[int, str] = {}
+        self._once: dict[str, int] = {}
         self._most_kept = min(KEPT_OPEN, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // KEPT_SHARE)
         self._inotify: Inotify | None = None
         if events:
@@ -72,8 +73,13 @@ class PinWatch:
         if kept is not None:
             yield kept[0]
             return
+        once = self._once.pop(name, -1)
+        if once >= 0 and self._inotify is not None:  # or what follows would be reported as somebody's close
+            self._inotify.remove(once)
         with self._directory.opened(name) as fd:
             yield fd
+        if once >= 0:
+            self.tell_once(name)
 
     def is_used_elsewhere(self, fd: int) -> bool:
         """Whether anybody else uses an open segment, according to the kernel; False where it gives none."""
@@ -104,6 +110,7 @@ class PinWatch:
         except OSError:
             os.close(fd)
             return False
+        self._once.pop(self._names.get(watch, ""), None)  # what told once is now kept
         self._kept[name] = fd, watch
         self._names[watch] = name
         return True
@@ -126,7 +133,7 @@ class PinWatch:
         if self._inotify is not None:
             with contextlib.suppress(OSError):
                 watch = self._inotify.add(self._directory.path + name, CLOSED, once=True)
-                self._names[watch] = name
+                self._names[watch], self._once[name] = name, watch
 
     def closed(self) -> set[str] | None:
         """Names that somebody let go of since the last call; None: any of them, too many to tell."""
@@ -137,8 +144,12 @@ class PinWatch:
             if event.mask & OVERFLOW:
                 return None
             name = self._names.get(event.watch)
-            if name is not None:
+            if name is None:
+                continue
+            if event.mask & ENDED:  # it has told, or was ended by our own look; what came before that counts
+                del self._names[event.watch]
+                if self._once.get(name) == event.watch:
+                    del self._once[name]
+            else:
                 names.add(name)
-                if name not in self._kept:
-                    del self._names[event.watch]
         return names

@@ -104,6 +104,32 @@ def test_a_segment_in_service_tells_once(directory: ShmDirectory) -> None:
     pins.close()
 
 
+def test_our_own_look_is_nobody_s_close(directory: ShmDirectory) -> None:
+    """Else who waits for room is told of some again and again, as long as it looks for some."""
+    pins = PinWatch(directory, events=True)
+    first = map_segment(directory.path + NAME)
+    for _ in range(3):
+        pins.tell_once(NAME)
+        assert pins.is_used(NAME) is True
+        assert pins.closed() == set()
+    first.close()
+    assert reported(pins.fd)
+    assert pins.closed() == {NAME}, "it is told of although somebody has looked meanwhile"
+    assert pins.is_used(NAME) is False
+    assert pins.closed() == set()
+    pins.close()
+
+
+def test_a_close_before_our_own_look_counts(directory: ShmDirectory) -> None:
+    pins = PinWatch(directory, events=True)
+    first = map_segment(directory.path + NAME)
+    pins.tell_once(NAME)
+    first.close()
+    assert pins.is_used(NAME) is False
+    assert pins.closed() == {NAME}
+    pins.close()
+
+
 def test_without_events_nothing_is_kept(directory: ShmDirectory) -> None:
     pins = PinWatch(directory)
     assert (pins.fd, pins.keep(NAME), pins.keeps(NAME), pins.closed()) == (-1, False, False, set())
