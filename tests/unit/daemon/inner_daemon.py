@@ -92,7 +92,8 @@ class InnerDaemon:
         self.sessions = Sessions()
         self.ledger = Ledger(budget_bytes)
         self.ledger.overhead_bytes = self.statistics.size_bytes
-        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory))
+        pins = PinWatch(self.directory, events=True)
+        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, pins)
         self.evictor = Evictor(self.reclaimer, POLICIES["distance"])
         self.watched = WatchedDescriptors()
         self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
@@ -109,6 +110,7 @@ class InnerDaemon:
         self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
         self.loads = self.scheduler.loads
         self.watched.watch(self.reclaimer.closer.fd, self.scheduler.hear_of_freed)
+        self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(self.now_s()))
         self.hold_answers = False
         self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []

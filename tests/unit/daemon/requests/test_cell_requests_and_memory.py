@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Sequence
@@ -68,6 +69,24 @@ def test_a_budget_that_is_just_enough(inner: Inner, small_map: DividedMap) -> No
     other.ledger.budget_bytes = other.ledger.overhead_bytes + 15 * each + estimate - 4096
     reply = other.everything()
     assert (len(reply.cells), [failure.code for failure in reply.failed]) == (15, ["over_budget"])
+
+
+def test_looking_for_room_where_others_map_everything_comes_to_an_end(
+    inner: Inner, small_map: DividedMap
+) -> None:
+    """The daemon looks at what they map, and hears of no close by that, for which it would look again."""
+    one = inner(small_map.root)
+    one.everything()
+    with contextlib.ExitStack() as stack:
+        for resident in one.ledger.residents():
+            stack.enter_context(open(one.path_of(resident.name.rsplit(".", 1)[1]), "rb"))
+        for _ in range(3):
+            one.offset_s += 5.0
+            looks = 0
+            while one.evictor.free(1 << 30, one.now_s()):
+                looks += 1
+                assert looks < 10
+                one.scheduler.hear_of_closes(one.now_s())
 
 
 def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
