@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The serving loop: one thread, and nothing in it that waits for a disk.
 
-Requests come first; between them the loop hears its clients and loaders, and frees memory.  Files are read
-and layers built elsewhere (`shmmap.daemon.loading.worker_main`).  A turn goes from one look at the
-descriptors to the next; whoever has just sent something waits for it: each is measured, none may be long.
+Clients are heard and served first.  Then come loaders, the kernel and others that have something to say,
+memory to free and loads to hand out: one of these, and if that took its time, whoever has asked meanwhile.
+Files are read and layers built elsewhere (`shmmap.daemon.loading.worker_main`).  A turn goes from one look at
+the descriptors to the next; whoever has just sent something waits for it: each is measured, none may be long.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class ServingLoop:
     _most_s: float = 0.0
     _most_of_it: str = "statistics"
     _told_s: float = float("-inf")
-    _others: dict[int, None] = field(default_factory=dict)
+    _others: dict[int, None] = field(default_factory=dict)  # that have something to say and are no clients
 
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer`` those who wait are left to the next life."""
