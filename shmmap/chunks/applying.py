@@ -124,6 +124,11 @@ class ChunkWriter:
         self._undo = undo
         self._touched = np.zeros(BRICKS, np.uint16)
 
+    def new_bricks(self, view: ChunkView, words: NDArray[np.uint16]) -> int:
+        """Return how many bricks a chunk gets by these words."""
+        count: int = kernels.touched_bricks(view.index, words, self._touched)
+        return count
+
     def apply(
         self,
         view: ChunkView,
@@ -161,10 +166,9 @@ class ChunkWriter:
         row = self._row(view, mapper)
         if row is not None and int(view.state["mappers"]["scan"][row]) >= scan:
             return view
-        new = kernels.touched_bricks(view.index, words, self._touched)
-        bricks = int(view.state["bricks"])
-        if bricks + new > len(view.bricks):
-            view = grow(bricks + new)
+        bricks = int(view.state["bricks"]) + self.new_bricks(view, words)
+        if bricks > len(view.bricks):
+            view = grow(bricks)
         self._undo.keep(view, self._touched[: np.count_nonzero(self._touched)])
         state = view.state
         sequence = state["sequence"].reshape(1)

@@ -74,7 +74,12 @@ def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tup
     made = LiveMap(
         MapFiles(folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")), undo_in(shm), limits
     )
-    made.adopt(time.monotonic())
+    try:
+        made.adopt(time.monotonic())
+    except OSError:
+        made.close()
+        folder.close()
+        raise
     return made, folder
 
 

@@ -15,18 +15,23 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
 
-import numpy as np
-
 from shmmap.chunks.applying import ChunkWriter, UndoRecord
 from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
-from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent, chunk_bytes, new_header
+from shmmap.chunks.layout import (
+    OUT_OF_SERVICE,
+    ChunkIdentity,
+    ChunkView,
+    check_consistent,
+    chunk_bytes,
+    new_header,
+)
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan
 from shmmap.daemon.live.residency import Residency
-from shmmap.errors import MapDataError, SegmentCorrupt
+from shmmap.errors import MapDataError, PackageMissing, SegmentCorrupt
 from shmmap.logfmt import log
 
 __all__ = ["LiveMap"]
@@ -86,7 +91,13 @@ class LiveMap:
     # --- the start ------------------------------------------------------------------------------
 
     def adopt(self, now_s: float) -> int:
-        """Take over what an earlier process left in memory; returns how many chunks."""
+        """Take over what an earlier process left in memory; returns how many chunks.
+
+        Raises
+        ------
+        OSError
+            One cannot be opened: it stays where it is, for the next try.
+        """
         newest: dict[ChunkKey, tuple[int, str]] = {}
         for name, key, generation in list(self.memory.names()):
             if key not in newest or newest[key][0] < generation:
@@ -96,6 +107,9 @@ class LiveMap:
             chunk = self._adopted(name) if newest[key] == (generation, name) else None
             if chunk is None:
                 self.memory.remove(name)
+                continue
+            if int(chunk.view.state["state"]) == OUT_OF_SERVICE:  # it was saved, and all but given up
+                os.close(self.memory.give_up(chunk))
                 continue
             saved = self.files.rows[key].version if key in self.files.rows else 0
             try:
@@ -119,10 +133,11 @@ class LiveMap:
         return len(self.chunks)
 
     def _adopted(self, name: str) -> ChunkFile | None:
+        """What has this name, if it is a chunk of this map; raises OSError if it cannot be opened now."""
         try:
             chunk = self.memory.open(name)
-        except (SegmentCorrupt, OSError) as error:
-            log.warning("chunk not adopted", file=name, reason=str(error))
+        except SegmentCorrupt as error:
+            log.warning("chunk not adopted", file=name, reason=error.message)
             return None
         if chunk.view.identity != self._identity(chunk.view.identity.key, chunk.view.identity.generation):
             log.warning("chunk not adopted", file=name, reason="of another map, or of other settings")
@@ -204,8 +219,8 @@ class LiveMap:
         part, file = self._parts[scan], self.chunks[chunk.key]
         begin, end, hits = part.places[chunk.key]
         words, bits = part.marks.words[begin:end], part.marks.bits[begin:end]
-        new = np.count_nonzero(file.view.index[np.unique(words >> 2)] == 0)
-        more = memory_bytes(int(file.view.state["bricks"]) + new) - chunk.nbytes
+        bricks = int(file.view.state["bricks"]) + self._writer.new_bricks(file.view, words)
+        more = memory_bytes(bricks) - chunk.nbytes
         if more > 0 and not self.residency.may_grow(chunk, more):
             return
         try:
@@ -245,8 +260,8 @@ class LiveMap:
                 except MapDataError as error:
                     self.files.put_aside(chunk.key, error.message)
             file = self.memory.create(content)
-        except OSError as error:
-            log.warning("chunk not loaded", chunk=chunk.key.text, reason=error.strerror)
+        except (OSError, PackageMissing) as error:
+            log.warning("chunk not loaded", chunk=chunk.key.text, reason=str(error))
             self.residency.load_failed(chunk, now_s)
             return
         self.chunks[chunk.key] = file

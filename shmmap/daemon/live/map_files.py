@@ -32,7 +32,6 @@ __all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
 MAP_FILE: Final = "map.json"
 MANIFEST: Final = "manifest.json"
 MAP_FORMAT: Final = 1
-MOST_MAPPERS: Final = 32
 SCANS_AHEAD: Final = 256
 """Numbers of scans that ``map.json`` leaves to a mapper before it is written again."""
 
@@ -245,8 +244,12 @@ class MapFiles:
     def flush(self) -> None:
         """Make durable what was saved."""
         if self._unflushed:
-            self._unflushed = False
-            self.files.sync_names()
+            self._unflushed = False  # what is saved from now on is for the next one
+            try:
+                self.files.sync_names()
+            except OSError:
+                self._unflushed = True
+                raise
             step("live.flushed")
 
     def write_manifest(self) -> None:
@@ -274,7 +277,7 @@ class MapFiles:
 
     def _header(self, name: str, *, whole: bool = False) -> ChunkFileHeader | None:
         """What a file of this map says of its chunk, if its length is right, and, if ``whole``, its body."""
-        with contextlib.suppress(OSError, MapDataError):
+        with contextlib.suppress(FileNotFoundError, MapDataError):
             if whole:
                 header = check_file(self.files.read(name), name)
             else:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import signal
@@ -14,7 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.chunks.layout import OUT_OF_SERVICE
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.chunk_memory import ChunkMemory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.live_drive import RESOLUTION, SCANS, marked, opened, voxels_on_disk
 from tests.support.slow_occupancy import Voxel
@@ -123,6 +126,35 @@ def test_a_writer_that_is_killed_at_any_time_loses_nothing(
         process.stdout.close()
     finish(shm, tmp_path, lines)
     assert_equal_to(reference, shm, tmp_path)
+
+
+def test_what_was_all_but_given_up_comes_back_from_disk(
+    monkeypatch: pytest.MonkeyPatch, shm: Path, tmp_path: Path, reference: dict[Voxel, int]
+) -> None:
+    """Out of service, and its name still there: nobody is to have that; and what cannot be opened stays."""
+    run(shm, tmp_path, 1).communicate(timeout=120)
+    name = max(shm.glob("shmmap-live.*"))
+    made, folder = opened(shm, tmp_path, 10**9)
+    key = next(key for key, chunk in made.chunks.items() if chunk.name == f"/{name.name}")
+    made.chunks[key].view.state["state"] = OUT_OF_SERVICE
+    made.close()
+    folder.close()
+    left = sorted(shm.iterdir())
+    with monkeypatch.context() as patch:
+        patch.setattr(ChunkMemory, "open", _too_many_files)
+        with pytest.raises(OSError, match="Too many open files"):
+            opened(shm, tmp_path, 10**9)
+    assert sorted(shm.iterdir()) == left
+    made, folder = opened(shm, tmp_path, 10**9)
+    assert key not in made.chunks
+    assert not name.exists()
+    made.close()
+    folder.close()
+    assert_equal_to(reference, shm, tmp_path)
+
+
+def _too_many_files(*_: object) -> None:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
 def test_what_is_damaged_on_disk_is_kept_and_mapping_goes_on(shm: Path, tmp_path: Path) -> None:

@@ -183,6 +183,33 @@ def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, tmp_
     folder.close()
 
 
+def test_what_was_not_flushed_is_flushed_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flush that fails makes nothing durable, nor does the next one by doing nothing."""
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 1))
+    with monkeypatch.context() as patch:
+        patch.setattr(disk, "sync_names", _full)
+        with pytest.raises(OSError, match="No space"):
+            made.flush()
+    made.flush()
+    assert version_of(MapFiles(disk.after(lambda: False, lambda _size: 0), SETTINGS), KEYS[0]) == 1
+
+
+def test_what_cannot_be_read_just_now_is_not_put_aside(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = Folder(tmp_path)
+    made = MapFiles(folder, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 1))
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "size", _full)
+        with pytest.raises(OSError, match="No space"):
+            MapFiles(folder, SETTINGS)
+    assert version_of(MapFiles(folder, SETTINGS), KEYS[0]) == 1
+    folder.close()
+
+
 def _full(*_: object) -> None:
     raise OSError(28, os.strerror(28))
 
