@@ -22,6 +22,7 @@
     ├── NoSession              the daemon does not know this session: say hello   exit 1
     ├── NotPermitted           the daemon refuses this to this user               exit 1
     ├── Busy                   too many requests of this process wait already     exit 75
+    ├── LiveInterrupted        who keeps live maps is started anew: ask again      exit 75
     ├── SegmentError           a segment cannot be used
     │   ├── StaleHandle        it is gone: ask again                              exit 1
     │   └── SegmentCorrupt     its bytes are wrong (magic, version, checksum)     exit 65
@@ -58,6 +59,7 @@ __all__ = [
     "DaemonUnreachable",
     "InstanceBusy",
     "InternalError",
+    "LiveInterrupted",
     "LoadFailed",
     "LoadTimeout",
     "MapDataError",
@@ -244,6 +246,17 @@ class Busy(ShmmapError):
 
     code = "busy"
     exit_code = 75
+
+
+class LiveInterrupted(ShmmapError):
+    """The process that keeps live maps ended before it answered, and is started anew: send the same again.
+
+    Nothing that was answered is lost, and a scan that is sent again counts once.
+    """
+
+    code = "live_interrupted"
+    exit_code = 75
+    advice = "ask again"
 
 
 class SegmentError(ShmmapError):

@@ -21,6 +21,7 @@ from shmmap.protocol import messages
 from shmmap.protocol.messages import Intent, Welcome
 
 if TYPE_CHECKING:
+    from shmmap.client.live.live_map import LiveMap
     from shmmap.client.map_listing import MapListing
 
 __all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
@@ -234,6 +235,27 @@ class Client(OperatorRequests):
         Every request tells it anyway; this is for programs that drop cells and then stay quiet.
         """
         return self._session.tell_unmapped()
+
+    # --- live maps ------------------------------------------------------------------------------
+
+    def live(self, name: str, *, frame_id: str = "") -> LiveMap:
+        """Use a live map: one that others write while it is read.
+
+        Parameters
+        ----------
+        name
+            What the daemon calls it.
+        frame_id
+            Frame in which this program works; empty: whatever the map's is.
+
+        Raises
+        ------
+        BadRequest
+            There is no such map, or it is in another frame.
+        """
+        from shmmap.client.live.live_map import LiveMap  # most clients never do
+
+        return LiveMap(self._session, name, frame_id)
 
     # --- the map ------------------------------------------------------------------------------------
 

@@ -28,6 +28,7 @@ from shmmap.daemon.host.signals import (
     StartSignals,
     ignore_signals,
 )
+from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
@@ -71,6 +72,7 @@ class Service:
         self,
         config: DaemonConfig,
         memory: MapInMemory,
+        live: LiveRelay | NoLiveMaps,
         reloader: Reloader,
         manager: ServiceManager,
         socket_path: str,
@@ -80,6 +82,7 @@ class Service:
     ) -> None:
         self._config = config
         self._memory = memory
+        self._live = live
         self._reloader = reloader
         self._manager = manager
         self._socket_path = socket_path
@@ -106,7 +109,9 @@ class Service:
             events_path(socket_path),
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader)
-        handshake = Handshake(sessions, cells, statistics, memory.event_log, operators, cache.survey)
+        handshake = Handshake(
+            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left
+        )
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log)
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
@@ -116,6 +121,7 @@ class Service:
             queries,
             operators,
             authorization,
+            live,
             cache.survey,
             sampler,
             defects,
@@ -211,6 +217,7 @@ class Service:
         if not any(self._connections):  # nobody can leave who would make room
             self._connections.try_again()
         self._pins.keep(now_s)
+        self._live.beat(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
         version = memory.cache.catalogue.map_version

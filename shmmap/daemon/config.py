@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Final
 
 from shmmap.daemon.config_file import Setting, read_settings_file
+from shmmap.daemon.config_live import LiveSettings, live_settings
 from shmmap.errors import BadRequest, ConfigError
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
@@ -38,11 +39,14 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "load_timeout_s": (lambda value: 0 < value <= 86400, "seconds, more than 0 and at most a day"),
     "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
+    "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
     "eviction": (lambda value: value in ("distance", "lru"), "distance or lru"),
 }
 """Which values a setting may have, and the hint for who gives another."""
 _NOT_SETTINGS: Final = "SHMMAP_TEST_"
-FILE_NAMES: Final = {"budget_bytes": "budget", "cache_bytes": "cache_size"}
+FILE_NAMES: Final = {
+    "budget_bytes": "budget", "cache_bytes": "cache_size", "live_budget_bytes": "live_budget",
+}  # fmt: skip
 """What files, variables and options call a setting, where that is not the attribute's name."""
 
 
@@ -88,6 +92,15 @@ class DaemonConfig:
         Most disk space of computed and prepared layers; 0: none are kept.
     eviction
         ``distance`` or ``lru``.
+    live
+        The live maps that are kept.
+    live_budget_bytes
+        Most shared memory of live maps; 0: an eighth of what is available, at most 1 GiB.
+    live_shm_dir
+        Where their chunks are: a tmpfs without huge pages; empty: /dev/shm where ``shm_dir`` has huge pages,
+        else ``shm_dir``.
+    live_group
+        Group whose members may map, besides root and the daemon's own user.
     """
 
     map_path: str = ""
@@ -107,6 +120,10 @@ class DaemonConfig:
     cache_dir: str = ""
     cache_bytes: int = 8 << 30
     eviction: str = "distance"
+    live: tuple[LiveSettings, ...] = ()
+    live_budget_bytes: int = 0
+    live_shm_dir: str = ""
+    live_group: str = ""
 
     def socket(self) -> str:
         """Path of the request socket."""
@@ -152,7 +169,7 @@ def _convert(name: str, value: Any, origin: str) -> Any:
     kind = type(getattr(DaemonConfig(), name))
     called = FILE_NAMES.get(name, name)
     try:
-        if name in ("budget_bytes", "cache_bytes"):
+        if name in ("budget_bytes", "cache_bytes", "live_budget_bytes"):
             value = parse_bytes(value) if isinstance(value, str) else value
         if name == "session_quota" and isinstance(value, str) and not value.replace(".", "").isdigit():
             value = float(parse_bytes(value))
@@ -230,16 +247,36 @@ def trace_settings(
     given += [(name, value, "command line") for name, value in flags.items() if value is not None]
     settings = {field.name: Setting(field.default, "default") for field in fields(DaemonConfig)}
     attributes = {called: name for name, called in FILE_NAMES.items()}
+    live: dict[str, list[tuple[Any, str]]] = {"tables": [], "flags": []}
     for word, value, origin in given:
+        if word == "live":
+            live[
+                "tables" if isinstance(value, Mapping) or origin.startswith(file or "\0") else "flags"
+            ].append((value, origin))
+            continue
         name = attributes.get(word, word)
         if name not in settings or (word in FILE_NAMES and origin != "command line"):
             raise _unknown(word, origin)
         settings[name] = Setting(_convert(name, value, origin), origin)
+    settings["live"] = _live(live["tables"], live["flags"])
     endpoint = settings["endpoint"]
     if endpoint.value and settings["instance"].origin == "default":
         # clients that know the socket alone look for the segments of the instance it is named after
         settings["instance"] = Setting(_instance_of(endpoint.value), endpoint.origin)
     return settings
+
+
+def _live(tables: list[tuple[Any, str]], flags: list[tuple[Any, str]]) -> Setting:
+    """Put the settings of live maps together: of those that variables or the command line name, too."""
+    origins = [origin for _, origin in (*tables, *flags)]
+    names = [
+        name.strip()
+        for value, _ in flags
+        for name in (value.split(",") if isinstance(value, str) else value)
+        if name.strip()
+    ]
+    table, table_origin = tables[-1] if tables else ({}, "")
+    return Setting(live_settings(names, table, table_origin), " and ".join(origins) or "default")
 
 
 def _instance_of(endpoint: str) -> str:

@@ -38,6 +38,8 @@ from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
+from shmmap.daemon.live.place import place_live_maps
+from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.loading.prepared_parent import fork_early
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map_in_memory import MapInMemory
@@ -48,6 +50,7 @@ from shmmap.daemon.prerequisites import (
     make_runtime_dir,
     raise_descriptor_limit,
 )
+from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
@@ -55,6 +58,8 @@ from shmmap.errors import ConfigError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.origin.map_layout import absolute_path
+from shmmap.origin.map_origin import MapOrigin
+from shmmap.origin.no_map import NoMap
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
@@ -81,8 +86,11 @@ def run(config: DaemonConfig) -> int:
         Something is full, not there yet, or in the way.
     """
     set_up_logging()
-    if not config.map_path:
-        raise ConfigError("no map is named", key="map_path", hint="give `shmmap serve MAP`, or set map_path")
+    if not config.map_path and not config.live:
+        raise ConfigError(
+            "no map is named", key="map_path",
+            hint="give `shmmap serve MAP`, or set map_path; --live NAME for a live map alone",
+        )  # fmt: skip
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     early = fork_early()
     prepare_process()
@@ -98,10 +106,12 @@ def run(config: DaemonConfig) -> int:
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
         pins = choose_pins(directory)
-        origin = find_origin(
-            config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
-            tell=notify,
-        )  # fmt: skip
+        origin: MapOrigin = NoMap()
+        if config.map_path:
+            origin = find_origin(
+                config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
+                tell=notify,
+            )  # fmt: skip
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere
             config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
@@ -122,10 +132,13 @@ def run(config: DaemonConfig) -> int:
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early)
             stack.push(partial(_close, memory, signals))
         del catalogue  # a reload replaces it
+        live = _live_maps(config, memory, gid)
+        stack.push(partial(_close_live, live, signals))
         reloader = Reloader(origin, lambda: memory.cache.catalogue)
         service = Service(
             config,
             memory,
+            live,
             reloader,
             ServiceManager(),
             path,
@@ -141,6 +154,32 @@ def run(config: DaemonConfig) -> int:
 def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:
     """Leave the segments to the next life, too, if a defect ended this one: it is like a crash."""
     memory.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
+
+
+def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay | NoLiveMaps:
+    """Bring the live maps into memory."""
+    if not config.live:
+        return NoLiveMaps()
+    mappers = Authorization(config.live_group, "live_group")
+    begin = place_live_maps(
+        config.live, instance=config.instance, cells=memory.directory,
+        cells_budget_bytes=memory.cache.ledger.budget_bytes, shm_dir=config.live_shm_dir,
+        budget_bytes=config.live_budget_bytes, gid=gid, marks_gid=mappers.gid,
+    )  # fmt: skip
+    relay = LiveRelay(begin, memory.watched, mappers.allow)
+    try:
+        relay.start()
+        relay.wait_until_serving()
+    except BaseException:
+        relay.close(keep=True)
+        raise
+    return relay
+
+
+def _close_live(
+    live: LiveRelay | NoLiveMaps, signals: StartSignals, kind: type[BaseException] | None, *_: object
+) -> None:
+    live.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
 
 
 def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:

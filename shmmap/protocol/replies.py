@@ -8,6 +8,7 @@ from typing import TypeAlias
 import msgspec
 
 from shmmap.protocol.events import EventPage
+from shmmap.protocol.live import LiveReply
 
 __all__ = [
     "Cells",
@@ -331,5 +332,6 @@ Reply: TypeAlias = (
     | Pinned
     | Stopping
     | EventPage
+    | LiveReply
     | ErrorReply
 )

@@ -12,6 +12,7 @@ import msgspec
 
 from shmmap.protocol.areas import AreaMessage, HeldCell, Intent
 from shmmap.protocol.events import Recent
+from shmmap.protocol.live import LiveRequest
 
 __all__ = [
     "Area",
@@ -183,5 +184,6 @@ Request: TypeAlias = (
     | Unpin
     | Shutdown
     | Recent
+    | LiveRequest
     | Bye
 )

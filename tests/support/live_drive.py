@@ -25,6 +25,7 @@ from shmmap.chunks.layout import ChunkView, check_consistent
 from shmmap.chunks.marking import Marker, ScanFilter
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import voxels_of
+from shmmap.daemon.live.adopting import adopt
 from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.live_map import LiveMap
@@ -75,7 +76,7 @@ def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tup
         MapFiles(folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")), undo_in(shm), limits
     )
     try:
-        made.adopt(time.monotonic())
+        adopt(made, time.monotonic())
     except OSError:
         made.close()
         folder.close()
@@ -89,7 +90,7 @@ def voxels_on_disk(files: MapFiles, made: LiveMap) -> dict[Voxel, int]:
     for key in files.rows:
         data = files.load(key)
         assert data is not None
-        view = ChunkView(decode_chunk(data, made._identity(key, 1)))
+        view = ChunkView(decode_chunk(data, made.identity(key, 1)))
         check_consistent(view)
         dense = view.dense()
         places = np.flatnonzero(dense)

@@ -49,6 +49,13 @@ def add_parser(subparsers: Subparsers) -> None:
         default=None,
         help="read the map again when its files change (not on NFS)",
     )
+    parser.add_argument(
+        "--live",
+        metavar="NAME[=DIR]",
+        action="append",
+        help="keep a live map, which mappers write to, with its files in DIR (default: live/NAME in the "
+        "state directory); may be given again",
+    )
     parser.add_argument("--config", metavar="FILE", default="", help="TOML file of settings")
     place = parser.add_argument_group("how clients find it")
     place.add_argument(
@@ -67,6 +74,11 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
     place.add_argument(
+        "--live-shm-dir", metavar="DIR",
+        help="directory of live maps' chunks, without huge pages (default: as --shm-dir, else /dev/shm)",
+    )  # fmt: skip
+    place.add_argument("--live-group", metavar="GROUP", help="group whose members may change live maps")
+    place.add_argument(
         "--group",
         metavar="GROUP",
         help="group whose members may connect and read the map (default: none, only the daemon's user)",
@@ -80,6 +92,11 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="BYTES",
         help="most memory for cells, such as 512M or 2G (default: a quarter of the memory available at "
         "start, at most 4G)",
+    )
+    limits.add_argument(
+        "--live-budget",
+        metavar="BYTES",
+        help="most memory for live maps (default: an eighth of what is free, at most 1G)",
     )
     limits.add_argument(
         "--session-quota",

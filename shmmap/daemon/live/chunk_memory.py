@@ -8,12 +8,12 @@ error here and not a signal later.  A file never gets shorter.
 
 from __future__ import annotations
 
-import ctypes
+import contextlib
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 from shmmap.chunks.layout import (
     BRICK_BYTES,
@@ -24,21 +24,17 @@ from shmmap.chunks.layout import (
     chunk_bytes,
     read_identity,
 )
+from shmmap.chunks.mapping import map_chunk, unmap_chunk, view_at
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, SegmentCorrupt
+from shmmap.segment.pins import in_use
 
-__all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "memory_bytes"]
+__all__ = ["ChunkFile", "ChunkMemory", "GivenUp", "live_prefix", "memory_bytes"]
 
-_PROT: Final = 0x1 | 0x2  # PROT_READ | PROT_WRITE
-_MAP_SHARED: Final = 0x1
-_FAILED: Final = ctypes.c_void_p(-1).value
+_GONE: Final = ".gone"
+"""What the name of a chunk out of service ends in."""
 _GROWTH_BRICKS: Final = 8
 """A page: memory comes in pages."""
-
-_libc: Any = ctypes.CDLL(None, use_errno=True)
-_libc.mmap.restype = ctypes.c_void_p
-_libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
-_libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 
 
 def live_prefix(instance: str, map_name: str) -> str:
@@ -49,6 +45,23 @@ def live_prefix(instance: str, map_name: str) -> str:
 def memory_bytes(bricks: int) -> int:
     """Memory of a chunk of so many bricks, in whole pages."""
     return chunk_bytes(-(-bricks // _GROWTH_BRICKS) * _GROWTH_BRICKS)
+
+
+class GivenUp(NamedTuple):
+    """What is left of a chunk that is out of service: a name and a descriptor, for asking who maps it."""
+
+    name: str
+    fd: int
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return os.fstat(self.fd).st_blocks * 512
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether anybody has it open or mapped, as the kernel says."""
+        return in_use(self.fd)
 
 
 @dataclass(eq=False)
@@ -84,18 +97,14 @@ class ChunkFile:
         size = memory_bytes(bricks)
         if size > len(self.view.data):
             os.posix_fallocate(self._fd, 0, size)
-            self.view = _view(self._address, size)
+            self.view = view_at(self._address, size)
         return self.view
 
     def close(self) -> None:
         """Unmap it; nothing of ``view`` may be used any more."""
         self.view = ChunkView(bytearray(HEADER_BYTES))
-        _libc.munmap(self._address, MOST_BYTES)
+        unmap_chunk(self._address)
         os.close(self._fd)
-
-
-def _view(address: int, size: int) -> ChunkView:
-    return ChunkView((ctypes.c_char * size).from_address(address))
 
 
 class ChunkMemory:
@@ -180,26 +189,39 @@ class ChunkMemory:
             raise
 
     def _mapped(self, name: str, fd: int, size: int) -> ChunkFile:
-        address = _libc.mmap(None, MOST_BYTES, _PROT, _MAP_SHARED, fd, 0)
-        if address == _FAILED:
-            number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number), name)
-        return ChunkFile(name, fd, address, _view(address, size))
+        address = map_chunk(fd, name, writable=True)
+        return ChunkFile(name, fd, address, view_at(address, size))
 
-    def give_up(self, chunk: ChunkFile) -> int:
-        """Take a chunk out of service and remove its name; returns a descriptor of what readers still map.
+    def give_up(self, chunk: ChunkFile) -> GivenUp:
+        """Take a chunk out of service: it gets another name, under which nobody looks for it.
 
         Whoever has it mapped sees by its ``state`` that it does not change any more.
         """
         chunk.view.state["state"] = OUT_OF_SERVICE
-        os.unlink(chunk.name.lstrip("/"), dir_fd=self._fd)
+        name = chunk.name + _GONE
+        os.rename(chunk.name.lstrip("/"), name.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
         kept = os.dup(chunk._fd)
         chunk.close()
-        return kept
+        return GivenUp(name, kept)
+
+    def given_up(self) -> Iterator[tuple[ChunkKey, GivenUp]]:
+        """What an earlier writer gave up, and readers may still map."""
+        for name, key, _ in self._named(re.escape(_GONE)):
+            fd = os.open(name.lstrip("/"), os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=self._fd)
+            yield key, GivenUp(name, fd)
+
+    def forget(self, chunk: GivenUp) -> None:
+        """Remove what was given up: nobody maps it any more, or the map ends."""
+        os.close(chunk.fd)
+        with contextlib.suppress(FileNotFoundError):
+            self.remove(chunk.name)
 
     def names(self) -> Iterator[tuple[str, ChunkKey, int]]:
         """Chunks that there are, with key and generation; what has no such name is left out."""
-        pattern = re.compile(re.escape(self.prefix.lstrip("/")) + r"(-?\d+_-?\d+_-?\d+)\.(\d+)")
+        return self._named("")
+
+    def _named(self, end: str) -> Iterator[tuple[str, ChunkKey, int]]:
+        pattern = re.compile(re.escape(self.prefix.lstrip("/")) + r"(-?\d+_-?\d+_-?\d+)\.(\d+)" + end)
         for name in sorted(os.listdir(self._fd)):
             if found := pattern.fullmatch(name):
                 try:

@@ -18,20 +18,18 @@ from typing import Any, Final
 from shmmap.chunks.applying import ChunkWriter, UndoRecord
 from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
 from shmmap.chunks.layout import (
-    OUT_OF_SERVICE,
     ChunkIdentity,
     ChunkView,
-    check_consistent,
     chunk_bytes,
     new_header,
 )
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
+from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, GivenUp, memory_bytes
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan
 from shmmap.daemon.live.residency import Residency
-from shmmap.errors import MapDataError, PackageMissing, SegmentCorrupt
+from shmmap.errors import MapDataError, PackageMissing
 from shmmap.logfmt import log
 
 __all__ = ["LiveMap"]
@@ -64,6 +62,17 @@ class LiveMap:
         How chunks are compressed on disk.
     on_applied, on_durable
         Called with scans that are in memory, and on the disk.
+    on_changed, on_gone
+        Called with chunks that came into memory or were changed there, and that left it.
+    on_work_done
+        Called, in another thread, when there is something to do in the next turn.
+
+    Attributes
+    ----------
+    kept : dict
+        What is out of service and may still be mapped, by number of its lease.
+    problem : str
+        What keeps a chunk from being loaded or saved just now.
     """
 
     files: MapFiles
@@ -73,9 +82,13 @@ class LiveMap:
     codec: str = "zlib"
     on_applied: Callable[[Scan], None] = lambda _scan: None
     on_durable: Callable[[Scan], None] = lambda _scan: None
+    on_changed: Callable[[ChunkKey], None] = lambda _key: None
+    on_gone: Callable[[ChunkKey], None] = lambda _key: None
+    on_work_done: Callable[[], None] = lambda: None
     residency: Residency = field(init=False)
     chunks: dict[ChunkKey, ChunkFile] = field(default_factory=dict)
-    _kept: dict[int, int] = field(default_factory=dict)
+    kept: dict[int, GivenUp] = field(default_factory=dict)
+    problem: str = ""
     _parts: dict[Scan, _Part] = field(default_factory=dict)
     _running: dict[Future[Any], Callable[[Future[Any], float], None]] = field(default_factory=dict)
     _generation: int = 0
@@ -88,64 +101,22 @@ class LiveMap:
         for key, row in self.files.rows.items():
             self.residency.note_size(key, memory_bytes(row.bricks))
 
-    # --- the start ------------------------------------------------------------------------------
+    def keep(self, key: ChunkKey, given_up: GivenUp) -> None:
+        """Count what is out of service until nobody maps it."""
+        self.kept[self.residency.lease(key, given_up.nbytes).number] = given_up
 
-    def adopt(self, now_s: float) -> int:
-        """Take over what an earlier process left in memory; returns how many chunks.
+    def take_over(self, chunk: ChunkFile, now_s: float) -> None:
+        """A chunk is in memory since an earlier life of the writer, and whole."""
+        key, state = chunk.view.identity.key, chunk.view.state
+        self.chunks[key] = chunk
+        self.residency.adopt(
+            key, version=int(state["version"]), saved=self.files.version(key), nbytes=chunk.nbytes,
+            active=int(state["active"]), now_s=now_s,
+        )  # fmt: skip
+        self.on_changed(key)
 
-        Raises
-        ------
-        OSError
-            One cannot be opened: it stays where it is, for the next try.
-        """
-        newest: dict[ChunkKey, tuple[int, str]] = {}
-        for name, key, generation in list(self.memory.names()):
-            if key not in newest or newest[key][0] < generation:
-                newest[key] = (generation, name)
-        undone = self.undo.of
-        for name, key, generation in list(self.memory.names()):
-            chunk = self._adopted(name) if newest[key] == (generation, name) else None
-            if chunk is None:
-                self.memory.remove(name)
-                continue
-            if int(chunk.view.state["state"]) == OUT_OF_SERVICE:  # it was saved, and all but given up
-                os.close(self.memory.give_up(chunk))
-                continue
-            saved = self.files.rows[key].version if key in self.files.rows else 0
-            try:
-                if undone == (key, generation):
-                    self.undo.restore(chunk.view)
-                check_consistent(chunk.view, name)
-                if int(chunk.view.state["version"]) < saved:
-                    raise SegmentCorrupt(f"{name}: older than its file")
-            except SegmentCorrupt as error:
-                log.warning("chunk not adopted", chunk=key.text, reason=error.message)
-                os.close(self.memory.give_up(chunk))
-                continue
-            state = chunk.view.state
-            self.chunks[key] = chunk
-            self.residency.adopt(
-                key, version=int(state["version"]), saved=saved, nbytes=chunk.nbytes,
-                active=int(state["active"]), now_s=now_s,
-            )  # fmt: skip
-        if undone is not None:
-            self.undo.drop()
-        return len(self.chunks)
-
-    def _adopted(self, name: str) -> ChunkFile | None:
-        """What has this name, if it is a chunk of this map; raises OSError if it cannot be opened now."""
-        try:
-            chunk = self.memory.open(name)
-        except SegmentCorrupt as error:
-            log.warning("chunk not adopted", file=name, reason=error.message)
-            return None
-        if chunk.view.identity != self._identity(chunk.view.identity.key, chunk.view.identity.generation):
-            log.warning("chunk not adopted", file=name, reason="of another map, or of other settings")
-            chunk.close()
-            return None
-        return chunk
-
-    def _identity(self, key: ChunkKey, generation: int) -> ChunkIdentity:
+    def identity(self, key: ChunkKey, generation: int) -> ChunkIdentity:
+        """What a chunk of this map says of itself."""
         settings = self.files.settings
         _, _, low, high = settings.occupancy.steps
         return ChunkIdentity(
@@ -177,8 +148,13 @@ class LiveMap:
 
     def released(self, lease: Lease) -> None:
         """Nobody maps what was given up any more."""
-        os.close(self._kept.pop(lease.number))
+        self.memory.forget(self.kept.pop(lease.number))
         self.residency.released(lease)
+
+    def look_at_leases(self) -> None:
+        """Free what nobody maps any more."""
+        for number in [number for number, kept in self.kept.items() if not kept.is_mapped]:
+            self.released(self.residency.leases[number])
 
     # --- a turn ---------------------------------------------------------------------------------
 
@@ -204,14 +180,17 @@ class LiveMap:
             residency.durability.begin()
             self._start(self.files.flush, then=self._flushed)
         while (lease := residency.next_eviction(now_s)) is not None:
-            self._kept[lease.number] = self.memory.give_up(self.chunks.pop(lease.key))
+            self.kept[lease.number] = self.memory.give_up(self.chunks.pop(lease.key))
+            self.on_gone(lease.key)
 
     def wait(self, seconds: float) -> None:
         """Wait until a file was read or written, at most so long; not at all if there is none."""
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
     def _start(self, work: Callable[..., Any], *arguments: Any, then: Callable[..., None]) -> None:
-        self._running[self._threads.submit(work, *arguments)] = then
+        future = self._threads.submit(work, *arguments)
+        self._running[future] = then
+        future.add_done_callback(lambda _future: self.on_work_done())
 
     # --- applying -------------------------------------------------------------------------------
 
@@ -237,6 +216,7 @@ class LiveMap:
             chunk, scan, version=int(state["version"]), nbytes=file.nbytes, active=int(state["active"]),
             now_s=now_s,
         )  # fmt: skip
+        self.on_changed(chunk.key)
         if scan.applied:
             self._tell_applied(scan)
 
@@ -250,7 +230,7 @@ class LiveMap:
 
     def _loaded(self, chunk: Chunk, future: Future[bytes | None], now_s: float) -> None:
         self._generation += 1
-        identity = self._identity(chunk.key, self._generation)
+        identity = self.identity(chunk.key, self._generation)
         content: bytes | bytearray = new_header(identity)
         try:
             data = future.result()
@@ -262,6 +242,7 @@ class LiveMap:
             file = self.memory.create(content)
         except (OSError, PackageMissing) as error:
             log.warning("chunk not loaded", chunk=chunk.key.text, reason=str(error))
+            self.problem = f"chunk {chunk.key.text} cannot be loaded: {error}"
             self.residency.load_failed(chunk, now_s)
             return
         self.chunks[chunk.key] = file
@@ -269,6 +250,7 @@ class LiveMap:
         self.residency.loaded(
             chunk, version=int(state["version"]), nbytes=file.nbytes, active=int(state["active"])
         )
+        self.on_changed(chunk.key)
 
     def _save(self, key: ChunkKey, view: ChunkView) -> None:
         self.files.save(key, encode_chunk(view, self.codec))
@@ -278,10 +260,21 @@ class LiveMap:
             future.result()
         except OSError as error:
             log.warning("chunk not saved", chunk=chunk.key.text, reason=error.strerror)
+            self.problem = f"chunk {chunk.key.text} cannot be saved: {error.strerror}"
             self.residency.save_failed(chunk, now_s)
             return
+        self.problem = ""
         self.residency.saved(chunk, version, now_s)
         self.chunks[chunk.key].view.state["saved_version"] = version
+
+    def list_files(self) -> None:
+        """Have the manifest written, beside the rest."""
+        self._start(self.files.write_manifest, then=self._listed)
+
+    def _listed(self, future: Future[None], now_s: float) -> None:
+        del now_s
+        if error := future.exception():
+            log.warning("manifest not written", reason=str(error))
 
     def _flushed(self, future: Future[None], now_s: float) -> None:
         del now_s
@@ -294,12 +287,21 @@ class LiveMap:
         for scan in self.residency.durability.flushed():
             self.on_durable(scan)
 
+    def remove_from_memory(self) -> None:
+        """Take all names away; what is mapped stays with whoever maps it."""
+        for file in self.chunks.values():
+            self.memory.forget(self.memory.give_up(file))
+        for kept in self.kept.values():
+            self.memory.forget(kept)
+        self.chunks.clear()
+        self.kept.clear()
+
     def close(self) -> None:
         """Leave memory and files as they are."""
         self._threads.shutdown()
         for file in self.chunks.values():
             file.close()
-        for fd in self._kept.values():
-            os.close(fd)
+        for kept in self.kept.values():
+            os.close(kept.fd)
         self.chunks.clear()
-        self._kept.clear()
+        self.kept.clear()

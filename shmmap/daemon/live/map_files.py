@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
+import threading
 from typing import Final
 
 import msgspec
@@ -132,6 +133,7 @@ class MapFiles:
         self.damaged: dict[str, str] = {}
         self.missing: dict[ChunkKey, Row] = {}
         self._unflushed = False
+        self._flushing = threading.Lock()
         names = files.names()
         if MAP_FILE in names:
             self._map = self._read_map(settings)
@@ -196,9 +198,9 @@ class MapFiles:
             raise MapDataError(f"it does not say what the map is: {error}", path=MAP_FILE) from error
         if found.format != MAP_FORMAT or len(found.map_id) != 32:
             raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
-        for name in settings.__struct_fields__:
-            old, new = getattr(found.settings, name), getattr(settings, name)
-            if old != new:
+        old_ones, new_ones = _flat(found.settings), _flat(settings)
+        for name, new in new_ones.items():
+            if (old := old_ones[name]) != new:
                 raise ConfigError(
                     f"{name} = {new!r}: the map was made with {old!r}",
                     key=name, hint="leave it as it was, or choose another directory for a new map",
@@ -211,6 +213,11 @@ class MapFiles:
         step("live.map")
 
     # --- chunks ---------------------------------------------------------------------------------
+
+    def version(self, key: ChunkKey) -> int:
+        """Version of a chunk's file; 0 where there is none."""
+        row = self.rows.get(key)
+        return row.version if row is not None else 0
 
     def load(self, key: ChunkKey) -> bytes | None:
         """Read the file of a chunk; None where there is none.  Raises OSError."""
@@ -243,19 +250,20 @@ class MapFiles:
 
     def flush(self) -> None:
         """Make durable what was saved."""
-        if self._unflushed:
-            self._unflushed = False  # what is saved from now on is for the next one
-            try:
-                self.files.sync_names()
-            except OSError:
-                self._unflushed = True
-                raise
-            step("live.flushed")
+        with self._flushing:  # who comes second waits until it is so
+            if self._unflushed:
+                self._unflushed = False  # what is saved from now on is for the next one
+                try:
+                    self.files.sync_names()
+                except OSError:
+                    self._unflushed = True
+                    raise
+                step("live.flushed")
 
     def write_manifest(self) -> None:
         """Make durable what was saved, and list it."""
         self.flush()
-        rows = {key.text: row for key, row in self.rows.items()}
+        rows = {key.text: row for key, row in dict(self.rows).items()}
         self._replace(MANIFEST, msgspec.json.encode({"format": MAP_FORMAT, "chunks": rows}))
         self.files.sync_names()
 
@@ -331,6 +339,12 @@ class MapFiles:
                 if key not in self.rows or self.rows[key].version < row.version:
                     self.missing[key] = row
                     log.error("chunk missing", chunk=text, version=row.version)
+
+
+def _flat(settings: MapSettings) -> dict[str, object]:
+    """All settings by name, those of the occupancy among them."""
+    found = msgspec.structs.asdict(settings)
+    return {**msgspec.structs.asdict(found.pop("occupancy")), **found}
 
 
 class _Manifest(msgspec.Struct):

@@ -113,6 +113,11 @@ class Residency:
         """Whether a scan may come: what waits is bounded, and a single one may always wait."""
         return not self.waiting_bytes or self.waiting_bytes + nbytes <= self.limits.waiting_bytes
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a chunk has to take in a scan."""
+        return bool(self._needing)
+
     def add(self, scan: Scan) -> None:
         """A scan has come: every chunk that it touches is wanted until it has taken it in."""
         if scan.to_apply:
@@ -318,9 +323,7 @@ class Residency:
         chunk = self._next_victim(now_s, State.CLEAN)
         if chunk is None:
             return None
-        self._leases_given += 1
-        lease = self.leases[self._leases_given] = Lease(chunk.key, self._leases_given, chunk.nbytes)
-        self.leased_bytes += lease.nbytes
+        lease = self.lease(chunk.key, chunk.nbytes)
         self._resize(chunk, 0, 0)
         del self.chunks[chunk.key]
         if chunk.waiting:  # for another that comes first it gave way: later it is loaded again
@@ -331,6 +334,13 @@ class Residency:
             again.changed_s = chunk.changed_s
         elif chunk.key in self.windows.near:
             self._missing.insert(0, chunk.key)
+        return lease
+
+    def lease(self, key: ChunkKey, nbytes: int) -> Lease:
+        """Count memory that is out of service and may still be mapped."""
+        self._leases_given += 1
+        lease = self.leases[self._leases_given] = Lease(key, self._leases_given, nbytes)
+        self.leased_bytes += nbytes
         return lease
 
     def released(self, lease: Lease) -> None:

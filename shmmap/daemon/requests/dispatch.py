@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from shmmap.daemon.cache.survey import Survey, Usage
 from shmmap.daemon.host.defects import Defects
+from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import bounded_intent
@@ -23,6 +24,7 @@ from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
+from shmmap.protocol.live import LIVE_REQUESTS
 
 __all__ = ["Dispatch"]
 
@@ -42,6 +44,7 @@ class Dispatch:
     queries: MapQueries
     operators: OperatorRequests
     authorization: Authorization
+    live: LiveRelay | NoLiveMaps
     survey: Survey
     sampler: Sampler
     defects: Defects
@@ -56,7 +59,7 @@ class Dispatch:
                 raise BadRequest("a request is one frame")
             message = decode_request(data)
             request = message.request
-            work = self._route(turn.connection, message)
+            work = self._route(turn.connection, message, data)
             if work is not None:
                 yield from work
         except ShmmapError as error:
@@ -65,7 +68,7 @@ class Dispatch:
             self.defects.met()
             turn.connection.refuse(request, InternalError("the daemon failed on this request"))
 
-    def _route(self, connection: Connection, message: messages.Request) -> Iterator[None] | None:
+    def _route(self, connection: Connection, message: messages.Request, body: bytes) -> Iterator[None] | None:
         """Do what is asked for; what takes longer is returned."""
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
@@ -91,7 +94,9 @@ class Dispatch:
         if isinstance(message, OPERATOR_REQUESTS):
             self.authorization.require(connection.peer, now_s)
             return self.operators.handle(session, message, now_s)
-        if isinstance(message, messages.Bye):
+        if isinstance(message, LIVE_REQUESTS):
+            self.live.ask(session, message, body, now_s)
+        elif isinstance(message, messages.Bye):
             self.handshake.leave(session)
         elif isinstance(message, messages.Stats):
             self.handshake.look_after_departed()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -32,7 +33,7 @@ class Handshake:
 
     Parameters
     ----------
-    operators
+    operators, tell_live
         Told of a session that has ended.
     """
 
@@ -42,6 +43,7 @@ class Handshake:
     event_log: EventLog
     operators: OperatorRequests
     survey: Survey
+    tell_live: Callable[[Session], None] = lambda _session: None
     _seen: Usage = field(default_factory=Usage)
     _settling: list[Session] = field(default_factory=list)
     _departed_before: list[Session] = field(default_factory=list)
@@ -120,3 +122,4 @@ class Handshake:
         self.sessions.close(session)
         self.cells.left(session)
         self.operators.left(session)
+        self.tell_live(session)

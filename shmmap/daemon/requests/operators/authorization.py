@@ -26,8 +26,15 @@ class Authorization:
 
     Parameters
     ----------
-    admin_group
+    group
         Group (name or number) whose members may, besides root and the daemon's user; empty: nobody.
+    setting
+        Where that is set.
+
+    Attributes
+    ----------
+    gid
+        Number of the group; -1 for none.
 
     Raises
     ------
@@ -35,18 +42,18 @@ class Authorization:
         There is no such group.
     """
 
-    def __init__(self, admin_group: str = "") -> None:
-        self._name = admin_group
-        self._gid = group_id(admin_group, "admin_group") if admin_group else -1
+    def __init__(self, group: str = "", setting: str = "admin_group") -> None:
+        self._name = group
+        self.gid = group_id(group, setting) if group else -1
         self._groups: dict[int, tuple[float, frozenset[int]]] = {}
 
     def allow(self, peer: Peer, now_s: float) -> bool:
         """Whether a connected process may administer the daemon."""
         if peer.uid in (0, os.geteuid()):
             return True
-        if self._gid < 0 or peer.uid < 0:
+        if self.gid < 0 or peer.uid < 0:
             return False
-        return peer.gid == self._gid or self._gid in self._groups_of(peer.uid, now_s)
+        return peer.gid == self.gid or self.gid in self._groups_of(peer.uid, now_s)
 
     def require(self, peer: Peer, now_s: float) -> None:
         """Refuse a process that may not.

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the chunks of live maps go, and how much memory they may take."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from shmmap.daemon.config_live import LiveSettings, live_directory
+from shmmap.daemon.host.mounts import mounts
+from shmmap.daemon.live.messages import Begin
+from shmmap.errors import CannotStart, ConfigError
+from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
+
+__all__ = ["place_live_maps"]
+
+CEILING_BYTES: Final = 1 << 30
+PART: Final = 8
+"""Of the memory that is free, by default."""
+
+
+def place_live_maps(
+    live: Sequence[LiveSettings], *, instance: str, cells: ShmDirectory, cells_budget_bytes: int,
+    shm_dir: str, budget_bytes: int, gid: int, marks_gid: int,
+) -> Begin:  # fmt: skip
+    """Decide where live maps are kept and what they may take.
+
+    Parameters
+    ----------
+    cells, cells_budget_bytes
+        Where the cells are, and what they may take.
+    shm_dir, budget_bytes
+        As set; empty and 0 for the defaults.
+    gid, marks_gid
+        Who may read chunks, and who may map.
+
+    Raises
+    ------
+    ConfigError
+        The directory has huge pages, or both budgets do not fit in it; there is no state directory.
+    CannotStart
+        The directory cannot be used, or too little is free.
+    """
+    path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
+    directory = ShmDirectory(path)
+    try:
+        size, free = directory.size_bytes(), directory.free_bytes()
+        used = sum(directory.used_bytes(f"/shmmap-live.{instance}.{one.name}.") for one in live)
+    finally:
+        directory.close()
+    if huge := _huge_pages(directory.path):
+        raise ConfigError(
+            f"{directory.path} has huge pages ({huge}): a chunk of a few KiB would take 2 MiB there",
+            key="live_shm_dir", hint="name a tmpfs without them, such as /dev/shm",
+        )  # fmt: skip
+    same = os.stat(directory.path).st_dev == os.stat(cells.path).st_dev
+    beside = cells_budget_bytes if same else 0
+    budget = budget_bytes or max(4 << 20, min((free + used - beside) // PART, CEILING_BYTES))
+    if budget + beside > size:
+        raise ConfigError(
+            f"live maps of {budget >> 20:,} MiB and cells of {beside >> 20:,} MiB do not fit in"
+            f" {directory.path}, which has {size >> 20:,} MiB",
+            key="live_budget", hint="lower --live-budget or --budget, or enlarge the tmpfs",
+        )  # fmt: skip
+    if budget_bytes and budget > free + used:
+        raise CannotStart(
+            f"live maps of {budget >> 20:,} MiB do not fit in {directory.path}, which has"
+            f" {free + used >> 20:,} MiB free",
+            hint="free some, or lower --live-budget",
+        )
+    maps = tuple(
+        msgspec.structs.replace(one, path=one.path or live_directory(instance, one.name)) for one in live
+    )
+    marks = os.path.join(directory.path, f"shmmap-live.{instance}.marks")
+    return Begin(instance, maps, directory.path, marks, budget, gid, marks_gid)
+
+
+def _huge_pages(path: str) -> str | None:
+    """The mount option that gives a directory huge pages; None where it has none."""
+    below = os.path.realpath(path) + "/"
+    around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
+    if not around:
+        return None
+    options = max(reversed(around), key=lambda mount: len(mount.point)).options
+    huge = next((option for option in options if option.startswith("huge=")), "huge=never")
+    return None if huge in ("huge=never", "huge=advise") else huge

@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon's side of the live worker: requests are passed on to it, and its answers back.
+
+A worker that dies takes nothing with it that was answered: another one is started, which finds the chunks in
+memory.  Who waited for an answer is told to ask again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from shmmap.daemon.live import messages
+from shmmap.daemon.transport.connection import Peer
+from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.errors import BadRequest, Busy, CannotStart, LiveInterrupted, ShmmapError, error_from_wire
+from shmmap.logfmt import log
+from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import start_child
+from shmmap.protocol.codec import encode
+from shmmap.protocol.live import LiveListed, LiveMapRow, LiveRequest
+
+__all__ = ["LiveRelay", "NoLiveMaps"]
+
+START_S: Final = 120.0
+"""How long the maps may take to come into memory before the daemon is ready: kernels are compiled, too."""
+END_S: Final = 60.0
+"""How long saving everything may take at the end; the unit's stop timeout is longer."""
+PAUSES_S: Final = (0.0, 0.5, 2.0, 10.0, 30.0)
+"""Before another worker is started for one that ended: the first time, and later ones in a row."""
+MOST_OF_A_SESSION: Final = 64
+"""Requests that may wait for their answers."""
+MOST_BYTES: Final = 1 << 16
+"""Of a request about live maps."""
+
+
+class NoLiveMaps:
+    """Where the daemon keeps none."""
+
+    maps: tuple[LiveMapRow, ...] = ()
+
+    def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
+        """Say that there are none."""
+        del body, now_s
+        if type(message).__name__ == "LiveList":
+            session.connection.reply(encode(LiveListed(message.request, ())))
+            return
+        raise BadRequest(
+            "this daemon keeps no live maps",
+            hint="start it with --live NAME, or with [live.NAME] in its settings",
+        )
+
+    def left(self, session: Session) -> None:
+        """Nobody has to be told."""
+
+    def beat(self, now_s: float) -> None:
+        """Nothing has to be done."""
+
+    def close(self, *, keep: bool) -> None:
+        """Nothing has to be ended."""
+
+
+class LiveRelay:
+    """Has the live worker, and passes on what concerns it.
+
+    Parameters
+    ----------
+    begin
+        Which maps it is to keep, and where.
+    watched
+        Told of its descriptor.
+    may_map
+        Whether a process may change live maps.
+
+    Attributes
+    ----------
+    maps : tuple
+        How the maps are, as of half a second ago.
+    restarts : int
+        Workers that ended without being told to.
+    """
+
+    def __init__(
+        self, begin: messages.Begin, watched: WatchedDescriptors, may_map: Callable[[Peer, float], bool]
+    ) -> None:
+        self.maps: tuple[LiveMapRow, ...] = ()
+        self.restarts = 0
+        self._begin = begin
+        self._watched = watched
+        self._may_map = may_map
+        self._process: subprocess.Popen[bytes] | None = None
+        self._channel: socket.socket | None = None
+        self._buffer = packet_buffer()
+        self._unsent: deque[bytes] = deque()
+        self._tickets: dict[int, tuple[Session, int]] = {}
+        self._waiting: dict[int, int] = {}  # by session
+        self._askers: set[int] = set()
+        self._last_ticket = 0
+        self._serving = False
+        self._failures = 0
+        self._start_s = 0.0
+        self._why: ShmmapError | None = None
+        self._unsaved = -1
+
+    # --- the worker's life ----------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start the worker; `wait_until_serving` says what came of it."""
+        self._process, self._channel = start_child("shmmap.daemon.live.worker.main", new_session=True)
+        self._channel.setblocking(False)
+        self._serving, self._why = False, None
+        with contextlib.suppress(ConnectionError):
+            self._channel.send(messages.encode(self._begin))
+        self._watched.watch(self._channel.fileno(), self.hear, "answers")
+
+    def wait_until_serving(self) -> None:
+        """Wait until all maps are in memory.
+
+        Raises
+        ------
+        ShmmapError
+            One cannot be: the daemon cannot start like that.
+        """
+        end_s = time.monotonic() + START_S
+        while not self._serving and self._channel is not None and (left_s := end_s - time.monotonic()) > 0:
+            select.select([self._channel], [], [], left_s)
+            self.hear()
+        if not self._serving:
+            raise self._why or CannotStart(
+                "the process that keeps live maps did not begin", hint="see the lines of the log before this"
+            )
+
+    def beat(self, now_s: float) -> None:
+        """Start another worker when it is time to."""
+        if self._channel is None and now_s >= self._start_s:
+            try:
+                self.start()
+            except OSError as error:
+                self._start_s = now_s + PAUSES_S[-1]
+                log.warning("live worker not started", reason=error.strerror)
+
+    def hear(self) -> None:
+        """Hear what the worker says, and send on what it did not take."""
+        while self._channel is not None:
+            try:
+                data, _ = receive_packet(self._channel, self._buffer)
+            except BlockingIOError:
+                break
+            except ConnectionResetError:
+                continue
+            if not data:
+                self._lost()
+                return
+            self._told(messages.decode_from_live(data))
+        self._flush()
+
+    def _told(self, message: messages.FromLive) -> None:
+        if isinstance(message, messages.Answer):
+            session, _ = self._tickets.pop(message.ticket, (None, 0))
+            if session is not None:
+                self._answered(session)
+                session.connection.reply(message.body)
+        elif isinstance(message, messages.Status):
+            self.maps = message.maps
+        elif isinstance(message, messages.Begun):
+            self._serving, self._failures = True, 0
+            log.info("live maps are served", maps=len(self._begin.maps), chunks=message.adopted)
+        elif isinstance(message, messages.Failed):
+            self._why = error_from_wire(message.code, message.message, message.hint)
+            log.error("live maps cannot be served", reason=message.message)
+        elif isinstance(message, messages.Ended):
+            self._unsaved = message.unsaved
+
+    def _answered(self, session: Session) -> None:
+        left = self._waiting.get(session.slot, 1) - 1
+        if left > 0:
+            self._waiting[session.slot] = left
+        else:
+            self._waiting.pop(session.slot, None)
+
+    def _lost(self) -> None:
+        """The worker has ended: tell who waits, and start another one soon."""
+        self._forget()
+        if self._unsaved >= 0:
+            return  # as it was told to
+        self.restarts += 1
+        self._start_s = time.monotonic() + PAUSES_S[min(self._failures, len(PAUSES_S) - 1)]
+        self._failures += 1
+        log.error("live worker ended", restarts=self.restarts)
+        error = LiveInterrupted("the process that keeps live maps ended, and is started anew")
+        tickets, self._tickets = self._tickets, {}
+        self._waiting.clear()
+        for session, request in tickets.values():
+            session.connection.refuse(request, error)
+
+    def _forget(self) -> None:
+        if self._channel is not None:
+            self._watched.unwatch(self._channel.fileno())
+            self._channel.close()
+            self._channel = None
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+        self._unsent.clear()
+        self._serving = False
+
+    # --- requests -------------------------------------------------------------------------------
+
+    def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
+        """Pass a request on.
+
+        Raises
+        ------
+        Busy
+            Too many of this session's wait.
+        BadRequest
+            It is too long.
+        LiveInterrupted
+            There is no worker just now.
+        """
+        if len(body) > MOST_BYTES:
+            raise BadRequest(f"a request about a live map has at most {MOST_BYTES} bytes")
+        waiting = self._waiting.get(session.slot, 0)
+        if waiting >= MOST_OF_A_SESSION:
+            raise Busy(f"{waiting} requests of this session about live maps wait", hint="wait for some")
+        if self._channel is None:
+            raise LiveInterrupted("the process that keeps live maps is being started anew")
+        self._askers.add(session.slot)
+        self._last_ticket += 1
+        self._tickets[self._last_ticket] = session, message.request
+        self._waiting[session.slot] = waiting + 1
+        maps = self._may_map(session.peer, now_s)
+        self._send(messages.Ask(self._last_ticket, session.slot, session.peer.uid, maps, bytes(body)))
+
+    def left(self, session: Session) -> None:
+        """A session has ended."""
+        if self._waiting.pop(session.slot, 0):
+            gone = [ticket for ticket, (asker, _) in self._tickets.items() if asker is session]
+            for ticket in gone:
+                del self._tickets[ticket]
+        if session.slot in self._askers:
+            self._askers.discard(session.slot)
+            if self._channel is not None:
+                self._send(messages.Left(session.slot))
+
+    def _send(self, message: messages.ToLive) -> None:
+        self._unsent.append(messages.encode(message))
+        self._flush()
+
+    def _flush(self) -> None:
+        """Send what the worker takes; the rest when it has heard some."""
+        if self._channel is None:
+            return
+        try:
+            while self._unsent:
+                self._channel.send(self._unsent[0])
+                self._unsent.popleft()
+        except BlockingIOError:
+            pass
+        except OSError:
+            return  # it has ended: `hear` hears of it
+        self._watched.watch_for(self._channel.fileno(), reading=True, writing=bool(self._unsent))
+
+    # --- the end --------------------------------------------------------------------------------
+
+    def close(self, *, keep: bool) -> None:
+        """Have everything saved and all names taken away, or leave memory to the next life."""
+        if self._channel is None:
+            return
+        end_s = time.monotonic() + END_S
+        self._unsaved = -1
+        self._unsent.append(messages.encode(messages.End(keep)))
+        while self._channel is not None and (left_s := end_s - time.monotonic()) > 0:
+            self._flush()
+            if self._channel is not None:
+                writing = [self._channel] if self._unsent else []
+                select.select([self._channel], writing, [], left_s)
+                self.hear()
+        if self._unsaved > 0 and not keep:
+            log.error("chunks not saved stay in memory", chunks=self._unsaved)
+        elif self._unsaved < 0:
+            log.error("live worker did not end in time: what is in memory stays there for the next start")
+        self._forget()

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live worker's process: it hears the daemon, and gives each map its turns.
+
+It dies with the daemon, and whenever it dies the next one finds what was applied in shared memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import mmap
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from typing import Any, Final
+
+from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
+from shmmap.chunks.chunk_file import usual_codec
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.host.logs import set_up_logging
+from shmmap.daemon.live import messages
+from shmmap.daemon.live.adopting import adopt
+from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
+from shmmap.daemon.live.folder import Folder
+from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.map_files import MapFiles, MapSettings
+from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.worker.marks_directory import MarksDirectory
+from shmmap.daemon.live.worker.served_map import ServedMap
+from shmmap.daemon.live.worker.voxel_lists import VoxelLists
+from shmmap.errors import BadRequest, CannotStart, InternalError, ShmmapError
+from shmmap.logfmt import log
+from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.protocol.codec import decode_request, encode, request_number
+from shmmap.protocol.live import LIVE_REQUESTS, LiveList, LiveListed
+from shmmap.protocol.messages import ErrorReply
+from shmmap.segment.pins import prepare_process
+
+__all__ = ["main"]
+
+STATUS_S: Final = 0.5
+HEARD_AT_ONCE: Final = 16
+END_S: Final = 0.2
+
+
+class _Worker:
+    """Serves the maps that the daemon names first."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
+        self._buffer = packet_buffer()
+        self._done = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._maps: dict[str, ServedMap] = {}
+        self._closing = contextlib.ExitStack()
+        self._ending: messages.End | None = None
+        self._status_s = 0.0
+        self._told: messages.Status | None = None
+        self._marks: MarksDirectory | None = None
+
+    # --- the start ------------------------------------------------------------------------------
+
+    def begin(self, wanted: messages.Begin) -> None:
+        """Bring the maps into memory.
+
+        Raises
+        ------
+        ShmmapError, OSError
+            One cannot be.
+        """
+        self._marks = MarksDirectory(wanted.marks_dir, wanted.marks_gid)
+        budget = wanted.budget_bytes // max(1, len(wanted.maps))
+        mode = 0o640 if wanted.gid >= 0 else 0o600
+        for settings in wanted.maps:
+            self._maps[settings.name] = self._open(settings, wanted, budget, mode, self._marks)
+
+    def _open(
+        self, settings: LiveSettings, wanted: messages.Begin, budget: int, mode: int, marks: MarksDirectory
+    ) -> ServedMap:
+        folder = Folder(settings.path)
+        self._closing.callback(folder.close)
+        prefix = live_prefix(wanted.instance, settings.name)
+        memory = ChunkMemory(wanted.shm_dir, prefix, mode=mode, gid=wanted.gid)
+        self._closing.callback(memory.close)
+        undo = _undo_record(wanted.shm_dir + prefix + "undo")
+        live = LiveMap(
+            MapFiles(folder, _fixed(settings)), memory, undo, _limits(settings, budget), usual_codec(),
+            on_work_done=self._wake,
+        )  # fmt: skip
+        lists = VoxelLists(live, wanted.shm_dir, mode, wanted.gid)
+        lists.remove_all()
+        found = adopt(live, time.monotonic())
+        log.info(
+            "live map in memory", map=settings.name, path=settings.path, chunks=found,
+            files=len(live.files.rows), damaged=len(live.files.damaged), missing=len(live.files.missing),
+        )  # fmt: skip
+        return ServedMap(settings, live, lists, marks, self._answer)
+
+    def _wake(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_write(self._done, 1)
+
+    # --- turns ----------------------------------------------------------------------------------
+
+    def run(self, wanted: messages.Begin) -> None:
+        """Serve until the daemon says that it ends, or is gone."""
+        self._send(messages.Begun(sum(len(one.live.chunks) for one in self._maps.values())))
+        poller = select.poll()
+        poller.register(self._channel, select.POLLIN)
+        poller.register(self._done, select.POLLIN)
+        while True:
+            now_s = time.monotonic()
+            for fd, _ in poller.poll(self._patience_ms(now_s)):
+                if fd == self._done:
+                    os.eventfd_read(self._done)
+                elif not self._hear():
+                    return  # the daemon is gone: what is in memory stays there
+            now_s = time.monotonic()
+            ending = self._ending is not None
+            for one in self._maps.values():
+                one.turn(now_s, save_all=ending)
+            if now_s >= self._status_s:
+                self._tell(now_s)
+            if self._ending is not None and self._may_end(self._ending):
+                break
+        self._end(wanted, self._ending)
+
+    def _patience_ms(self, now_s: float) -> float:
+        due_s = min((one.next_turn_s(now_s) for one in self._maps.values()), default=now_s + STATUS_S)
+        return max(0.0, min(due_s - now_s, STATUS_S if self._ending is None else END_S)) * 1000
+
+    def _hear(self) -> bool:
+        """Hear what the daemon says; False when it is gone."""
+        self._channel.setblocking(False)
+        try:
+            for _ in range(HEARD_AT_ONCE):
+                data, _fd = receive_packet(self._channel, self._buffer)
+                if not data:
+                    return False
+                message = messages.decode_to_live(data)
+                if isinstance(message, messages.Ask):
+                    self._ask(message)
+                elif isinstance(message, messages.Left):
+                    self._left(message.session)
+                elif isinstance(message, messages.End):
+                    self._ending = message
+                    for one in self._maps.values():
+                        one.stop_taking()
+        except BlockingIOError:
+            pass
+        except ConnectionResetError:
+            return False
+        finally:
+            self._channel.setblocking(True)
+        return True
+
+    def _ask(self, ask: messages.Ask) -> None:
+        request = request_number(ask.body)
+        try:
+            message = decode_request(ask.body)
+            if isinstance(message, LiveList):
+                rows = tuple(one.status() for one in self._maps.values())
+                self._answer(ask.ticket, LiveListed(request, rows))
+            elif isinstance(message, LIVE_REQUESTS):
+                self._map(message.map).handle(ask, message, time.monotonic())
+            else:
+                raise BadRequest("this is no request about live maps")
+        except ShmmapError as error:
+            self._answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))
+        except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
+            log.exception("request about a live map failed")
+            failed = InternalError("the daemon failed on this request")
+            self._answer(ask.ticket, ErrorReply(request, failed.code, failed.message, failed.hint))
+
+    def _map(self, name: str) -> ServedMap:
+        if name not in self._maps:
+            names = ", ".join(self._maps)
+            raise BadRequest(f"there is no live map {name!r}", hint=f"there are: {names}")
+        return self._maps[name]
+
+    def _left(self, session: int) -> None:
+        for one in self._maps.values():
+            one.left(session)
+        if self._marks is not None:
+            self._marks.forget(session)
+
+    def _answer(self, ticket: int, reply: Any) -> None:
+        self._send(messages.Answer(ticket, encode(reply)))
+
+    def _send(self, message: messages.FromLive) -> None:
+        self._channel.send(messages.encode(message))
+
+    def _tell(self, now_s: float) -> None:
+        self._status_s = now_s + STATUS_S
+        status = messages.Status(tuple(one.status() for one in self._maps.values()))
+        if status != self._told:
+            self._told = status
+            self._send(status)
+
+    # --- the end --------------------------------------------------------------------------------
+
+    def _may_end(self, ending: messages.End) -> bool:
+        return ending.keep or all(one.is_saved for one in self._maps.values())
+
+    def _end(self, wanted: messages.Begin, ending: messages.End | None) -> None:
+        keep = ending is None or ending.keep
+        unsaved = 0
+        for name, one in self._maps.items():
+            left = one.end(keep=keep)
+            unsaved += left
+            if not keep and not left:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(wanted.shm_dir + live_prefix(wanted.instance, name) + "undo")
+        if self._marks is not None:
+            self._marks.close()
+        self._closing.close()
+        with contextlib.suppress(OSError):
+            self._send(messages.Ended(unsaved))
+
+
+def _fixed(settings: LiveSettings) -> MapSettings:
+    """What is fixed when the map is made."""
+    return MapSettings(settings.resolution, settings.occupancy, settings.frame_id)
+
+
+def _limits(settings: LiveSettings, budget_bytes: int) -> Limits:
+    """What a map may take of so much memory; readers cannot keep it from using a quarter of that."""
+    return Limits(
+        budget_bytes, reserve_bytes=budget_bytes // 4, most_active=settings.most_active,
+        radius=settings.radius, hysteresis=settings.hysteresis, linger_s=settings.linger_s,
+        checkpoint_s=settings.checkpoint_s,
+    )  # fmt: skip
+
+
+def _undo_record(path: str) -> UndoRecord:
+    """The undo record in shared memory, made if there is none."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    fd = os.open(path, flags, 0o600)
+    try:
+        os.posix_fallocate(fd, 0, UNDO_BYTES)
+        return UndoRecord(mmap.mmap(fd, UNDO_BYTES))
+    finally:
+        os.close(fd)
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID``; the first packet says which maps."""
+    die_with(int(arguments[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    prepare_process()
+    set_up_logging()
+    with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
+        data, _ = receive_packet(channel, packet_buffer())
+        if not data:
+            return 0  # the daemon did not start after all
+        wanted = messages.decode_to_live(data)
+        if not isinstance(wanted, messages.Begin):
+            return 1
+        worker = _Worker(channel)
+        try:
+            worker.begin(wanted)
+        except (ShmmapError, OSError) as error:
+            told = error if isinstance(error, ShmmapError) else CannotStart(f"live maps: {error}")
+            channel.send(messages.encode(messages.Failed(told.code, told.message, told.hint)))
+            return told.exit_code
+        gc.collect()
+        gc.freeze()
+        worker.run(wanted)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who maps, and which of their scans are where: applied once each, whatever is sent again.
+
+A mapper is a user and a name that a program of theirs chose; its scans have numbers that rise, also when the
+program starts anew.  A scan that was sent twice is applied once: while it is on its way, both are answered
+by it; afterwards every chunk knows that it has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from shmmap.chunks.layout import MAPPERS
+from shmmap.daemon.live.map_files import MapFiles, Mapper
+from shmmap.errors import BadRequest, Busy, LiveInterrupted
+
+__all__ = ["ActiveMapper", "Mappers"]
+
+
+@dataclass(eq=False, slots=True)
+class ActiveMapper:
+    """A mapper in this life of the worker.
+
+    Attributes
+    ----------
+    session
+        Who maps under it now; 0: nobody.
+    last
+        Highest number of a scan that was taken in.
+    used
+        Order of use: the greatest was used last.
+    unsaved
+        Scans that were taken in and are not durable.
+    """
+
+    mapper: Mapper
+    session: int = 0
+    last: int = 0
+    used: int = 0
+    unsaved: set[int] = field(default_factory=set)
+
+    @property
+    def durable(self) -> int:
+        """All scans up to this one are on the disk."""
+        return min(self.unsaved) - 1 if self.unsaved else self.last
+
+
+class Mappers:
+    """The mappers of one map."""
+
+    def __init__(self, files: MapFiles) -> None:
+        self._files = files
+        self._uses = 0
+        self.by_number = {mapper.number: ActiveMapper(mapper) for mapper in files.mappers}
+
+    def open(self, uid: int, name: str, session: int) -> ActiveMapper:
+        """Let a session map under a name; one that did before does not any more.
+
+        Raises
+        ------
+        Busy
+            There are as many mappers as a chunk remembers, and none of them can be forgotten.
+        OSError
+            The disk does not take a new one.
+        """
+        for active in self.by_number.values():
+            if (active.mapper.uid, active.mapper.name) == (uid, name):
+                break
+        else:
+            if len(self.by_number) >= MAPPERS:
+                self._forget_one()
+            mapper = self._files.add_mapper(uid, name)
+            active = self.by_number[mapper.number] = ActiveMapper(mapper)
+        active.session = session
+        self._uses += 1
+        active.used = self._uses
+        return active
+
+    def _forget_one(self) -> None:
+        idle = [one for one in self.by_number.values() if not one.session and not one.unsaved]
+        if not idle:
+            raise Busy(
+                f"{MAPPERS} mappers have this map open already",
+                hint="end one of them, or let two programs' scans come through one",
+            )
+        oldest = min(idle, key=lambda one: one.used)
+        self._files.forget_mapper(oldest.mapper)
+        del self.by_number[oldest.mapper.number]
+
+    def next_scan(self, active: ActiveMapper) -> int:
+        """The least number that a new scan may have: no earlier one, of any life, had it."""
+        return (active.last or active.mapper.scans) + 1
+
+    def expect(self, number: int, scan: int, session: int) -> ActiveMapper:
+        """Return whose scan this is, which is about to be taken in.
+
+        Raises
+        ------
+        BadRequest
+            The session does not map under this number.
+        LiveInterrupted
+            No session does, since the worker began anew.
+        OSError
+            The disk does not take what has to be there first.
+        """
+        active = self.by_number.get(number)
+        if active is None:
+            raise BadRequest(
+                f"this map does not know mapper {number}",
+                hint="it has not mapped for long: open the map again",
+            )
+        if not active.session:
+            raise LiveInterrupted(
+                f"nobody maps as {active.mapper.name!r} just now", hint="open the map again"
+            )
+        if active.session != session:
+            raise BadRequest(
+                f"another program maps as {active.mapper.name!r} now", hint="give each program its own name"
+            )
+        if not 0 < scan < 1 << 63:
+            raise BadRequest(f"scan {scan}: numbers begin at 1 and rise")
+        self._files.expect_scan(active.mapper, scan)
+        return active
+
+    def left(self, session: int) -> None:
+        """A session has ended."""
+        for active in self.by_number.values():
+            if active.session == session:
+                active.session = 0

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where mappers put the marks of their scans, as files: what is in them is nobody's word but theirs.
+
+The directory belongs to the daemon; members of the mappers' group may make files in it and remove their own
+(mode 3770).  A file is named after the session that made it, and goes when that has ended.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+from typing import Final
+
+from shmmap.errors import BadRequest
+
+__all__ = ["MOST_MARKS_BYTES", "MarksDirectory"]
+
+MOST_MARKS_BYTES: Final = 32 << 20
+"""Of one scan; 120 000 points make 0.2 MB."""
+
+_NAME: Final = re.compile(r"([0-9a-f]{1,16})\.[0-9]{1,20}")
+
+
+class MarksDirectory:
+    """Files of marks.
+
+    Parameters
+    ----------
+    path
+        On a tmpfs; made here, and what an earlier life left in it is removed.
+    gid
+        Group whose members may map; -1: none, only the owner.
+
+    Raises
+    ------
+    OSError
+        It cannot be made, or is somebody else's.
+    """
+
+    def __init__(self, path: str, gid: int = -1) -> None:
+        self.path = path
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(path, 0o700)
+        self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        try:
+            if os.fstat(self._fd).st_uid != os.geteuid():
+                raise PermissionError(1, "it belongs to somebody else", path)
+            if gid >= 0:
+                os.fchown(self._fd, -1, gid)
+            os.fchmod(self._fd, 0o3770 if gid >= 0 else 0o700)
+            self._remove_all()
+        except BaseException:
+            os.close(self._fd)
+            raise
+
+    def take(self, name: str, nbytes: int, session: int, uid: int) -> bytes:
+        """Copy a file of marks.
+
+        Parameters
+        ----------
+        name, nbytes
+            What the mapper says of it.
+        session, uid
+            Whose it must be.
+
+        Raises
+        ------
+        BadRequest
+            It is not what a file of marks of this session can be: the message says why.
+        """
+        found = _NAME.fullmatch(name)
+        if found is None or int(found[1], 16) != session:
+            raise BadRequest(f"marks: {name!r} is not a name that this session may use")
+        if not 0 < nbytes <= MOST_MARKS_BYTES:
+            raise BadRequest(f"marks: {nbytes} bytes; {MOST_MARKS_BYTES} are the most")
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+        try:
+            fd = os.open(name, flags, dir_fd=self._fd)
+        except OSError as error:
+            raise BadRequest(f"marks: {name} cannot be opened: {error.strerror}") from error
+        try:
+            status = os.fstat(fd)
+            if not stat.S_ISREG(status.st_mode) or status.st_uid != uid:
+                raise BadRequest(f"marks: {name} is no regular file of this user")
+            if status.st_size != nbytes:
+                raise BadRequest(f"marks: {name} has {status.st_size} bytes, not {nbytes}")
+            data = os.pread(fd, nbytes, 0)
+        finally:
+            os.close(fd)
+        if len(data) != nbytes:
+            raise BadRequest(f"marks: {name} was cut to {len(data)} bytes")
+        return data
+
+    def forget(self, session: int) -> None:
+        """Remove what a session left."""
+        start = f"{session:x}."
+        for name in os.listdir(self._fd):
+            if name.startswith(start):
+                self._remove(name)
+
+    def close(self) -> None:
+        """Remove it, and all that is in it."""
+        self._remove_all()
+        os.close(self._fd)
+        with contextlib.suppress(OSError):
+            os.rmdir(self.path)
+
+    def _remove_all(self) -> None:
+        for name in os.listdir(self._fd):
+            self._remove(name)
+
+    def _remove(self, name: str) -> None:
+        try:
+            os.unlink(name, dir_fd=self._fd)
+        except IsADirectoryError:
+            with contextlib.suppress(OSError):  # a directory that has something in it stays
+                os.rmdir(name, dir_fd=self._fd)
+        except FileNotFoundError:
+            pass

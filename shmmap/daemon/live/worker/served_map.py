@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One live map as clients meet it: requests come in, and are answered when what they ask for is so."""
+
+from __future__ import annotations
+
+import heapq
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final, Protocol, TypeVar
+
+from shmmap.chunks.marks import decode_marks
+from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX, ChunkKey
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.messages import Ask
+from shmmap.daemon.live.records import Chunk, Scan, State
+from shmmap.daemon.live.worker.changes import Changes
+from shmmap.daemon.live.worker.mappers import Mappers
+from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
+from shmmap.daemon.live.worker.voxel_lists import VoxelLists, check_area, touches
+from shmmap.errors import BadRequest, CannotWrite, NotPermitted, ShmmapError
+from shmmap.logfmt import log
+from shmmap.protocol import live as messages
+from shmmap.protocol.messages import ErrorReply
+
+__all__ = ["ServedMap"]
+
+_T = TypeVar("_T")
+
+AHEAD_S: Final = 2.0
+"""Chunks are loaded for where a mapper will be then, if it goes on as it does."""
+MOST_AHEAD_CHUNKS: Final = 4.0
+MANIFEST_S: Final = 60.0
+LEASES_S: Final = 0.25
+"""How often the kernel is asked whether what was given up is still mapped."""
+
+
+class _Reply(Protocol):
+    request: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a session was, and when."""
+
+    xyz: tuple[float, float, float]
+    seen_s: float
+
+
+class ServedMap:
+    """Answers what concerns one map.
+
+    Parameters
+    ----------
+    live
+        In memory, with what an earlier life left.
+    answer
+        Takes a ticket and the reply to it.
+    """
+
+    def __init__(
+        self,
+        settings: LiveSettings,
+        live: LiveMap,
+        lists: VoxelLists,
+        marks: MarksDirectory,
+        answer: Callable[[int, _Reply], None],
+    ) -> None:
+        self.settings = settings
+        self.live = live
+        self.changes = Changes(time.time_ns())
+        self.mappers = Mappers(live.files)
+        self._lists = lists
+        self._marks = marks
+        self._answer = answer
+        self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans that are on their way
+        self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
+        self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
+        self._lists_begun: deque[tuple[Ask, int, Iterator[messages.LiveVoxelsReply | None]]] = deque()
+        self._places: dict[int, _Place] = {}
+        self._scans = self._durable = 0
+        self._leases_s = self._manifest_s = 0.0
+        self._listed = -1
+        live.on_applied, live.on_durable = self._on_applied, self._on_durable
+        live.on_changed, live.on_gone = self.changes.changed, self.changes.gone
+        for key in live.chunks:
+            self.changes.changed(key)
+
+    # --- requests -------------------------------------------------------------------------------
+
+    def handle(self, ask: Ask, message: messages.LiveRequest, now_s: float) -> None:
+        """Answer a request now or later; raises what refuses it."""
+        if isinstance(message, messages.LiveScan | messages.LiveSave) and not ask.maps:
+            raise NotPermitted(
+                "this user may not change live maps", hint="its group is `live_group` of the daemon"
+            )
+        if isinstance(message, messages.LiveOpen):
+            self._answer(ask.ticket, self._open(ask, message))
+        elif isinstance(message, messages.LiveScan):
+            self._scan(ask, message, now_s)
+        elif isinstance(message, messages.LiveMove):
+            self._move(ask.session, message.position, now_s)
+            self._answer(ask.ticket, messages.LiveMoved(message.request, self.changes.number))
+        elif isinstance(message, messages.LiveSave):
+            unsaved = [
+                (chunk, chunk.version)
+                for chunk in self.live.residency.chunks.values()
+                if chunk.version > chunk.durable
+            ]
+            self._saves.append((ask, message, unsaved))
+        elif isinstance(message, messages.LiveChunks):
+            self._answer(ask.ticket, self._page(message))
+        elif isinstance(message, messages.LiveVoxels):
+            self._begin_list(ask, message)
+        elif isinstance(message, messages.LiveRelease):
+            self._lists.release(ask.session, message.segment)
+            self._answer(ask.ticket, messages.LiveReleased(message.request))
+
+    def _open(self, ask: Ask, message: messages.LiveOpen) -> messages.LiveOpened:
+        live, fixed = self.live, self.live.files.settings
+        if message.frame_id not in ("", fixed.frame_id):
+            raise BadRequest(
+                f"live map {self.settings.name} is in frame {fixed.frame_id!r}, not {message.frame_id!r}",
+                hint="transform the poses, or use another map",
+            )
+        hit, miss, low, high = fixed.occupancy.steps
+        above, below = fixed.occupancy.thresholds
+        reply = messages.LiveOpened(
+            message.request, live.files.map_id, fixed.resolution, fixed.frame_id, hit, miss, low, high, above,
+            below, self._lists.path, live.memory.prefix, ask.session,
+        )  # fmt: skip
+        if message.mapper:
+            if not ask.maps:
+                raise NotPermitted(
+                    "this user may not change live maps", hint="its group is `live_group` of the daemon"
+                )
+            active = self._on_disk(lambda: self.mappers.open(ask.uid, message.mapper, ask.session))
+            reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
+            reply.marks_dir, reply.most_marks_bytes = self._marks.path, MOST_MARKS_BYTES
+        return reply
+
+    def _on_disk(self, work: Callable[[], _T]) -> _T:
+        try:
+            return work()
+        except OSError as error:
+            raise CannotWrite(
+                f"live map {self.settings.name}: its directory cannot be written: {error.strerror}",
+                hint=f"see to {self.settings.path}; what is in memory stays there",
+            ) from error
+
+    def _scan(self, ask: Ask, message: messages.LiveScan, now_s: float) -> None:
+        active = self._on_disk(lambda: self.mappers.expect(message.mapper, message.scan, ask.session))
+        self._move(ask.session, message.sensor, now_s)
+        on_its_way = self._tickets.get((active.mapper.number, message.scan))
+        if on_its_way is not None:
+            on_its_way.append((ask.ticket, message.request))
+        else:
+            self._waiting.append((ask, message))
+
+    def _take_scans(self) -> None:
+        """Take in what waits, as long as there is room for it; the rest waits where the mappers put it."""
+        while self._waiting and self.live.residency.has_room(self._waiting[0][1].bytes):
+            ask, message = self._waiting.popleft()
+            try:
+                self._take(ask, message)
+            except ShmmapError as error:
+                self._refuse(ask, message.request, error)
+
+    def _take(self, ask: Ask, message: messages.LiveScan) -> None:
+        active = self.mappers.by_number.get(message.mapper)
+        if active is None or active.session != ask.session:
+            raise BadRequest(f"the session does not map as mapper {message.mapper} any more")
+        on_its_way = self._tickets.get((message.mapper, message.scan))
+        if on_its_way is not None:
+            on_its_way.append((ask.ticket, message.request))
+            return
+        data = self._marks.take(message.marks, message.bytes, ask.session, ask.uid)
+        marks = decode_marks(data, self.live.files.map_id, message.mapper, message.scan)
+        active.last = max(active.last, message.scan)
+        active.unsaved.add(message.scan)
+        self._tickets[message.mapper, message.scan] = [(ask.ticket, message.request)]
+        self.live.add(message.mapper, message.scan, marks, message.bytes)
+
+    def _move(self, session: int, position: tuple[float, float, float], now_s: float) -> None:
+        """A client is here, and will be further on: what is near both is brought into memory."""
+        reach = FURTHEST_INDEX * self.live.files.settings.resolution / 2
+        if not all(-reach < value < reach for value in position):
+            raise BadRequest(f"position {position}: it is not finite, or too far away")
+        self.live.move(session, position)
+        before = self._places.get(session)
+        self._places[session] = _Place(position, now_s)
+        if before is None or now_s <= before.seen_s:
+            return
+        step = MOST_AHEAD_CHUNKS * CHUNK_SIDE * self.live.files.settings.resolution
+        ahead = [
+            here + min(max((here - there) / (now_s - before.seen_s) * AHEAD_S, -step), step)
+            for here, there in zip(position, before.xyz, strict=True)
+        ]
+        self.live.move((session, "ahead"), (ahead[0], ahead[1], ahead[2]))
+
+    def left(self, session: int) -> None:
+        """A session has ended: what it sent goes on, what it asked for does not."""
+        for client in (session, (session, "ahead")):
+            self.live.residency.leave(client)
+        self._places.pop(session, None)
+        self.mappers.left(session)
+        self._lists.left(session)
+        self._waiting = deque(row for row in self._waiting if row[0].session != session)
+        self._saves = [row for row in self._saves if row[0].session != session]
+        self._lists_begun = deque(row for row in self._lists_begun if row[0].session != session)
+
+    # --- readers --------------------------------------------------------------------------------
+
+    def _page(self, message: messages.LiveChunks) -> messages.LiveChunkPage:
+        live, resolution = self.live, self.live.files.settings.resolution
+        if message.area is not None:
+            check_area(message.area)
+        known = not message.since or self.changes.known(message.since)
+        since = message.since if known else 0
+        keys = (key for key in live.chunks if not since or self.changes.is_newer(key, since))
+        wanted: list[ChunkKey] = [key for key in keys if touches(message.area, key, resolution)]
+        if message.saved:
+            wanted += [
+                key for key in live.files.rows
+                if key not in live.chunks and touches(message.area, key, resolution)
+            ]  # fmt: skip
+        if message.after is not None:
+            wanted = [key for key in wanted if key > message.after]
+        page = heapq.nsmallest(messages.MOST_CHUNK_ROWS, wanted)
+        first = since and message.after is None
+        gone = (
+            [key for key in self.changes.left(since) if touches(message.area, key, resolution)]
+            if first
+            else []
+        )
+        return messages.LiveChunkPage(
+            message.request, self.changes.number, tuple(self._row(key) for key in page),
+            len(wanted) > len(page), tuple(gone), known,
+        )  # fmt: skip
+
+    def _row(self, key: ChunkKey) -> messages.LiveChunkRow:
+        there = self.live.chunks.get(key)
+        if there is None:
+            row = self.live.files.rows[key]
+            return messages.LiveChunkRow(
+                key, 0, row.version, "saved", row.active, row.occupied, row.free, row.bytes
+            )
+        state, known = there.view.state, self.live.residency.chunks[key]
+        return messages.LiveChunkRow(
+            key, there.view.identity.generation, int(state["version"]), known.state.value,
+            int(state["active"]), int(state["occupied"]), int(state["free"]), known.nbytes,
+        )  # fmt: skip
+
+    def _begin_list(self, ask: Ask, message: messages.LiveVoxels) -> None:
+        if message.scope not in ("memory", "disk", "all"):
+            raise BadRequest(f"scope {message.scope!r}", hint="ask for memory, disk or all")
+        if message.area is not None:
+            check_area(message.area)
+        resolution, since = self.live.files.settings.resolution, message.since
+        since = since if self.changes.known(since) else 0
+        keys = set() if message.scope == "disk" else {
+            key for key in self.live.chunks if not since or self.changes.is_newer(key, since)
+        }  # fmt: skip
+        if message.scope != "memory" and not since:
+            keys |= set(self.live.files.rows)
+        chosen = sorted(key for key in keys if touches(message.area, key, resolution))
+        work = self._lists.collect(message, chosen, ask.session, self.changes.number)
+        self._lists_begun.append((ask, message.request, work))
+
+    def _go_on_with_lists(self) -> None:
+        ask, request, work = self._lists_begun[0]
+        try:
+            reply = next(work)
+        except ShmmapError as error:
+            self._refuse(ask, request, error)
+        except OSError as error:
+            self._refuse(ask, request, CannotWrite(f"the list of voxels: {error.strerror}"))
+        else:
+            if reply is None:
+                self._lists_begun.rotate(-1)
+                return
+            self._answer(ask.ticket, reply)
+        self._lists_begun.popleft()
+
+    # --- answers --------------------------------------------------------------------------------
+
+    def _on_applied(self, scan: Scan) -> None:
+        self._scans += 1
+        active = self.mappers.by_number.get(scan.mapper)
+        durable = active.durable if active is not None else 0
+        for ticket, request in self._tickets.pop((scan.mapper, scan.number), ()):
+            self._answer(ticket, messages.LiveApplied(request, scan.number, durable))
+
+    def _on_durable(self, scan: Scan) -> None:
+        self._durable += 1
+        active = self.mappers.by_number.get(scan.mapper)
+        if active is not None:
+            active.unsaved.discard(scan.number)
+
+    def _refuse(self, ask: Ask, request: int, error: ShmmapError) -> None:
+        self._answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))
+
+    def _answer_saves(self) -> None:
+        waiting, self._saves = self._saves, []
+        for ask, message, unsaved in waiting:
+            left = [(chunk, version) for chunk, version in unsaved if chunk.durable < version]
+            if left:
+                self._saves.append((ask, message, left))
+                continue
+            mine = [one.durable for one in self.mappers.by_number.values() if one.session == ask.session]
+            files = len(self.live.files.rows)
+            self._answer(ask.ticket, messages.LiveDurable(message.request, max(mine, default=0), files))
+
+    # --- turns ----------------------------------------------------------------------------------
+
+    def turn(self, now_s: float, *, save_all: bool) -> None:
+        """Do what can be done now."""
+        self._take_scans()
+        self.live.turn(now_s, time.time_ns(), save_all=save_all or bool(self._saves))
+        if self._saves:
+            self._answer_saves()
+        if self._lists_begun:
+            self._go_on_with_lists()
+        if self.live.kept and now_s >= self._leases_s:
+            self.live.look_at_leases()
+            self._leases_s = now_s + LEASES_S
+        if now_s >= self._manifest_s and self.changes.number != self._listed:
+            self._manifest_s, self._listed = now_s + MANIFEST_S, self.changes.number
+            self.live.list_files()
+
+    def next_turn_s(self, now_s: float) -> float:
+        """When the next turn is due, if nothing happens before."""
+        residency = self.live.residency
+        if self._lists_begun or any(not chunk.missing_bytes for chunk, _ in residency.ready()):
+            return now_s
+        times = [residency.next_event_s(now_s)]
+        if self.live.kept:
+            times.append(self._leases_s)
+        if self._waiting or residency.is_waiting:
+            times.append(now_s + LEASES_S)
+        return min(times)
+
+    def status(self) -> messages.LiveMapRow:
+        """How the map is."""
+        live, residency = self.live, self.live.residency
+        states = [chunk.state for chunk in residency.chunks.values()]
+        missing = [f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items()]
+        damaged = [f"{name}: {why}" for name, why in live.files.damaged.items()]
+        return messages.LiveMapRow(
+            self.settings.name, self.settings.path, live.files.settings.resolution,
+            live.files.settings.frame_id, chunks=len(live.chunks), active=residency.active,
+            bytes=residency.chunk_bytes, loading=states.count(State.LOADING),
+            dirty=states.count(State.DIRTY), saving=states.count(State.SAVING),
+            evicting=len(residency.leases), evicting_bytes=residency.leased_bytes,
+            waiting_bytes=residency.waiting_bytes, files=len(live.files.rows),
+            file_bytes=sum(row.bytes for row in list(live.files.rows.values())), scans=self._scans,
+            durable=self._durable, budget_bytes=live.limits.budget_bytes,
+            damaged=tuple([*missing, *damaged][:64]),
+            mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
+            problem=live.problem,
+        )  # fmt: skip
+
+    # --- the end --------------------------------------------------------------------------------
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether nothing is in memory alone."""
+        return self.live.all_durable
+
+    def stop_taking(self) -> None:
+        """Take in nothing more: what waits is sent again to the next life."""
+        self._waiting.clear()
+
+    def end(self, *, keep: bool) -> int:
+        """End it; returns how many chunks stay in memory because they are nowhere else."""
+        self._lists.remove_all()
+        unsaved = sum(chunk.version > chunk.saved for chunk in self.live.residency.chunks.values())
+        if not keep and not unsaved:
+            try:
+                self.live.files.write_manifest()
+            except OSError as error:
+                log.warning("manifest not written", map=self.settings.name, reason=error.strerror)
+            self.live.remove_from_memory()
+        self.live.close()
+        return unsaved
