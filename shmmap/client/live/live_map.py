@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from shmmap import geometry
 from shmmap.chunks.voxels import ChunkKey, in_chunk, voxel_indices
 from shmmap.client.live.attached_chunk import AttachedChunk
+from shmmap.client.live.patience import until_served
 from shmmap.client.live.voxels import Voxels, open_voxels
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, SegmentError, StaleHandle
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     from shmmap.client.live.mapper import LiveMapper
 
 __all__ = ["ChunkInfo", "LiveMap", "Sphere"]
+
+R = TypeVar("R")
 
 LIST_S: Final = 60.0
 """How long putting voxels together may take, beside what any request may."""
@@ -97,12 +101,18 @@ class LiveMap:
         self._open()
 
     def _open(self) -> None:
-        self._opened = self._session.ask(
+        self._opened = self._ask(
             lambda n: messages.LiveOpen(n, self.name, "", self._frame_id), messages.LiveOpened
         )
         opened = self._opened
         self.map_id, self.resolution, self.frame_id = opened.map_id, opened.resolution, opened.frame_id
         self._slot = self._session.welcome.session
+
+    def _ask(self, make: Callable[[int], messages.LiveRequest], kind: type[R], *, quiet_s: float = 0.0) -> R:
+        """Send a request; again if the process that keeps live maps is started anew."""
+        return until_served(
+            lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
+        )
 
     def __repr__(self) -> str:
         return f"<LiveMap {self.name}, voxels of {self.resolution} m in frame {self.frame_id}>"
@@ -134,7 +144,7 @@ class LiveMap:
 
     def move_to(self, x: float, y: float, z: float) -> None:
         """Say where this process is, metres in the map's frame: chunks around it stay in memory."""
-        self._session.ask(
+        self._ask(
             lambda n: messages.LiveMove(n, self.name, (float(x), float(y), float(z))), messages.LiveMoved
         )
 
@@ -148,14 +158,12 @@ class LiveMap:
         NoAnswer
             It took longer: a disk is full, or slow; see `status`.
         """
-        reply = self._session.ask(
-            lambda n: messages.LiveSave(n, self.name), messages.LiveDurable, quiet_s=timeout_s
-        )
+        reply = self._ask(lambda n: messages.LiveSave(n, self.name), messages.LiveDurable, quiet_s=timeout_s)
         return reply.files
 
     def status(self) -> messages.LiveMapRow:
         """How the map is: chunks, memory, files, problems."""
-        reply = self._session.ask(messages.LiveList, messages.LiveListed)
+        reply = self._ask(messages.LiveList, messages.LiveListed)
         for row in reply.maps:
             if row.name == self.name:
                 return row
@@ -186,7 +194,7 @@ class LiveMap:
         change, known = -1, True
         while True:
             start = after
-            page = self._session.ask(
+            page = self._ask(
                 lambda n, start=start: messages.LiveChunks(n, self.name, message, since, saved, start),  # type: ignore[misc]
                 messages.LiveChunkPage,
             )
@@ -260,7 +268,7 @@ class LiveMap:
             There are too many for the daemon's memory: ask for a smaller area.
         """
         message = _area(area)
-        reply = self._session.ask(
+        reply = self._ask(
             lambda n: messages.LiveVoxels(n, self.name, kind, message, scope, since),
             messages.LiveVoxelsReply,
             quiet_s=LIST_S,
@@ -268,9 +276,7 @@ class LiveMap:
         try:
             return open_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
         finally:
-            self._session.ask(
-                lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased
-            )
+            self._ask(lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased)
 
     def occupied(self, area: geometry.Box | Sphere | None = None) -> NDArray[np.float64]:
         """Middles of the occupied voxels in memory, (N, 3) metres in the map's frame."""

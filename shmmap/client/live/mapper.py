@@ -12,13 +12,15 @@ import errno
 import os
 import threading
 import time
+import weakref
+from collections import deque
 from dataclasses import dataclass
-from queue import Queue
 from typing import TYPE_CHECKING, Final
 
 from shmmap.chunks.marking import Counts, Marker, ScanFilter
 from shmmap.chunks.marks import encode_marks
 from shmmap.client.connection import Connection
+from shmmap.client.live.patience import PAUSE_S, until_served
 from shmmap.client.session import Session
 from shmmap.errors import (
     BadRequest,
@@ -39,8 +41,8 @@ __all__ = ["LiveMapper"]
 
 ON_THE_WAY: Final = 3
 """Scans that are marked and not answered; `LiveMapper.add` waits when there are more."""
-PAUSE_S: Final = 0.05
-"""Between two tries while the worker is started anew."""
+LAST_S: Final = 1.0
+"""How long what is on the way may take when nobody has closed the mapper."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +52,133 @@ class _Marked:
     number: int
     data: bytes
     sensor: tuple[float, float, float]
+
+
+class _Sender:
+    """Sends marks in the order in which they come, each until it is answered; has a thread for it.
+
+    Attributes
+    ----------
+    opened
+        What the daemon said of the map.
+    applied, durable
+        Numbers of scans, as of the last answer.
+    error
+        Why a scan, and all after it, did not get into the map.
+    changed
+        Told of changes of the three, and of `waiting`.
+    """
+
+    def __init__(
+        self, path: str, live_map: str, name: str, frame_id: str, connect_s: float, timeout_s: float
+    ) -> None:
+        self._map, self._name, self._frame_id, self._timeout_s = live_map, name, frame_id, timeout_s
+        self.changed = threading.Condition()
+        self.error: ShmmapError | None = None
+        self._waiting: deque[_Marked] = deque()
+        self._ending = False
+        self._files = 0
+        self._connection = Connection((path,), name=f"mapper {name}"[:64], timeout_s=connect_s)
+        try:
+            self.opened = self._open()
+        except BaseException:
+            self._connection.close()
+            raise
+        self.applied = self.durable = self.opened.next_scan - 1
+        self._thread = threading.Thread(target=self._run, name=f"mapper {name}", daemon=True)
+        self._thread.start()
+
+    def put(self, scan: _Marked) -> None:
+        """Send a scan when those before are answered; waits while too many are on the way."""
+        with self.changed:
+            self.changed.wait_for(lambda: len(self._waiting) < ON_THE_WAY or self.error is not None)
+            if self.error is not None:
+                raise self.error
+            self._waiting.append(scan)
+            self.changed.notify_all()
+
+    def end(self, *, patience_s: float | None = None) -> None:
+        """Send what is on the way, then end the session; waits for that, at most so long."""
+        with self.changed:
+            self._ending = True
+            self.changed.notify_all()
+        self._thread.join(patience_s)
+
+    def save(self, timeout_s: float) -> int:
+        """Have everything saved, when all is applied; returns the number up to which scans are durable."""
+        reply = until_served(
+            lambda: self._connection.ask(
+                messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
+                timeout_s=timeout_s, quiet_s=timeout_s,
+            ),
+            timeout_s,
+        )  # fmt: skip
+        # a worker that began anew does not know what came before, and has it saved all the same
+        self.durable = max(reply.scan, self.applied)
+        return self.durable
+
+    def _run(self) -> None:
+        while True:
+            with self.changed:
+                self.changed.wait_for(lambda: bool(self._waiting) or self._ending)
+                if not self._waiting or self.error is not None:
+                    break
+                scan = self._waiting[0]
+            try:
+                durable = self._send(scan)
+            except ShmmapError as error:
+                with self.changed:
+                    self.error = error
+                    self._waiting.clear()  # what comes later cannot go in before it
+                    self.changed.notify_all()
+            else:
+                with self.changed:
+                    self.applied, self.durable = scan.number, max(self.durable, durable)
+                    self._waiting.popleft()
+                    self.changed.notify_all()
+        self._connection.close()
+
+    def _open(self) -> messages.LiveOpened:
+        return until_served(
+            lambda: self._connection.ask(
+                messages.LiveOpen(self._connection.new_request(), self._map, self._name, self._frame_id),
+                messages.LiveOpened,
+                timeout_s=self._timeout_s,
+            ),
+            self._timeout_s,
+        )
+
+    def _send(self, scan: _Marked) -> int:
+        """Send a scan until it is answered; returns what is durable."""
+        end_s = time.monotonic() + self._timeout_s
+        while True:
+            try:
+                return self._try(scan, max(0.1, end_s - time.monotonic()))
+            except (LiveInterrupted, Busy, DaemonUnreachable) as error:  # noqa: PERF203  until it is there again
+                if time.monotonic() >= end_s:
+                    raise
+                time.sleep(PAUSE_S)
+                with contextlib.suppress(LiveInterrupted, Busy, DaemonUnreachable):
+                    if not isinstance(error, Busy):
+                        self.opened = self._open()
+
+    def _try(self, scan: _Marked, timeout_s: float) -> int:
+        self._files += 1
+        name = f"{self._connection.welcome.session:x}.{self._files}"
+        path = os.path.join(self.opened.marks_dir, name)
+        try:
+            _write(path, scan.data)
+            reply = self._connection.ask(
+                messages.LiveScan(
+                    self._connection.new_request(), self._map, self.opened.mapper, scan.number, name,
+                    len(scan.data), scan.sensor,
+                ),
+                messages.LiveApplied, timeout_s=timeout_s, quiet_s=timeout_s,
+            )  # fmt: skip
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(path)
+        return reply.durable
 
 
 class LiveMapper:
@@ -71,26 +200,12 @@ class LiveMapper:
             raise BadRequest("a mapper needs a name", hint="one that the program keeps: 'front_lidar'")
         self.name = name
         self.counts: Counts | None = None
-        self._map, self._frame_id, self._timeout_s = live_map, frame_id, timeout_s
-        self._shm_dir = os.environ.get("SHMMAP_LIVE_SHM_DIR", "")
-        self._connection = Connection(
-            (session.path,), name=f"mapper {name}"[:64], timeout_s=session.timeout_s
-        )
-        self._changed = threading.Condition()
-        self._error: ShmmapError | None = None
-        self._applied = self._durable = 0
-        self._files = 0
-        try:
-            self._opened = self._open()
-        except BaseException:
-            self._connection.close()
-            raise
-        self._marker = Marker(self._opened.resolution, scan_filter)
-        self._next = self._opened.next_scan
-        self._applied = self._durable = self._last = self._next - 1
-        self._queue: Queue[_Marked | None] = Queue(ON_THE_WAY)
-        self._thread = threading.Thread(target=self._send_all, name=f"mapper {name}", daemon=True)
-        self._thread.start()
+        self._timeout_s = timeout_s
+        sender = self._sender = _Sender(session.path, live_map, name, frame_id, session.timeout_s, timeout_s)
+        # also when nobody calls close(), and at the end of the program
+        self._end = weakref.finalize(self, sender.end, patience_s=LAST_S)
+        self._marker = Marker(sender.opened.resolution, scan_filter)
+        self._last = sender.applied
 
     def __enter__(self) -> LiveMapper:
         return self
@@ -100,12 +215,8 @@ class LiveMapper:
 
     def close(self) -> None:
         """Send what is on the way, wait until it is applied, and end the session; raises no error."""
-        if self._thread.is_alive():
-            self._queue.put(None)
-            self._thread.join()
-            self._connection.close()
-
-    # --- scans ----------------------------------------------------------------------------------
+        if self._end.detach() is not None:
+            self._sender.end()
 
     def add(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> int:
         """Add a scan; waits while earlier ones are still on the way.
@@ -124,33 +235,35 @@ class LiveMapper:
         Raises
         ------
         BadRequest
-            A shape is wrong, the pose is no rotation and finite position, or the scan touches too much.
+            A shape is wrong, the pose is no rotation and finite position, the scan touches too much, or the
+            mapper is closed.
         ShmmapError
             Why an earlier scan, and all after it, did not get into the map.
         """
-        self._check()
+        if not self._end.alive:
+            raise BadRequest("this mapper is closed", hint="open another one")
         marks, self.counts = self._marker.mark(points, pose)
-        number, self._next = self._next, self._next + 1
-        data = encode_marks(marks, self._opened.map_id, self._opened.mapper, number)
-        if len(data) > self._opened.most_marks_bytes:
+        number, opened = self._last + 1, self._sender.opened
+        data = encode_marks(marks, opened.map_id, opened.mapper, number)
+        if len(data) > opened.most_marks_bytes:
             raise BadRequest(
-                f"the scan's marks have {len(data)} bytes; {self._opened.most_marks_bytes} are the most",
+                f"the scan's marks have {len(data)} bytes; {opened.most_marks_bytes} are the most",
                 hint="lower max_range, or make the map with larger voxels",
             )
         x, y, z = (float(pose[axis][3]) for axis in range(3))
+        self._sender.put(_Marked(number, data, (x, y, z)))
         self._last = number
-        self._queue.put(_Marked(number, data, (x, y, z)))
         return number
 
     @property
     def applied(self) -> int:
         """Highest number of a scan that is in the map: no death of a process takes it out."""
-        return self._applied
+        return self._sender.applied
 
     @property
     def durable(self) -> int:
         """All scans up to this one are on the disk, as of the last answer."""
-        return self._durable
+        return self._sender.durable
 
     def wait_applied(self, timeout_s: float | None = None) -> int:
         """Wait until every scan that was added is applied; returns the last one's number.
@@ -163,12 +276,16 @@ class LiveMapper:
             Why one could not be applied.
         """
         patience_s = self._timeout_s if timeout_s is None else timeout_s
-        with self._changed:
-            self._changed.wait_for(lambda: self._applied >= self._last or self._error is not None, patience_s)
-        self._check()
-        if self._applied < self._last:
+        sender = self._sender
+        with sender.changed:
+            sender.changed.wait_for(
+                lambda: sender.applied >= self._last or sender.error is not None, patience_s
+            )
+        if sender.error is not None:
+            raise sender.error
+        if sender.applied < self._last:
             raise NoAnswer(f"scan {self._last} was not applied within {patience_s:.3g} s")
-        return self._applied
+        return sender.applied
 
     def wait_durable(self, timeout_s: float = 300.0) -> int:
         """Have everything saved; returns the number up to which all scans are on the disk.
@@ -176,72 +293,7 @@ class LiveMapper:
         Raises as `wait_applied`.
         """
         self.wait_applied()
-        reply = self._connection.ask(
-            messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
-            timeout_s=timeout_s, quiet_s=timeout_s,
-        )  # fmt: skip
-        self._durable = reply.scan
-        return reply.scan
-
-    def _check(self) -> None:
-        if self._error is not None:
-            raise self._error
-
-    # --- sending --------------------------------------------------------------------------------
-
-    def _open(self) -> messages.LiveOpened:
-        return self._connection.ask(
-            messages.LiveOpen(self._connection.new_request(), self._map, self.name, self._frame_id),
-            messages.LiveOpened,
-            timeout_s=self._timeout_s,
-        )
-
-    def _send_all(self) -> None:
-        while (scan := self._queue.get()) is not None:
-            if self._error is not None:
-                continue  # what comes later cannot go in before it
-            try:
-                durable = self._send(scan)
-            except ShmmapError as error:
-                with self._changed:
-                    self._error = error
-                    self._changed.notify_all()
-            else:
-                with self._changed:
-                    self._applied, self._durable = scan.number, max(self._durable, durable)
-                    self._changed.notify_all()
-
-    def _send(self, scan: _Marked) -> int:
-        """Send a scan until it is answered; returns what is durable."""
-        end_s = time.monotonic() + self._timeout_s
-        while True:
-            try:
-                return self._try(scan, max(0.1, end_s - time.monotonic()))
-            except (LiveInterrupted, Busy, DaemonUnreachable) as error:  # noqa: PERF203  until it is there again
-                if time.monotonic() >= end_s:
-                    raise
-                time.sleep(PAUSE_S)  # nothing tells when the worker is there again
-                with contextlib.suppress(LiveInterrupted, Busy, DaemonUnreachable):
-                    if not isinstance(error, Busy):
-                        self._opened = self._open()
-
-    def _try(self, scan: _Marked, timeout_s: float) -> int:
-        self._files += 1
-        name = f"{self._connection.welcome.session:x}.{self._files}"
-        path = os.path.join(self._opened.marks_dir, name)
-        try:
-            _write(path, scan.data)
-            reply = self._connection.ask(
-                messages.LiveScan(
-                    self._connection.new_request(), self._map, self._opened.mapper, scan.number, name,
-                    len(scan.data), scan.sensor,
-                ),
-                messages.LiveApplied, timeout_s=timeout_s, quiet_s=timeout_s,
-            )  # fmt: skip
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(path)
-        return reply.durable
+        return self._sender.save(timeout_s)
 
 
 def _write(path: str, data: bytes) -> None:

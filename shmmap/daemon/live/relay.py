@@ -35,6 +35,8 @@ END_S: Final = 60.0
 """How long saving everything may take at the end; the unit's stop timeout is longer."""
 PAUSES_S: Final = (0.0, 0.5, 2.0, 10.0, 30.0)
 """Before another worker is started for one that ended: the first time, and later ones in a row."""
+STARTS: Final = 2
+"""Workers that may be killed before the maps are in memory."""
 MOST_OF_A_SESSION: Final = 64
 """Requests that may wait for their answers."""
 MOST_BYTES: Final = 1 << 16
@@ -129,8 +131,13 @@ class LiveRelay:
             One cannot be: the daemon cannot start like that.
         """
         end_s = time.monotonic() + START_S
-        while not self._serving and self._channel is not None and (left_s := end_s - time.monotonic()) > 0:
-            select.select([self._channel], [], [], left_s)
+        while not self._serving and self._why is None and (left_s := end_s - time.monotonic()) > 0:
+            if self._channel is None:
+                if self._failures > STARTS:
+                    break
+                self.start()
+            if self._channel is not None:
+                select.select([self._channel], [], [], left_s)
             self.hear()
         if not self._serving:
             raise self._why or CannotStart(

@@ -85,10 +85,11 @@ class _Worker:
         prefix = live_prefix(wanted.instance, settings.name)
         memory = ChunkMemory(wanted.shm_dir, prefix, mode=mode, gid=wanted.gid)
         self._closing.callback(memory.close)
-        undo = _undo_record(wanted.shm_dir + prefix + "undo")
+        files = MapFiles(folder, _fixed(settings))
+        self._closing.callback(_forget_undo, wanted.shm_dir + prefix, memory)
         live = LiveMap(
-            MapFiles(folder, _fixed(settings)), memory, undo, _limits(settings, budget), usual_codec(),
-            on_work_done=self._wake,
+            files, memory, _undo_record(wanted.shm_dir + prefix + "undo"), _limits(settings, budget),
+            usual_codec(), on_work_done=self._wake,
         )  # fmt: skip
         lists = VoxelLists(live, wanted.shm_dir, mode, wanted.gid)
         lists.remove_all()
@@ -105,7 +106,7 @@ class _Worker:
 
     # --- turns ----------------------------------------------------------------------------------
 
-    def run(self, wanted: messages.Begin) -> None:
+    def run(self) -> None:
         """Serve until the daemon says that it ends, or is gone."""
         self._send(messages.Begun(sum(len(one.live.chunks) for one in self._maps.values())))
         poller = select.poll()
@@ -126,7 +127,8 @@ class _Worker:
                 self._tell(now_s)
             if self._ending is not None and self._may_end(self._ending):
                 break
-        self._end(wanted, self._ending)
+        with contextlib.suppress(OSError):
+            self._send(messages.Ended(self.end(self._ending)))
 
     def _patience_ms(self, now_s: float) -> float:
         due_s = min((one.next_turn_s(now_s) for one in self._maps.values()), default=now_s + STATUS_S)
@@ -205,20 +207,15 @@ class _Worker:
     def _may_end(self, ending: messages.End) -> bool:
         return ending.keep or all(one.is_saved for one in self._maps.values())
 
-    def _end(self, wanted: messages.Begin, ending: messages.End | None) -> None:
-        keep = ending is None or ending.keep
+    def end(self, ending: messages.End) -> int:
+        """Leave memory as it is, or empty; returns how many chunks stay there for they are nowhere else."""
         unsaved = 0
-        for name, one in self._maps.items():
-            left = one.end(keep=keep)
-            unsaved += left
-            if not keep and not left:
-                with contextlib.suppress(FileNotFoundError):
-                    os.unlink(wanted.shm_dir + live_prefix(wanted.instance, name) + "undo")
+        for one in self._maps.values():
+            unsaved += one.end(keep=ending.keep)
         if self._marks is not None:
             self._marks.close()
         self._closing.close()
-        with contextlib.suppress(OSError):
-            self._send(messages.Ended(unsaved))
+        return unsaved
 
 
 def _fixed(settings: LiveSettings) -> MapSettings:
@@ -233,6 +230,13 @@ def _limits(settings: LiveSettings, budget_bytes: int) -> Limits:
         radius=settings.radius, hysteresis=settings.hysteresis, linger_s=settings.linger_s,
         checkpoint_s=settings.checkpoint_s,
     )  # fmt: skip
+
+
+def _forget_undo(prefix: str, memory: ChunkMemory) -> None:
+    """Remove the undo record where no chunk is left that it could be for."""
+    if not list(memory.names()):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(prefix + "undo")
 
 
 def _undo_record(path: str) -> UndoRecord:
@@ -263,12 +267,13 @@ def main(arguments: list[str]) -> int:
         try:
             worker.begin(wanted)
         except (ShmmapError, OSError) as error:
+            worker.end(messages.End(keep=True))
             told = error if isinstance(error, ShmmapError) else CannotStart(f"live maps: {error}")
             channel.send(messages.encode(messages.Failed(told.code, told.message, told.hint)))
             return told.exit_code
         gc.collect()
         gc.freeze()
-        worker.run(wanted)
+        worker.run()
     return 0
 
 

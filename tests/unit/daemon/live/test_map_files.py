@@ -86,7 +86,7 @@ def test_scans_are_expected_ahead() -> None:
     [
         (MapSettings(resolution=0.2), "resolution"),
         (MapSettings(resolution=0.1, frame_id="odom"), "frame_id"),
-        (MapSettings(resolution=0.1, occupancy=Occupancy(hit=0.8)), "occupancy"),
+        (MapSettings(resolution=0.1, occupancy=Occupancy(hit=0.8)), "hit"),
     ],
 )
 def test_other_settings_are_refused(other: MapSettings, key: str) -> None:

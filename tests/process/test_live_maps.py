@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live maps from end to end: mappers write, readers read, processes die, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.chunks.marks import encode_marks
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.client.live.live_map import Sphere
+from shmmap.errors import BadRequest, ConfigError, LiveInterrupted
+from shmmap.failpoints import LIVE_STEPS
+from shmmap.protocol import live as messages
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess
+from tests.support.live_drive import FILTER, RESOLUTION, drive, marked
+from tests.support.live_reference import held, reference
+from tests.support.patience import Patience
+from tests.support.slow_occupancy import walk
+
+SETTINGS = """\
+[live.lidar]
+resolution = {resolution}
+linger_s = 0.05
+checkpoint_s = {checkpoint}
+path = "{path}"
+"""
+
+LiveDaemon = Callable[..., DaemonProcess]
+
+
+@pytest.fixture
+def live_daemon(daemon: DaemonFactory, tmp_path: Path) -> LiveDaemon:
+    """Start a daemon that keeps the live map ``lidar`` alone."""
+
+    def make(
+        *flags: str, resolution: float = RESOLUTION, checkpoint: float = 0.2, start: bool = True
+    ) -> DaemonProcess:
+        file = tmp_path / "shmmap.toml"
+        file.write_text(
+            SETTINGS.format(resolution=resolution, checkpoint=checkpoint, path=tmp_path / "lidar")
+        )
+        one: DaemonProcess = daemon("", "--config", str(file), "--live-budget", "16M", *flags, start=start)
+        return one
+
+    return make
+
+
+def worker_of(one: DaemonProcess) -> int:
+    """Id of the live worker."""
+    (found,) = (pid for pid in one.children() if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return found
+
+
+def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -> None:
+    """Voxel for voxel, in memory and on disk, by list, by point, and by ray."""
+    expected = reference(drive())
+    one = live_daemon()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        assert (live.resolution, live.frame_id) == (RESOLUTION, "map")
+        with live.mapper("front", FILTER) as mapper:
+            numbers = [mapper.add(points, pose) for points, pose in drive()]
+            assert numbers == list(range(1, len(numbers) + 1))
+            assert mapper.wait_applied() == numbers[-1] == mapper.applied
+            assert held(live) == expected
+            assert mapper.wait_durable() == numbers[-1] == mapper.durable
+        assert held(live, "disk") == expected
+        status = live.status()
+        assert (status.scans, status.durable, status.dirty) == (len(numbers), len(numbers), 0)
+        assert status.mappers == (f"{os.getuid()}/front",)
+
+        origin = np.array(drive()[-1][1][:3, 3])
+        live.move_to(*origin)
+        here = ChunkKey(*np.floor(origin / (64 * RESOLUTION)).astype(int).tolist())
+        waiting = Patience()
+        while waiting(sum(chunk.key.distance(here) <= 1 for chunk in live.chunks()) < 27):
+            pass
+        near = np.array(
+            [voxel for voxel in expected if np.abs(np.array(voxel) - origin / RESOLUTION).max() < 60]
+        )
+        assert live.log_odds((near + 0.5) * RESOLUTION).tolist() == [
+            expected[x, y, z] for x, y, z in near.tolist()
+        ]
+        assert live.log_odds([[5000.0, 0.0, 0.0]]).tolist() == [0]
+
+        ends = origin + np.random.default_rng(3).uniform(-8.0, 8.0, (200, 3))
+        for end, distance in zip(ends, live.first_hits(origin, ends), strict=True):
+            first, last = (tuple(np.floor(p * (1 / RESOLUTION)).astype(int).tolist()) for p in (origin, end))
+            way = [*walk(first, last), last]
+            hit = next((voxel for voxel in way if expected.get(voxel, 0) > 0), None)
+            if hit is None:
+                assert distance == np.inf
+            else:
+                assert distance == pytest.approx(np.linalg.norm((np.array(hit) + 0.5) * RESOLUTION - origin))
+    one.stop()
+    assert not [name for name in os.listdir(one.shm_dir) if "live" in name]
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        assert held(live, "disk") == expected
+        with live.mapper("front") as mapper:
+            assert mapper.add(np.zeros((0, 3)), np.eye(4)) > len(numbers)  # never a number again
+
+
+def test_voxels_of_an_area_and_since_a_change(live_daemon: LiveDaemon) -> None:
+    expected = reference(drive(1))
+    one = live_daemon()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            mapper.add(*drive()[0])
+            mapper.wait_applied()
+            sphere = Sphere(1.0, 1.0, 0.0, 3.0)
+            found = live.voxels("free", sphere)
+            free = np.array([voxel for voxel, value in expected.items() if value < 0])
+            inside = np.linalg.norm((free + 0.5) * RESOLUTION - [1.0, 1.0, 0.0], axis=1) <= 3.0
+            assert sorted(found.indices.tolist()) == sorted(free[inside].tolist())
+            assert (found.probability < 0.5).all()
+            box = shmmap.Box(-2.0, -2.0, 2.0, 2.0, shmmap.ZRange(-1.0, 1.0))
+            occupied = live.occupied(box)
+            assert (np.abs(occupied) <= [2.0, 2.0, 1.0]).all()
+            assert len(occupied)
+            everything = live.voxels("occupied")
+            assert not len(live.voxels("occupied", since=everything.change))
+            mapper.add(*drive()[0])
+            mapper.wait_applied()
+            assert len(live.voxels("occupied", since=everything.change)) == len(everything)
+        names = [name for name in os.listdir(one.shm_dir) if ".voxels." in name]
+        assert not names  # each was opened
+
+
+@pytest.mark.parametrize("label", LIVE_STEPS)
+def test_a_worker_killed_at_any_step_loses_nothing(
+    live_daemon: LiveDaemon, tmp_path: Path, label: str
+) -> None:
+    """The mapper notices nothing but a pause: what was not answered it sends again, and it counts once."""
+    scans = drive(10)
+    one = live_daemon(start=False)
+    one.environment["SHMMAP_TEST_CRASH"] = f"{label}:{3 if label == 'live.map' else 5}:{tmp_path}/reached"
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            for points, pose in scans:
+                mapper.add(points, pose)
+            mapper.wait_applied()
+            mapper.wait_durable()
+        assert held(live) == reference(scans)
+        assert held(live, "disk") == reference(scans)
+    assert (tmp_path / "reached").exists(), "the step was never reached"
+
+
+def test_a_daemon_killed_again_and_again_loses_nothing(live_daemon: LiveDaemon) -> None:
+    """Its worker dies with it; chunks in memory are found by the next, and the mapper goes on."""
+    scans = drive(12)
+    one = live_daemon(checkpoint=60.0)  # memory alone has what was applied
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            for number, (points, pose) in enumerate(scans):
+                mapper.add(points, pose)
+                if number % 4 == 2:
+                    one.kill()
+                    one.start()
+            mapper.wait_applied()
+            live = client.live("lidar")
+            assert held(live) == reference(scans)
+
+
+def test_a_killed_mapper_goes_on_with_numbers_that_nobody_had(live_daemon: LiveDaemon) -> None:
+    one = live_daemon()
+    scans = drive(4)
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        first = live.mapper("front", FILTER)
+        first.add(*scans[0])
+        first.wait_applied()
+        second = live.mapper("front", FILTER)  # as after a restart of the program; the first is a ghost
+        number = second.add(*scans[1])
+        assert number == 2
+        second.wait_applied()
+        first.add(*scans[2])
+        with pytest.raises(BadRequest, match="another program maps as 'front'"):
+            first.wait_applied()
+        first.close()
+        second.close()
+        assert held(live) == reference(scans[:2])
+
+
+def test_mappers_side_by_side(live_daemon: LiveDaemon) -> None:
+    """Each its own scans, into the same chunks or not; one sends no two into one voxel beyond the clamps."""
+    scans = drive(6)
+    far = [(points, pose + np.array([[0, 0, 0, 1e4]] + [[0.0] * 4] * 3)) for points, pose in scans]
+    one = live_daemon()
+
+    def work(name: str, mine: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        with shmmap.connect(one.endpoint) as client, client.live("lidar").mapper(name, FILTER) as mapper:
+            for points, pose in mine:
+                mapper.add(points, pose)
+            mapper.wait_applied()
+
+    threads = [
+        threading.Thread(target=work, args=("near", scans)), threading.Thread(target=work, args=("far", far))
+    ]  # fmt: skip
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        assert held(live) == reference([*scans, *far])
+        assert live.status().scans == 12
+
+
+def test_what_is_no_marks_is_refused_and_costs_only_its_sender(
+    live_daemon: LiveDaemon, tmp_path: Path
+) -> None:
+    one = live_daemon()
+    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
+        live = client.live("lidar")
+        session = client.session
+        opened = session.ask(lambda n: messages.LiveOpen(n, "lidar", "bad"), messages.LiveOpened)
+        directory, mine = Path(opened.marks_dir), f"{client.welcome.session:x}"
+        good = encode_marks(marked(1)[0], opened.map_id, opened.mapper, 1)
+
+        def send(name: str, nbytes: int, scan: int = 1) -> messages.LiveApplied:
+            return session.ask(
+                lambda n: messages.LiveScan(n, "lidar", opened.mapper, scan, name, nbytes, (0.0, 0.0, 0.0)),
+                messages.LiveApplied,
+            )
+
+        os.mkfifo(directory / f"{mine}.1")
+        (directory / f"{mine}.2").symlink_to("/etc/passwd")
+        (directory / f"{mine}.3").write_bytes(good[:-1])
+        (directory / f"{mine}.4").write_bytes(bytes(len(good)))
+        (directory / f"{mine}.5").mkdir()
+        (directory / f"{other.welcome.session:x}.6").write_bytes(good)
+        for name, nbytes, said in (
+            (f"{mine}.1", 10, "no regular file"),
+            (f"{mine}.2", 10, "cannot be opened"),
+            (f"{mine}.3", len(good), "has .* bytes, not"),
+            (f"{mine}.4", len(good), "something else"),
+            (f"{mine}.5", 10, "no regular file"),
+            (f"{mine}.7", 10, "cannot be opened"),
+            (f"{other.welcome.session:x}.6", len(good), "not a name that this session may use"),
+            ("../shmmap.toml", 10, "not a name"),
+            (f"{mine}.4", 1 << 40, "are the most"),
+        ):
+            with pytest.raises(BadRequest, match=said):
+                send(name, nbytes)
+        (directory / f"{mine}.8").write_bytes(good)
+        with pytest.raises(BadRequest, match="not scan 2"):
+            send(f"{mine}.8", len(good), scan=2)
+        assert send(f"{mine}.8", len(good)).scan == 1
+        assert held(live) == reference(drive(1))
+        with pytest.raises(BadRequest, match="no live map 'radar'"):
+            client.live("radar")
+        with pytest.raises(BadRequest, match="frame 'map', not 'odom'"):
+            client.live("lidar", frame_id="odom")
+    with shmmap.connect(one.endpoint) as client:  # their files are gone with their sessions
+        waiting = Patience()
+        while waiting(any(name.startswith(mine) for name in os.listdir(directory))):
+            client.live("lidar")
+
+
+def test_a_map_made_with_other_settings_is_refused_at_the_start(live_daemon: LiveDaemon) -> None:
+    live_daemon().stop()
+    other = live_daemon(resolution=0.5, start=False)
+    assert other.run_to_end() == ConfigError.exit_code
+    assert "resolution = 0.5: the map was made with 0.2" in other.log
+
+
+def test_a_daemon_without_live_maps_says_so(daemon: DaemonFactory, divided_map: object) -> None:
+    one = daemon(divided_map.root)  # type: ignore[attr-defined]
+    with shmmap.connect(one.endpoint) as client, pytest.raises(BadRequest, match="keeps no live maps"):
+        client.live("lidar")
+
+
+def test_requests_that_wait_when_the_worker_dies_are_told(live_daemon: LiveDaemon) -> None:
+    one = live_daemon()
+    with shmmap.connect(one.endpoint) as client:
+        client.live("lidar")
+        worker = worker_of(one)
+        os.kill(worker, signal.SIGSTOP)
+        asked = threading.Event()
+        told: list[Exception] = []
+
+        def ask() -> None:
+            asked.set()
+            try:
+                client.live("lidar")
+            except LiveInterrupted as error:
+                told.append(error)
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        asked.wait()
+        with shmmap.connect(one.endpoint) as second:
+            assert second.metadata() is not None  # nobody else waits for the worker
+        os.kill(worker, signal.SIGKILL)
+        thread.join()
+        waiting = Patience()
+        while waiting(True):
+            try:
+                client.live("lidar")
+                break
+            except LiveInterrupted:
+                continue
+        assert len(told) <= 1
