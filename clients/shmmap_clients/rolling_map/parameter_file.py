@@ -21,6 +21,7 @@ __all__ = ["Entry", "Value", "read_parameter_file"]
 Value: TypeAlias = bool | float | str | None
 
 _ROS: Final = "ros__parameters"
+_DEEPEST: Final = 16
 _MOST_BYTES: Final = 1 << 20  # a parameter file has a few hundred
 _TRUE: Final = frozenset({"true", "yes", "on", "y"})
 _FALSE: Final = frozenset({"false", "no", "off", "n"})
@@ -66,14 +67,12 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Entry]:
         raise ConfigError(f"{name}: larger than a parameter file ever is", origin=name)
     try:
         text = data.decode("utf-8")
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent):  # ROS 2 takes none either
-                raise yaml.MarkedYAMLError(problem="aliases are not read", problem_mark=event.start_mark)
+        _check_shape(text, name)
         root = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         raise ConfigError(f"{name}{line}: no YAML: {error.problem}", origin=f"{name}{line}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{name}: no YAML: {str(error).splitlines()[0]}", origin=name) from None
     if root is None:
         return {}
@@ -86,6 +85,19 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Entry]:
             )
         entries[key] = Entry(*_value(node), origin)
     return entries
+
+
+def _check_shape(text: str, name: str) -> None:
+    """Refuse what ROS 2 reads neither: aliases, and names very deep inside names, which would take long."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        mark = event.start_mark
+        if depth > _DEEPEST or isinstance(event, yaml.AliasEvent):
+            origin = f"{name}:{mark.line + 1}" if mark is not None else name
+            what = "nested too deeply" if depth > _DEEPEST else "aliases are not read"
+            raise ConfigError(f"{origin}: {what}", origin=origin)
 
 
 def _parameters(root: yaml.Node, name: str) -> yaml.Node:

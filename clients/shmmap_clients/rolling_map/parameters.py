@@ -100,6 +100,28 @@ class Parameters(msgspec.Struct, frozen=True):
             f"{', '.join(names)} ({reason})" for reason, names in by_reason.items()
         )
 
+    def check_map(self, name: str, resolution: float, frame_id: str, occupancy: Occupancy) -> None:
+        """Refuse a live map that is not as the file has it; what the file leaves out may be anything.
+
+        Raises
+        ------
+        ConfigError
+            It differs.
+        """
+        has = {"m_resolution": resolution, "map_frame": frame_id}
+        wants = {"m_resolution": self.live.resolution, "map_frame": self.live.frame_id}
+        for theirs, ours in _OCCUPANCY.items():
+            has[theirs], wants[theirs] = getattr(occupancy, ours), getattr(self.live.occupancy, ours)
+        for key, value in wants.items():
+            if key in self.origins and has[key] != value:
+                origin = self.origins[key]
+                raise ConfigError(
+                    f"{origin}: {key} is {value}, but the live map {name} has {has[key]}",
+                    key=key,
+                    origin=origin,
+                    hint="`shmmap-rolling config` says how the daemon makes a map as the file has it",
+                )
+
 
 def read_parameters(path: str | os.PathLike[str]) -> Parameters:
     """Read a parameter file of Rolling-Bonxai, version 1.
