@@ -160,7 +160,6 @@ class _View:
         left: float, top: float,
     ) -> None:  # fmt: skip
         self._axes = list(axes)
-        self._third = 3 - sum(axes)
         self._low, self._high = low[self._axes], high[self._axes]
         self._scale, self._left, self._top = scale, left, top
         self.bottom: float = top + float(self._high[1] - self._low[1]) * scale
@@ -215,7 +214,7 @@ class _View:
         return found
 
     def _voxels(self, content: MapContent, colours: HeightColours) -> str:
-        """The highest voxel of each column, or the southernmost; free ones only where none is occupied."""
+        """Of the voxels behind one another the highest; free ones only where none is occupied."""
         cells = [self._cells(voxels, content.resolution) for voxels in (content.free, content.occupied)]
         both = np.concatenate(cells)
         if not len(both):
@@ -227,8 +226,8 @@ class _View:
         image = np.zeros((rows, columns, 4), np.uint8)
         free, occupied = ((places - low) // coarse for places in cells)
         image[rows - 1 - free[:, 1], free[:, 0]] = _FREE
-        depth = content.occupied[:, self._third] * (1 if self._third == 2 else -1)
-        order = np.argsort(depth, kind="stable")  # of several values for one pixel, the last stays
+        # of several values for one pixel the last stays
+        order = np.argsort(content.occupied[:, 2], kind="stable")
         image[rows - 1 - occupied[order, 1], occupied[order, 0], :3] = colours.rgb(content.occupied[order, 2])
         image[rows - 1 - occupied[:, 1], occupied[:, 0], 3] = 255
         edge = content.resolution * coarse

@@ -226,14 +226,14 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_the_section_equals_the_file(read: Any) -> None:
-    live = read(OTHER + 'c_chunk_folder_path: "/maps/a \\"b\\" ö"\n').live
+    live = read(OTHER + 'c_chunk_folder_path: "/maps/a \\"b\\" ö😀"\n').live
     section = tomllib.loads(live_section("lidar", live))
     assert section == {
         "live": {
             "lidar": {
                 "resolution": 0.1, "frame_id": "odom", "hit": 0.8, "miss": 0.3, "clamp_min": 0.2,
                 "clamp_max": 0.9, "occupied_above": 0.5, "free_below": 0.5, "radius": 1,
-                "hysteresis": 0.0, "path": '/maps/a "b" ö',
+                "hysteresis": 0.0, "path": '/maps/a "b" ö😀',
             }
         }
     }  # fmt: skip

@@ -81,13 +81,6 @@ def test_heights_never_look_like_clean_or_dirty_chunks() -> None:
     assert colours.rgb(np.array([-1e9, 3.0, 1e9])).shape == (3, 3)
 
 
-def test_from_the_south_the_southernmost_is_in_front() -> None:
-    near, far = (3, -7, 2), (3, 8, 2)
-    content = MapContent(RESOLUTION, centers(near, far, (0, 0, 9), (0, 0, -9)))
-    _, (side, _) = images(drawn(content))
-    assert (side[7, 3, :3] == HeightColours.of(content.occupied[:, 2]).rgb(centers(near)[:, 2])[0]).all()
-
-
 @pytest.mark.parametrize("key", [(0, 0, 0), (-3, 2, -1)])
 def test_voxels_lie_in_their_chunk(key: tuple[int, int, int]) -> None:
     first = tuple(64 * part for part in key)
