@@ -17,6 +17,8 @@ import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from shmmap.chunks.occupancy import Occupancy
+    from shmmap.chunks.scan_filter import Counts, ScanFilter
     from shmmap.client import (
         Cell,
         CellInfo,
@@ -96,6 +98,7 @@ __all__ = [
     "Client",
     "ConfigError",
     "ConnectionLost",
+    "Counts",
     "DaemonUnreachable",
     "Departed",
     "EventStream",
@@ -119,6 +122,7 @@ __all__ = [
     "NoSocket",
     "NoSpace",
     "NotPermitted",
+    "Occupancy",
     "Offline",
     "OverBudget",
     "PackageMissing",
@@ -127,6 +131,7 @@ __all__ = [
     "ProtocolMismatch",
     "Retention",
     "RetentionPolicy",
+    "ScanFilter",
     "SegmentCorrupt",
     "SegmentError",
     "ShmmapError",
@@ -149,6 +154,7 @@ __all__ = [
 
 _GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
 _MESSAGES: Final = frozenset({"HeldCell", "Holder", "Intent"})
+_CHUNKS: Final = {"Counts": "scan_filter", "Occupancy": "occupancy", "ScanFilter": "scan_filter"}
 _LAYERS: Final = {
     "LayerKind": "contract",
     "LayerTable": "contract",
@@ -185,6 +191,8 @@ def __getattr__(name: str) -> Any:
         module = "shmmap.geometry"
     elif name in _MESSAGES:
         module = "shmmap.protocol.messages"
+    elif name in _CHUNKS:
+        module = f"shmmap.chunks.{_CHUNKS[name]}"
     elif name in _LAYERS:
         module = f"shmmap.layers.{_LAYERS[name]}"
     elif name == "read_cloud":

@@ -5,6 +5,7 @@ Pure: nothing here knows a daemon, a socket or a directory.  ``CHUNKS.md`` is th
 
 - `voxels`: which voxel, chunk and brick a point lies in
 - `occupancy`: what a hit and a miss are worth
+- `scan_filter`: which points of a scan count
 - `marking`: a scan becomes the lists of voxels that it hits and passes through
 - `marks`: these lists as bytes, from the mapper to the daemon's worker
 - `layout`: a chunk in shared memory

@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-import msgspec
 import numpy as np
 
 from shmmap.chunks import marking_kernels as kernels
 from shmmap.chunks.marks import MOST_CHUNKS, Marks
+from shmmap.chunks.scan_filter import Counts, ScanFilter
 from shmmap.chunks.voxels import CHUNK_SHIFT, CHUNK_SIDE, WORDS, voxel_indices
 from shmmap.errors import BadRequest, ConfigError
 
@@ -28,52 +28,6 @@ __all__ = ["Counts", "Marker", "ScanFilter"]
 FIRST_SLOTS: Final = 64
 MOST_REACH: Final = 64
 """Chunks from the sensor to the end of the longest ray; the window's table is then 9 MB."""
-
-
-class ScanFilter(msgspec.Struct, frozen=True):
-    """Which points of a scan count; metres, in the sensor's frame.
-
-    The defaults are those of Rolling-Bonxai's parameter file.
-
-    Attributes
-    ----------
-    min_range, max_range
-        Nearer points are left out; rays to further ones are cut at ``max_range`` and end in nothing.
-    min_z, max_z
-        Points below and above are left out.
-
-    Raises
-    ------
-    ConfigError
-        Nothing lies between two of them, or one is no finite number.
-    """
-
-    min_range: float = 0.5
-    max_range: float = 5.0
-    min_z: float = -2.0
-    max_z: float = 2.0
-
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
-            if not math.isfinite(value):
-                raise ConfigError(f"{name} = {value!r}: need a finite number of metres", key=name)
-        if self.min_range < 0.0:
-            raise ConfigError(f"min_range = {self.min_range!r}: it must not be negative", key="min_range")
-        for least, most in (("min_range", "max_range"), ("min_z", "max_z")):
-            low, high = getattr(self, least), getattr(self, most)
-            if not low < high:
-                raise ConfigError(f"{most} = {high!r}: need more than {least} = {low!r}", key=most)
-
-
-class Counts(msgspec.Struct, frozen=True):
-    """What became of a scan's points: in range, cut at the greatest range, and left out for what reason."""
-
-    near: int
-    far: int
-    too_near: int
-    outside_z: int
-    not_finite: int
 
 
 class Marker:

@@ -17,6 +17,7 @@ from shmmap_clients.compare_map_filter.cli import main as compare
 from shmmap_clients.elevation_map.cli import main as elevation
 from shmmap_clients.ndt_scan_matcher.cli import main as ndt
 from shmmap_clients.pose_initializer.cli import main as pose_init
+from shmmap_clients.rolling_map.cli import main as rolling
 
 from shmmap import CannotWrite
 
@@ -94,6 +95,7 @@ PROGRAMS = {
     "compare_map_filter": (compare, ["apply"], ["follow"]),
     "elevation_map": (elevation, ["build"]),
     "pose_initializer": (pose_init, []),
+    "rolling_map": (rolling, ["run"]),
 }
 
 
@@ -138,9 +140,9 @@ def test_the_same_option_is_the_same_everywhere(
             with_daemon += "--instance" in options
             for name, said in options.items():
                 seen.setdefault(name, set()).add(said)
-    assert with_daemon == 4
+    assert with_daemon == 5
     # these differ in their defaults, or in what they are of
-    own = {"--thin", "--height", "--update-distance", "--wait", "--out", "--mask", "--pose"}
+    own = {"--thin", "--height", "--update-distance", "--wait", "--out", "--mask", "--pose", "--picture"}
     assert {name: said for name, said in seen.items() if len(said) > 1 and name not in own} == {}
 
 
@@ -154,6 +156,7 @@ def test_a_missing_package_is_one_clear_line(package: str, tmp_path: Path) -> No
         "compare_map_filter": ["apply", "--map", scan, "--scan", scan],
         "elevation_map": ["build", "--cache", str(tmp_path)],
         "pose_initializer": ["--scan", scan, "--pose", "0,0,0,0,0,0"],
+        "rolling_map": ["run", "--live", "lidar", "--scans", str(tmp_path)],
     }[package]
     code = (
         "import sys\nfor name in ('numba', 'xxhash', 'lzf', 'yaml', 'open3d', 'rich'):\n"

@@ -43,7 +43,10 @@ NEEDED = {
     "shmmap/_systemd/shmmap.toml",
     "shmmap/_systemd/system/shmmapd.service",
 }
-PROGRAMS = {"shmmap", "shmmapd", "shmmap-ndt", "shmmap-pose-init", "shmmap-compare", "shmmap-elevation"}
+PROGRAMS = {
+    *("shmmap", "shmmapd", "shmmap-ndt", "shmmap-pose-init", "shmmap-compare", "shmmap-elevation"),
+    "shmmap-rolling",
+}
 
 
 def tree() -> set[str]:

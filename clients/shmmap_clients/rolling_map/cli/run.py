@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap-rolling run``: map scan after scan into a live map of the daemon."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from typing import TYPE_CHECKING, Any, Final
+
+from shmmap_clients.command_line import (
+    add_allow_empty,
+    add_daemon_options,
+    add_json_option,
+    add_verb,
+    announce_scans,
+    complain,
+    connect,
+    nothing_found,
+    output_file,
+    print_json,
+    print_line,
+    seconds,
+    write_text,
+)
+from shmmap_clients.rolling_map.cli.map_options import (
+    add_filter_options,
+    add_params_option,
+    add_show_option,
+    parameters_from,
+    scan_filter_from,
+    shown_from,
+)
+from shmmap_clients.shared_options import add_quiet_option, add_scans_option
+
+if TYPE_CHECKING:
+    from shmmap_clients.rolling_map.live_interface import Live, Mapper
+    from shmmap_clients.rolling_map.parameters import Parameters, Shown
+    from shmmap_clients.rolling_map.statistics import DriveStatistics
+
+__all__ = ["add_parser", "run"]
+
+_NAME: Final = "shmmap-rolling"
+_EPILOG: Final = """\
+JSON (fields may be added, none is removed):
+  {"map", "scans", "points",
+   "counts": {"near": in range, "far": beyond it, "too_near", "outside_z",
+              "not_finite": left out},
+   "first_scan", "last_scan": their numbers, or null,
+   "applied", "durable": number of the newest scan in memory, on the disk,
+   "add_ms": {"p50", "p99", "max"}, or null,
+   "usage": {"active": voxels that are known, "bytes", "chunks",
+             "waiting_bytes"},
+   "chunks": {state: how many}}
+
+Exit code: 0; 1 when there was no scan, no point of any scan counted, or the
+last scan was not on the disk after --wait."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "run",
+        run,
+        help="map scan after scan",
+        description="Map scan after scan into a live map of the daemon (`shmmap serve --live NAME`).  The"
+        " map's window follows the poses.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("--live", required=True, metavar="NAME", help="name of the live map")
+    add_scans_option(parser)
+    parser.add_argument(
+        "--poses",
+        metavar="FILE",
+        help="poses of the frame that the points are in, for the scans of a directory, TUM format; a"
+        " publisher's scans bring theirs",
+    )
+    add_params_option(parser)
+    parser.add_argument(
+        "--mapper",
+        default=_NAME,
+        metavar="NAME",
+        help=f"name under which scans are counted: each running program needs its own (default: {_NAME})",
+    )
+    parser.add_argument(
+        "--frame",
+        metavar="ID",
+        help="frame of the poses: another one than the map's is refused (default: as --params says, else the"
+        " map's)",
+    )
+    add_filter_options(parser)
+    out = parser.add_argument_group("output")
+    out.add_argument(
+        "--picture",
+        type=output_file,
+        metavar="FILE",
+        help="write an SVG of the map at the end",
+    )
+    add_show_option(out)
+    out.add_argument(
+        "--wait",
+        type=seconds,
+        default=30.0,
+        metavar="SECONDS",
+        help="how long to wait at the end until all scans are on the disk; 0: not at all (default: 30)",
+    )
+    add_quiet_option(out)
+    add_allow_empty(parser)
+    add_json_option(parser)
+    add_daemon_options(parser, json=False)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Map the scans to their end."""
+    from shmmap_clients.rolling_map.drive import map_drive
+    from shmmap_clients.rolling_map.statistics import DriveStatistics, usage_text
+    from shmmap_clients.scans.scan_source import open_scans
+
+    parameters = parameters_from(args)
+    shown = shown_from(args, parameters)
+    scan_filter = scan_filter_from(args, parameters)
+    statistics = DriveStatistics()
+    with contextlib.ExitStack() as stack:
+        scans = open_scans(args.scans, args.poses, stack)
+        client = stack.enter_context(connect(args, _NAME))
+        live: Live = client.live(args.live)  # type: ignore[attr-defined]
+        if parameters is not None:
+            parameters.check_map(live.name, live.resolution, live.frame_id, live.occupancy)
+        frame_id = _frame(args, parameters, live)
+        mapper: Mapper = live.mapper(args.mapper, scan_filter=scan_filter, frame_id=frame_id)
+        announce_scans(args)
+        for mapped in map_drive(scans, live, mapper):
+            statistics.add(mapped)
+            if not args.quiet:
+                usage = f"; {usage_text(live.usage())}" if shown.usage else ""
+                print_line(statistics.line(mapped) + usage, file=sys.stderr)
+        code = _settled(args, mapper, statistics)
+        if args.picture:
+            _draw(args, live, shown, statistics)
+        _report(args, live, mapper, statistics)
+    return code
+
+
+def _frame(args: argparse.Namespace, parameters: Parameters | None, live: Live) -> str:
+    if args.frame is not None:
+        return str(args.frame)
+    if parameters is not None and "map_frame" in parameters.origins:
+        return parameters.live.frame_id
+    return live.frame_id
+
+
+def _settled(args: argparse.Namespace, mapper: Mapper, statistics: DriveStatistics) -> int:
+    """Wait until everything is in memory and on the disk; returns the exit code."""
+    from shmmap import NoAnswer
+
+    last = statistics.last
+    if last is None:
+        return nothing_found(args, f"no scan came from {args.scans}", name=_NAME)
+    if args.wait > 0:
+        with contextlib.suppress(NoAnswer):  # what is missing is told below
+            mapper.wait_durable(args.wait)
+        if mapper.durable < last:
+            missing = f"scan {last} is not on the disk after {args.wait:g} s, but scan {mapper.durable}"
+            complain(_NAME, missing, "the daemon goes on; `shmmap live show` says how far it is")
+            return 1
+    if not statistics.counted:
+        why = f"of {statistics.points} points {statistics.left_out}" if statistics.points else "none had any"
+        return nothing_found(args, f"no point of any scan counted: {why}", name=_NAME)
+    return 0
+
+
+def _draw(args: argparse.Namespace, live: Live, shown: Shown, statistics: DriveStatistics) -> None:
+    import numpy as np
+
+    from shmmap_clients.rolling_map.picture import MapContent, map_picture
+    from shmmap_clients.rolling_map.statistics import usage_text
+
+    nothing = np.empty((0, 3))
+    content = MapContent(
+        live.resolution,
+        live.occupied() if shown.occupied else nothing,
+        live.free() if shown.free else nothing,
+        live.chunks() if shown.chunks else (),
+        statistics.path,
+        usage_text(live.usage()) if shown.usage else "",
+    )
+    note = f"{statistics.scans} scans, voxels of {live.resolution:g} m, frame {live.frame_id}"
+    write_text(args.picture, map_picture(content, f"live map {live.name}", note))
+
+
+def _report(args: argparse.Namespace, live: Live, mapper: Mapper, statistics: DriveStatistics) -> None:
+    from collections import Counter
+
+    from shmmap_clients.rolling_map.statistics import states_text, usage_text
+
+    usage, chunks = live.usage(), live.chunks()
+    summary = statistics.summary(applied=mapper.applied, durable=mapper.durable)
+    if args.json:
+        fields = ("active", "bytes", "chunks", "waiting_bytes")
+        print_json(
+            {
+                "map": live.name,
+                **summary,
+                "usage": {name: getattr(usage, name) for name in fields},
+                "chunks": dict(Counter(row.state for row in chunks)),
+            }
+        )
+        return
+    times = summary["add_ms"]
+    spent = f"; {times['p50']:.1f} ms each (p99 {times['p99']:.1f})" if times else ""
+    left_out = f"; left out: {statistics.left_out}" if statistics.left_out else ""
+    print(
+        f"{statistics.scans} scans, {statistics.points} points, {statistics.counted} count{left_out}{spent}"
+    )
+    print(f"live map {live.name}: {usage_text(usage)}; {states_text(chunks)}")
