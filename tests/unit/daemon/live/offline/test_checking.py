@@ -150,22 +150,51 @@ def test_chunks_that_are_missing(tmp_path: Path) -> None:
     assert checked(tmp_path).good
 
 
+def save_newer(folder: Folder, path: Path) -> tuple[ChunkKey, int]:
+    """Save another state of a chunk, and list it; returns the chunk and that version."""
+    files = MapFiles(folder, SETTINGS)
+    key = ChunkKey.from_text(path.name.removesuffix(".chunk"))
+    version = files.rows[key].version + 5
+    view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
+    view.state["version"] = version
+    files.save(key, encode_chunk(view, "raw"))
+    files.write_manifest()
+    return key, version
+
+
 def test_a_chunk_of_which_only_an_older_state_is_there(tmp_path: Path) -> None:
     stored_drive(tmp_path)
     path = largest(tmp_path)
-    folder = Folder(tmp_path)
-    files = MapFiles(folder, SETTINGS)
-    key = ChunkKey.from_text(path.name.removesuffix(".chunk"))
-    version = files.rows[key].version
-    view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
-    view.state["version"] = version + 5
     old = path.read_bytes()
-    files.save(key, encode_chunk(view, "raw"))
-    files.write_manifest()
+    folder = Folder(tmp_path)
+    key, version = save_newer(folder, path)
     folder.close()
     path.write_bytes(old)
     (lost,) = checked(tmp_path).missing
-    assert (lost.chunk, lost.version, lost.found) == (key.text, version + 5, version)
+    assert (lost.chunk, lost.version, lost.found) == (key.text, version, version - 5)
+
+
+def test_a_chunk_that_is_saved_while_the_map_is_checked(tmp_path: Path) -> None:
+    """A newer state of it is listed then than was read: nothing is missing."""
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    folder = Folder(tmp_path)
+
+    class Saving(FolderToRead):
+        saved = False
+
+        def read(self, name: str, most: int = -1) -> bytes:
+            data = super().read(name, most)
+            if name == path.name and not self.saved:
+                self.saved = True
+                save_newer(folder, path)
+            return data
+
+    files = Saving(tmp_path)
+    assert check(files, str(tmp_path)).good
+    assert files.saved
+    files.close()
+    folder.close()
 
 
 def _remove(manifest: Path) -> None:

@@ -154,11 +154,13 @@ def test_others_read_the_ply_file(directory: Path) -> None:
 
 def test_voxels_that_are_neither(directory: Path) -> None:
     """With thresholds apart from a half some voxels are known, and neither occupied nor free."""
-    settings = MapSettings(RESOLUTION, Occupancy(occupied_above=0.6, free_below=0.35))
+    settings = MapSettings(RESOLUTION, Occupancy(occupied_above=0.65, free_below=0.35))
     voxels = stored_drive(directory, settings=settings)
     high, low = settings.occupancy.thresholds
     sure = {voxel: value for voxel, value in voxels.items() if value > high or value < low}
     assert 100 < len(sure) < len(voxels)
+    assert any(0 < value <= high for value in voxels.values())
+    assert any(low <= value < 0 for value in voxels.values())
     assert_are(exported(directory, "pcd", "both"), sure)
 
 
