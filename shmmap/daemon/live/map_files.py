@@ -22,8 +22,7 @@ import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, check_file, read_file_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
-from shmmap.daemon.live.map_record import (
+from shmmap.daemon.live.disk.map_record import (
     CHUNK,
     MANIFEST,
     MAP_FILE,
@@ -36,6 +35,7 @@ from shmmap.daemon.live.map_record import (
     read_map,
     write_rows,
 )
+from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
 from shmmap.errors import BadRequest, ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log

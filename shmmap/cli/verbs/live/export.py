@@ -15,7 +15,7 @@ from shmmap.cli.verbs.divide import metres, translation
 from shmmap.cli.verbs.live.directory import add_directory, directory_from
 
 if TYPE_CHECKING:
-    from shmmap.daemon.live.offline.exporting import ExportedVoxels, Format
+    from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format
 
 __all__ = ["add_parser", "run"]
 
@@ -75,8 +75,8 @@ def run(args: argparse.Namespace) -> int:
     """Export, and say what came out."""
     import time
 
-    from shmmap.daemon.live.offline.exporting import export
-    from shmmap.daemon.live.offline.stored_map import StoredMap, opened_folder_to_read
+    from shmmap.daemon.live.disk.exporting import export
+    from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
 
     path = directory_from(args)
     began_s = time.monotonic()

@@ -13,10 +13,10 @@ import pytest
 from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.checking import CheckedMap, check, repair
+from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
 from shmmap.daemon.live.folder import Folder, FolderToRead
 from shmmap.daemon.live.map_files import MapFiles
-from shmmap.daemon.live.offline.checking import CheckedMap, check, repair
-from shmmap.daemon.live.offline.stored_map import opened_folder, opened_folder_to_read
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 from tests.support.live_drive import SETTINGS
 from tests.support.stored_live_map import contents, stored_drive

@@ -20,7 +20,7 @@ from shmmap.chunks.chunk_file import ChunkFileHeader
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.occupancy import UNIT
 from shmmap.chunks.voxels import ChunkKey, voxel_centers, voxels_of
-from shmmap.daemon.live.offline.stored_map import StoredMap
+from shmmap.daemon.live.disk.stored_map import StoredMap
 from shmmap.dividing.divide import divide
 from shmmap.dividing.frame import Frame, Translation, frame_between
 from shmmap.dividing.inputs import check_output_directory

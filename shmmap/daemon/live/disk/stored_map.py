@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, decode_chunk, read_file_header
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, read_map
 from shmmap.daemon.live.folder import DAMAGED, FilesToRead, Folder, FolderToRead
-from shmmap.daemon.live.map_record import CHUNK, MAP_FILE, read_map
 from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
 
 __all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]

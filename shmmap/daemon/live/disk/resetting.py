@@ -8,8 +8,8 @@ from itertools import count
 
 import msgspec
 
+from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, MAP_FILE
 from shmmap.daemon.live.folder import DAMAGED, INTERIM, Folder, FolderToRead
-from shmmap.daemon.live.map_record import CHUNK, MANIFEST, MAP_FILE
 from shmmap.formats.durable_file import flush_directory
 
 __all__ = ["ResetMap", "files_of_map", "reset"]

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from shmmap.chunks.occupancy import Occupancy, probability
+from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format, Voxels, export
+from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.map_files import MapSettings
-from shmmap.daemon.live.offline.exporting import ExportedVoxels, Format, Voxels, export
-from shmmap.daemon.live.offline.stored_map import StoredMap, opened_folder_to_read
 from shmmap.dividing.frame import Translation
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.open3d_reader import read_with_open3d

@@ -8,9 +8,9 @@ from typing import Literal
 import msgspec
 
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, Manifest, Row, write_rows
+from shmmap.daemon.live.disk.stored_map import StoredMap
 from shmmap.daemon.live.folder import INTERIM, Files, FilesToRead, keep_aside
-from shmmap.daemon.live.map_record import CHUNK, MANIFEST, Manifest, Row, write_rows
-from shmmap.daemon.live.offline.stored_map import StoredMap
 from shmmap.errors import BadRequest, MapDataError
 
 __all__ = ["CheckedMap", "DamagedFile", "MissingChunk", "check", "repair"]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.daemon.live.disk.checking import check
+from shmmap.daemon.live.disk.resetting import reset
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.map_files import MapFiles
-from shmmap.daemon.live.offline.checking import check
-from shmmap.daemon.live.offline.resetting import reset
 from tests.support.live_drive import SETTINGS
 from tests.support.stored_live_map import contents, stored_drive
 
