@@ -15,7 +15,7 @@ import msgspec
 
 from shmmap.errors import ConfigError
 
-__all__ = ["Occupancy", "log_odds", "probability"]
+__all__ = ["UNIT", "Occupancy", "log_odds", "probability"]
 
 UNIT: Final = 1000
 HARDLY: Final = 1e-9

@@ -18,6 +18,7 @@ VERBS: Final = {
     "divide": "divide",
     "merge": "merge",
     "prepare": "prepare",
+    "live": "live.group",
     "serve": "serve",
     "status": "status",
     "ls": "ls",

@@ -23,7 +23,7 @@ from shmmap.dividing.sources import Bound3, Source
 from shmmap.errors import MapDataError
 from shmmap.formats.finite import Bounds
 
-__all__ = ["FLOAT32_REACH_M", "Frame", "Translation", "choose_frame"]
+__all__ = ["FLOAT32_REACH_M", "Frame", "Translation", "choose_frame", "frame_between"]
 
 FLOAT32_REACH_M: Final = 16384.0
 """Below, rounding to float32 moves a coordinate by less than half a millimetre."""
@@ -117,15 +117,26 @@ def choose_frame(
     before
         With ``auto``, the move to prefer where float32 is precise enough with it.
     """
-    single, double = np.dtype(np.float32), np.dtype(np.float64)
     if row["x"].itemsize == 4 and not isinstance(translation, tuple):
-        return Frame(NO_MOVE, single)
-    low, high = _source_bounds(sources)
+        return Frame(NO_MOVE, np.dtype(np.float32))
+    return frame_between(_source_bounds(sources), row["x"], lattice, translation, before)
+
+
+def frame_between(
+    bounds: Bound3,
+    axis: np.dtype[np.floating],
+    lattice: CellLattice,
+    translation: Translation,
+    before: tuple[float, float, float] | None = None,
+) -> Frame:
+    """Choose as `choose_frame` does, for points of a type between the least and greatest coordinates."""
+    single, double = np.dtype(np.float32), np.dtype(np.float64)
+    low, high = bounds
     if not np.isfinite(low).all():
         return Frame(NO_MOVE if isinstance(translation, str) else translation, single)
     if isinstance(translation, tuple):
         reach = _reach(low, high, translation)
-        if reach < FLOAT32_REACH_M or (row["x"].itemsize == 4 and reach <= _reach(low, high, NO_MOVE)):
+        if reach < FLOAT32_REACH_M or (axis.itemsize == 4 and reach <= _reach(low, high, NO_MOVE)):
             return Frame(translation, single)
         return Frame(translation, double, (_kept_note(reach),))
     reach = _reach(low, high, NO_MOVE)
@@ -138,11 +149,11 @@ def choose_frame(
         return Frame(NO_MOVE, double, (_kept_note(reach),))
     step = lattice.common_step()
     move = [0.0, 0.0, 0.0]
-    for axis in range(3):
-        if max(abs(low[axis]), abs(high[axis])) >= FLOAT32_REACH_M:
-            unit = step if axis < 2 else Fraction(1)
+    for number in range(3):
+        if max(abs(low[number]), abs(high[number])) >= FLOAT32_REACH_M:
+            unit = step if number < 2 else Fraction(1)
             # exactly, rounded once: a multiple of a size with decimals keeps as few of them
-            move[axis] = 0.0 - float(round((low[axis] + high[axis]) / 2 / float(unit)) * unit)
+            move[number] = 0.0 - float(round((low[number] + high[number]) / 2 / float(unit)) * unit)
     x, y, z = move
     moved = _reach(low, high, (x, y, z))
     if moved >= FLOAT32_REACH_M:

@@ -17,8 +17,9 @@ MAP_ID = bytes(range(16))
 class ChunkMemory:
     """A map's chunks by key, each as long as its bricks, and their writer."""
 
-    def __init__(self, resolution: float, occupancy: Occupancy | None = None) -> None:
+    def __init__(self, resolution: float, occupancy: Occupancy | None = None, map_id: bytes = MAP_ID) -> None:
         self.resolution = resolution
+        self.map_id = map_id
         self.occupancy = occupancy if occupancy is not None else Occupancy()
         self.chunks: dict[ChunkKey, ChunkView] = {}
         self.undo = UndoRecord(bytearray(UNDO_BYTES))
@@ -29,7 +30,7 @@ class ChunkMemory:
         if key not in self.chunks:
             _, _, low, high = self.occupancy.steps
             identity = ChunkIdentity(
-                MAP_ID, key, self.resolution, low, high, *self.occupancy.thresholds, 1, "map"
+                self.map_id, key, self.resolution, low, high, *self.occupancy.thresholds, 1, "map"
             )
             self.chunks[key] = ChunkView(new_header(identity))
         return self.chunks[key]

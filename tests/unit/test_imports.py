@@ -74,8 +74,8 @@ PARTS = {
     },
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
-        "segment", "service", "statistics", "daemon.config", "daemon.config_file", "daemon.main",
-        "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
+        "segment", "service", "statistics", "daemon.config", "daemon.config_file", "daemon.live.disk",
+        "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip
 """What stands below what; a dotted name allows that module or package alone."""

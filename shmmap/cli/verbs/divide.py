@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from shmmap.dividing.frame import Translation
     from shmmap.dividing.report import DividedMap
 
-__all__ = ["add_parser", "run"]
+__all__ = ["add_parser", "metres", "run", "translation"]
 
 _EPILOG = """\
 IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb) or a directory
@@ -46,7 +46,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("out", metavar="OUT", help="the map directory to make")
     cells = parser.add_argument_group("cells")
     cells.add_argument(
-        "--cell-size", metavar="METRES", type=_metres, default=20.0, help="side of a cell (default: 20)"
+        "--cell-size", metavar="METRES", type=metres, default=20.0, help="side of a cell (default: 20)"
     )
     cells.add_argument(
         "--origin",
@@ -60,7 +60,7 @@ def add_parser(subparsers: Subparsers) -> None:
     points.add_argument(
         "--translate",
         metavar="X,Y,Z|auto|none",
-        type=_translation,
+        type=translation,
         default="auto",
         help="added to every point; auto (the default) shifts float64 and LAS clouds to the origin if "
         "float32 would lose more than 0.5 mm where they are, as `serve` does with a cloud; none keeps their "
@@ -69,7 +69,7 @@ def add_parser(subparsers: Subparsers) -> None:
     points.add_argument(
         "--leaf",
         metavar="METRES",
-        type=_metres,
+        type=metres,
         default=0.0,
         help="thin out: one point, the mean, for each voxel of this side",
     )
@@ -150,14 +150,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _metres(text: str) -> float:
+def metres(text: str) -> float:
+    """Read a length in metres."""
     try:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected metres, not {text!r}") from None
 
 
-def _translation(text: str) -> Translation:
+def translation(text: str) -> Translation:
+    """Read what is to be added to points."""
     if text == "auto":
         return "auto"
     if text == "none":

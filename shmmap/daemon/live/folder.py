@@ -7,16 +7,34 @@ a power cut may leave either as it was, or, of a file, any part of it.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
-from typing import Protocol
+import secrets
+from itertools import count
+from typing import Final, Protocol
 
 from shmmap.errors import InstanceBusy
+from shmmap.failpoints import step
 
-__all__ = ["Files", "Folder"]
+__all__ = [
+    "DAMAGED",
+    "INTERIM",
+    "Files",
+    "FilesToRead",
+    "Folder",
+    "FolderToRead",
+    "keep_aside",
+    "replace_file",
+]
+
+INTERIM: Final = ".tmp"
+"""How the name of a file ends that has not got its own yet; it begins with a dot."""
+DAMAGED: Final = ".damaged."
+"""What stands between the name that a file had and a number when it was put aside."""
 
 
-class Files(Protocol):
+class FilesToRead(Protocol):
     """Files in one directory, by name."""
 
     def names(self) -> list[str]:
@@ -27,6 +45,10 @@ class Files(Protocol):
 
     def read(self, name: str, most: int = -1) -> bytes:
         """The first ``most`` bytes of a file, or all."""
+
+
+class Files(FilesToRead, Protocol):
+    """Files that may be changed, too."""
 
     def write(self, name: str, data: bytes) -> None:
         """Make a file of a new name."""
@@ -44,34 +66,48 @@ class Files(Protocol):
         """Have all names on the disk as they are now."""
 
 
-class Folder:
-    """Files of a directory that nobody else works with: there is a lock on it while this lives.
+def replace_file(files: Files, name: str, data: bytes) -> None:
+    """Put a file, which is on the disk, in the place of what has its name; `sync_names` makes that last."""
+    interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
+    try:
+        files.write(interim, data)
+        step("live.written")
+        files.sync(interim)
+        step("live.synced")
+        files.rename(interim, name)
+        step("live.renamed")
+    except OSError:
+        with contextlib.suppress(OSError):
+            files.remove(interim)
+        raise
+
+
+def keep_aside(files: Files, name: str) -> str:
+    """Give a damaged file another name, which is on the disk when this returns it."""
+    taken = set(files.names())
+    aside = next(one for number in count(1) if (one := f"{name}{DAMAGED}{number}") not in taken)
+    files.rename(name, aside)
+    files.sync_names()
+    return aside
+
+
+class FolderToRead:
+    """Files of a directory with which somebody else may be working: each is whole, as it was at a moment.
 
     Parameters
     ----------
     path
-        Made if it is missing, for this user alone.
+        The directory.
 
     Raises
     ------
-    InstanceBusy
-        Somebody else has it open.
     OSError
-        It cannot be made or opened.
+        It cannot be opened.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
-        os.makedirs(self.path, mode=0o700, exist_ok=True)
         self._fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(self._fd)
-            raise InstanceBusy(
-                f"another process works with the live map in {self.path}",
-                hint="stop it, or choose another directory",
-            ) from None
 
     def close(self) -> None:
         """Let others have it."""
@@ -92,6 +128,35 @@ class Folder:
         """The first ``most`` bytes of a file, or all."""
         with open(self._open(name, os.O_RDONLY), "rb") as file:
             return file.read(most)
+
+
+class Folder(FolderToRead):
+    """Files of a directory that nobody else works with: there is a lock on it while this lives.
+
+    Parameters
+    ----------
+    path
+        Made if it is missing, for this user alone.
+
+    Raises
+    ------
+    InstanceBusy
+        Somebody else has it open.
+    OSError
+        It cannot be made or opened.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        os.makedirs(path, mode=0o700, exist_ok=True)
+        super().__init__(path)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._fd)
+            raise InstanceBusy(
+                f"another process works with the live map in {self.path}",
+                hint="stop it, or choose another directory",
+            ) from None
 
     def write(self, name: str, data: bytes) -> None:
         """Make a file of a new name."""

@@ -117,12 +117,7 @@ class LiveMap:
 
     def identity(self, key: ChunkKey, generation: int) -> ChunkIdentity:
         """What a chunk of this map says of itself."""
-        settings = self.files.settings
-        _, _, low, high = settings.occupancy.steps
-        return ChunkIdentity(
-            self.files.map_id, key, settings.resolution, low, high, *settings.occupancy.thresholds,
-            generation, settings.frame_id,
-        )  # fmt: skip
+        return self.files.settings.identity(self.files.map_id, key, generation)
 
     # --- what comes -----------------------------------------------------------------------------
 

@@ -21,81 +21,29 @@ from typing import Final
 import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, check_file, read_file_header
-from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.folder import Files
+from shmmap.daemon.live.disk.map_record import (
+    CHUNK,
+    MANIFEST,
+    MAP_FILE,
+    MAP_FORMAT,
+    Manifest,
+    Mapper,
+    MapRecord,
+    MapSettings,
+    Row,
+    read_map,
+    write_rows,
+)
+from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
 from shmmap.errors import BadRequest, ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 
 __all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
 
-MAP_FILE: Final = "map.json"
-MANIFEST: Final = "manifest.json"
-MAP_FORMAT: Final = 1
 SCANS_AHEAD: Final = 256
 """Numbers of scans that ``map.json`` leaves to a mapper before it is written again."""
-
-_CHUNK: Final = ".chunk"
-_DAMAGED: Final = ".chunk.damaged."
-_INTERIM: Final = ".tmp"
-
-
-class MapSettings(msgspec.Struct, frozen=True):
-    """What is fixed when a map is made.
-
-    Attributes
-    ----------
-    resolution
-        Edge of a voxel, metres.
-    occupancy
-        What a hit and a miss are worth.
-    frame_id
-        Frame of the map.
-    """
-
-    resolution: float = 0.05
-    occupancy: Occupancy = Occupancy()
-    frame_id: str = "map"
-
-
-class Mapper(msgspec.Struct):
-    """Who maps: a user and the name that a program of theirs chose.
-
-    Attributes
-    ----------
-    number
-        Stands for it in chunks, and is never given to another.
-    scans
-        All scans that it sent have smaller numbers; true on disk before one is applied.
-    """
-
-    number: int
-    uid: int
-    name: str
-    scans: int = 0
-
-
-class Row(msgspec.Struct, frozen=True):
-    """What is known of a chunk's file without opening it."""
-
-    version: int
-    bytes: int
-    active: int
-    occupied: int
-    free: int
-    bricks: int
-
-
-class _MapFile(msgspec.Struct):
-    """``map.json``."""
-
-    format: int
-    map_id: str
-    settings: MapSettings
-    mappers: list[Mapper] = []
-    next_mapper: int = 1
-    lives: int = 0
 
 
 class MapFiles:
@@ -137,13 +85,13 @@ class MapFiles:
         names = files.names()
         if MAP_FILE in names:
             self._map = self._read_map(settings)
-        elif any(name.endswith(_CHUNK) for name in names):
+        elif any(name.endswith(CHUNK) for name in names):
             raise MapDataError(
                 "there are chunks, but the file that says what they are is missing",
                 path=MAP_FILE, hint="choose another directory, or bring the file back",
             )  # fmt: skip
         else:
-            self._map = _MapFile(MAP_FORMAT, secrets.token_hex(16), settings)
+            self._map = MapRecord(MAP_FORMAT, secrets.token_hex(16), settings)
             self._write_map()
         self._adopt_interim(names)
         self._read_rows()
@@ -190,14 +138,8 @@ class MapFiles:
             mapper.scans = scan + SCANS_AHEAD
             self._write_map()
 
-    def _read_map(self, settings: MapSettings) -> _MapFile:
-        try:
-            found = msgspec.json.decode(self.files.read(MAP_FILE), type=_MapFile)
-            bytes.fromhex(found.map_id)
-        except (msgspec.MsgspecError, ValueError, ConfigError) as error:
-            raise MapDataError(f"it does not say what the map is: {error}", path=MAP_FILE) from error
-        if found.format != MAP_FORMAT or len(found.map_id) != 32:
-            raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
+    def _read_map(self, settings: MapSettings) -> MapRecord:
+        found = read_map(self.files)
         old_ones, new_ones = _flat(found.settings), _flat(settings)
         for name, new in new_ones.items():
             if (old := old_ones[name]) != new:
@@ -208,7 +150,8 @@ class MapFiles:
         return found
 
     def _write_map(self) -> None:
-        self._replace(MAP_FILE, msgspec.json.format(msgspec.json.encode(self._map), indent=1) + b"\n")
+        text = msgspec.json.format(msgspec.json.encode(self._map), indent=1)
+        replace_file(self.files, MAP_FILE, text + b"\n")
         self.files.sync_names()
         step("live.map")
 
@@ -223,16 +166,11 @@ class MapFiles:
         """Read the file of a chunk; None where there is none.  Raises OSError."""
         if key not in self.rows:
             return None
-        return self.files.read(key.text + _CHUNK)
+        return self.files.read(key.text + CHUNK)
 
     def put_aside(self, key: ChunkKey, why: str) -> str:
         """Keep a file that cannot be read under another name, which is returned."""
-        taken = set(self.files.names())
-        number = 1
-        while (name := f"{key.text}{_DAMAGED}{number}") in taken:
-            number += 1
-        self.files.rename(key.text + _CHUNK, name)
-        self.files.sync_names()
+        name = keep_aside(self.files, key.text + CHUNK)
         self.rows.pop(key, None)
         self.damaged[name] = why
         log.error("chunk put aside", chunk=key.text, file=name, reason=why)
@@ -244,8 +182,8 @@ class MapFiles:
         When this returns, the chunk's memory may be freed: no death of a process loses it.
         """
         header = read_file_header(data)
-        self._replace(key.text + _CHUNK, data)
-        self.rows[key] = _row(header, len(data))
+        replace_file(self.files, key.text + CHUNK, data)
+        self.rows[key] = Row.of(header)
         self._unflushed = True
 
     def flush(self) -> None:
@@ -263,23 +201,7 @@ class MapFiles:
     def write_manifest(self) -> None:
         """Make durable what was saved, and list it."""
         self.flush()
-        rows = {key.text: row for key, row in dict(self.rows).items()}
-        self._replace(MANIFEST, msgspec.json.encode({"format": MAP_FORMAT, "chunks": rows}))
-        self.files.sync_names()
-
-    def _replace(self, name: str, data: bytes) -> None:
-        interim = f".{name}.{secrets.token_hex(4)}{_INTERIM}"
-        try:
-            self.files.write(interim, data)
-            step("live.written")
-            self.files.sync(interim)
-            step("live.synced")
-            self.files.rename(interim, name)
-            step("live.renamed")
-        except OSError:
-            with contextlib.suppress(OSError):
-                self.files.remove(interim)
-            raise
+        write_rows(self.files, dict(self.rows))
 
     # --- the start ------------------------------------------------------------------------------
 
@@ -298,11 +220,11 @@ class MapFiles:
     def _adopt_interim(self, names: list[str]) -> None:
         """A file that was written and had not got its name may be the newest of its chunk; others go."""
         for name in names:
-            if not (name.startswith(".") and name.endswith(_INTERIM)):
+            if not (name.startswith(".") and name.endswith(INTERIM)):
                 continue
             header = self._header(name, whole=True)
             if header is not None:
-                place = header.key.text + _CHUNK
+                place = header.key.text + CHUNK
                 old = self._header(place)
                 if name.startswith(f".{place}.") and (old is None or old.version < header.version):
                     if old is None and place in names:
@@ -316,10 +238,10 @@ class MapFiles:
         """Find the chunks, and what is missing of those that the manifest lists."""
         names = self.files.names()
         for name in names:
-            if not name.endswith(_CHUNK):
+            if not name.endswith(CHUNK):
                 continue
             try:
-                key = ChunkKey.from_text(name.removesuffix(_CHUNK))
+                key = ChunkKey.from_text(name.removesuffix(CHUNK))
             except BadRequest:
                 log.warning("not a chunk of this map", file=name)
                 continue
@@ -327,12 +249,12 @@ class MapFiles:
             if header is None or header.key != key:
                 self.put_aside(key, "its header or its length is wrong")
             else:
-                self.rows[key] = _row(header, FILE_HEADER_BYTES + header.stored_bytes)
+                self.rows[key] = Row.of(header)
         self.flush()
         listed: dict[str, Row] = {}
         if MANIFEST in names:
             with contextlib.suppress(msgspec.MsgspecError):  # it is written anew
-                listed = msgspec.json.decode(self.files.read(MANIFEST), type=_Manifest).chunks
+                listed = msgspec.json.decode(self.files.read(MANIFEST), type=Manifest).chunks
         for text, row in listed.items():
             with contextlib.suppress(BadRequest):
                 key = ChunkKey.from_text(text)
@@ -345,14 +267,3 @@ def _flat(settings: MapSettings) -> dict[str, object]:
     """All settings by name, those of the occupancy among them."""
     found = msgspec.structs.asdict(settings)
     return {**msgspec.structs.asdict(found.pop("occupancy")), **found}
-
-
-class _Manifest(msgspec.Struct):
-    """``manifest.json``."""
-
-    format: int
-    chunks: dict[str, Row]
-
-
-def _row(header: ChunkFileHeader, nbytes: int) -> Row:
-    return Row(header.version, nbytes, header.active, header.occupied, header.free, header.bricks)

@@ -19,7 +19,7 @@ CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evic
 CONTRACT += ["pin", "unpin", "stop"]
 CONTRACT += ["config", "unit", "doctor"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
-CONTRACT += ["divide", "merge", "prepare"]
+CONTRACT += ["divide", "merge", "prepare", "live"]
 CONTRACT += ["top", "tail", "map", "metrics"]
 
 

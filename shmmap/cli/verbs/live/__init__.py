@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap live``: one module an action."""

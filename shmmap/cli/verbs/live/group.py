@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap live``: what is done with live maps."""
+
+from __future__ import annotations
+
+from shmmap.cli.options import Subparsers, add_verb
+from shmmap.cli.verbs.live import export, fsck, reset
+
+__all__ = ["add_parser"]
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "live",
+        fsck.run,
+        help="check, export or reset a live map",
+        description="Look after live maps: what programs map while they drive.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    for action in (fsck, export, reset):
+        action.add_parser(actions)

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The voxels of a live map's files as a cloud, or as a divided map that can be served.
+
+A point lies in the middle of its voxel.  Its ``intensity`` is the probability that the voxel is occupied.
+Chunks are read and written one by one.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from typing import Any, Final, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.chunks.chunk_file import ChunkFileHeader
+from shmmap.chunks.layout import ChunkView
+from shmmap.chunks.occupancy import UNIT
+from shmmap.chunks.voxels import ChunkKey, voxel_centers, voxels_of
+from shmmap.daemon.live.disk.stored_map import StoredMap
+from shmmap.dividing.divide import divide
+from shmmap.dividing.frame import Frame, Translation, frame_between
+from shmmap.dividing.inputs import check_output_directory
+from shmmap.dividing.lattice import CellLattice
+from shmmap.dividing.settings import DivideSettings
+from shmmap.errors import BadRequest
+from shmmap.formats.durable_file import appearing_file, writing_errors
+from shmmap.formats.pcd.writer import pcd_header
+from shmmap.formats.ply_writer import ply_header
+
+__all__ = ["ExportedVoxels", "Format", "Voxels", "export"]
+
+Format = Literal["ply", "pcd", "map"]
+Voxels = Literal["occupied", "free", "both"]
+
+_MOST_POINTS: Final = (1 << 32) - 1  # of a PCD file
+_INTENSITY: Final = "intensity"
+
+
+class ExportedVoxels(msgspec.Struct, frozen=True):
+    """What was written.
+
+    Attributes
+    ----------
+    path, format
+        Where, and as what.
+    voxels, chunks
+        How many voxels, of how many chunks that have some.
+    cells
+        Of a divided map, else 0.
+    resolution, frame_id
+        Edge of a voxel, metres; frame of the live map.
+    origin
+        To be added to a point to come back to that frame, metres.
+    fields
+        Names and dtypes of what each point has.
+    aside
+        Files that are left out because they were put aside before.
+    """
+
+    path: str
+    format: Format
+    voxels: int
+    chunks: int
+    cells: int
+    resolution: float
+    frame_id: str
+    origin: tuple[float, float, float]
+    fields: list[tuple[str, str]]
+    aside: list[str]
+
+
+def export(
+    stored: StoredMap,
+    out: str | os.PathLike[str],
+    kind: Format,
+    *,
+    voxels: Voxels = "occupied",
+    translate: Translation = "auto",
+    cell_size: float = 20.0,
+    force: bool = False,
+) -> ExportedVoxels | None:
+    """Write voxels to ``out``, which appears complete or not at all; None if there is none to write.
+
+    Parameters
+    ----------
+    stored
+        The live map; a daemon may be working with it.
+    voxels
+        Which ones; those that are known and neither occupied nor free are left out.
+    translate
+        As in `DivideSettings`.
+    cell_size
+        Of a divided map, metres.
+    force
+        Replace what is there; in the place of a directory only a divided map.
+
+    Raises
+    ------
+    BadRequest
+        There is something at ``out``, or a setting makes no sense.
+    MapDataError
+        A chunk's file is damaged.
+    CannotWrite
+        The disk is full or not writable.
+    """
+    path = os.path.abspath(out)
+    lattice = CellLattice.of(cell_size)
+    if kind == "map":
+        check_output_directory(path, force=force)
+    elif os.path.isdir(path) or (os.path.lexists(path) and not force):
+        raise BadRequest(f"{path} exists", hint="give another name, or --force to overwrite a file")
+    keys = _keys(stored, voxels)
+    if not keys:
+        return None
+    frame = frame_between(
+        _bounds(keys, stored.settings.resolution),
+        np.dtype(np.float64),
+        lattice,
+        "none" if kind == "map" else translate,  # dividing translates, and writes down by what
+    )
+    if kind == "map":
+        return _export_map(stored, path, keys, voxels, frame, translate, cell_size, force)
+    with writing_errors(path):
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        count, chunks = _write_cloud(stored, path, kind, keys, voxels, frame, replace=force)
+    return _exported(stored, path, kind, count, chunks, 0, frame.origin, _row(frame))
+
+
+def _export_map(
+    stored: StoredMap,
+    path: str,
+    keys: list[ChunkKey],
+    voxels: Voxels,
+    frame: Frame,
+    translate: Translation,
+    cell_size: float,
+    force: bool,
+) -> ExportedVoxels:
+    parent, name = os.path.split(path)
+    with writing_errors(path):
+        os.makedirs(parent, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{name}.voxels-", dir=parent) as scratch:
+            cloud = os.path.join(scratch, f"{os.path.basename(stored.path) or 'live'}.pcd")
+            count, chunks = _write_cloud(stored, cloud, "pcd", keys, voxels, frame, replace=False)
+            settings = DivideSettings(cell_size=cell_size, translate=translate, force=force)
+            made = divide([cloud], path, settings)
+    row = np.dtype([(field, dtype) for field, dtype in made.fields])
+    return _exported(stored, path, "map", count, chunks, made.cells, made.origin, row)
+
+
+def _exported(
+    stored: StoredMap,
+    path: str,
+    kind: Format,
+    count: int,
+    chunks: int,
+    cells: int,
+    origin: tuple[float, float, float],
+    row: np.dtype[np.void],
+) -> ExportedVoxels:
+    return ExportedVoxels(
+        path=path,
+        format=kind,
+        voxels=count,
+        chunks=chunks,
+        cells=cells,
+        resolution=stored.settings.resolution,
+        frame_id=stored.settings.frame_id,
+        origin=origin,
+        fields=[(name, row[name].str) for name in row.names or ()],
+        aside=stored.aside,
+    )
+
+
+# --- which voxels -----------------------------------------------------------------------------------
+
+
+def _keys(stored: StoredMap, voxels: Voxels) -> list[ChunkKey]:
+    """The chunks that have such voxels, by what their files say without being read whole."""
+
+    def has_some(header: ChunkFileHeader) -> bool:
+        counted = {
+            "occupied": header.occupied,
+            "free": header.free,
+            "both": header.occupied + header.free,
+        }
+        return counted[voxels] > 0
+
+    return [key for key in stored.chunks if has_some(stored.header(key))]
+
+
+def _bounds(keys: list[ChunkKey], resolution: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    boxes = np.array([key.box(resolution) for key in keys])
+    return boxes[:, :3].min(axis=0), boxes[:, 3:].max(axis=0)
+
+
+def _row(frame: Frame) -> np.dtype[np.void]:
+    return np.dtype([*((axis, frame.axis) for axis in "xyz"), (_INTENSITY, np.dtype("<f4"))])
+
+
+def _points(
+    key: ChunkKey, view: ChunkView, resolution: float, voxels: Voxels, frame: Frame
+) -> NDArray[np.void]:
+    """The voxels of a chunk, in the order of their places."""
+    identity = view.identity
+    log_odds = view.dense()
+    chosen = np.zeros(len(log_odds), bool)
+    if voxels != "free":
+        chosen |= log_odds > identity.occupied_above
+    if voxels != "occupied":
+        chosen |= log_odds < identity.free_below
+    places = np.flatnonzero(chosen)
+    centers = voxel_centers(voxels_of(key, places), resolution)
+    points = np.empty(len(places), _row(frame))
+    for number, axis in enumerate("xyz"):
+        points[axis] = centers[:, number] + frame.move[number]
+    points[_INTENSITY] = 1.0 / (1.0 + np.exp(log_odds[places] / -float(UNIT)))
+    return points
+
+
+# --- files ------------------------------------------------------------------------------------------
+
+
+def _write_cloud(
+    stored: StoredMap,
+    path: str,
+    kind: Format,
+    keys: list[ChunkKey],
+    voxels: Voxels,
+    frame: Frame,
+    *,
+    replace: bool,
+) -> tuple[int, int]:
+    """Write a file; returns how many voxels it has, and of how many chunks.
+
+    Its header says how many there are, and is written last, in the room that was left for it.
+    """
+    header = _header_of(kind, _row(frame), stored, frame)
+    room = len(header(_MOST_POINTS, 0))
+    count = chunks = 0
+    with appearing_file(path, replace=replace) as file:
+        file.write(bytes(room))
+        for key in keys:
+            _, view = stored.chunk(key)
+            points = _points(key, view, stored.settings.resolution, voxels, frame)
+            file.write(points.view(np.uint8).data)
+            count += len(points)
+            chunks += len(points) > 0
+        file.seek(0)
+        file.write(header(count, room))
+    return count, chunks
+
+
+def _header_of(
+    kind: Format, row: np.dtype[np.void], stored: StoredMap, frame: Frame
+) -> Callable[[int, int], bytes]:
+    """What makes a header, by the number of points and its own length."""
+    fields: list[tuple[str, np.dtype[Any]]] = [(name, row[name]) for name in row.names or ()]
+    if kind == "ply":
+        origin = " ".join(f"{part:.17g}" for part in frame.origin)
+        comment = f"voxels of {stored.settings.resolution:.17g} m, origin {origin}"
+        return lambda count, room: ply_header(fields, count, comment=comment, header_bytes=room)
+    counted = [(name, dtype, 1) for name, dtype in fields]
+    return lambda count, room: pcd_header(counted, count, "binary", header_bytes=room)

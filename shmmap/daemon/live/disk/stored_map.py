@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live map as its files have it, read without changing anything.
+
+A daemon may be working with it meanwhile: each file is replaced as a whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+
+from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, decode_chunk, read_file_header
+from shmmap.chunks.layout import ChunkView
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, read_map
+from shmmap.daemon.live.folder import DAMAGED, FilesToRead, Folder, FolderToRead
+from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
+
+__all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]
+
+
+class StoredMap:
+    """What a live map is, and its chunks one by one.
+
+    Parameters
+    ----------
+    files
+        Of its directory.
+    path
+        What errors call the directory.
+
+    Attributes
+    ----------
+    map_id, settings
+        As ``map.json`` has them.
+    chunks : dict
+        The files of chunks by key, in the order of the keys.
+    strange : list
+        Files that are called as those of chunks are, but for a chunk that cannot be.
+    aside : list
+        Files that were put aside, because they could not be read.
+
+    Raises
+    ------
+    MapDataError
+        ``map.json`` is not what it should be.
+    """
+
+    def __init__(self, files: FilesToRead, path: str) -> None:
+        self.files = files
+        self.path = path
+        try:
+            record = read_map(files)
+        except MapDataError as error:
+            raise MapDataError(
+                error.message,
+                path=path,
+                hint="bring the file back from a copy; or have `shmmap live reset` put the whole map aside",
+            ) from error
+        self.map_id = bytes.fromhex(record.map_id)
+        self.settings = record.settings
+        self.names = sorted(files.names())
+        self.strange: list[str] = []
+        found: dict[ChunkKey, str] = {}
+        for name in self.names:
+            if name.endswith(CHUNK):
+                try:
+                    found[ChunkKey.from_text(name.removesuffix(CHUNK))] = name
+                except BadRequest:
+                    self.strange.append(name)
+        self.chunks = dict(sorted(found.items()))
+        self.aside = [name for name in self.names if CHUNK + DAMAGED in name]
+
+    def header(self, key: ChunkKey) -> ChunkFileHeader:
+        """What a file says of its chunk; raises as `chunk`."""
+        path = self.path_of(key)
+        with _reading(path):
+            return read_file_header(self.files.read(self.chunks[key], FILE_HEADER_BYTES), path)
+
+    def chunk(self, key: ChunkKey) -> tuple[ChunkFileHeader, ChunkView]:
+        """Read a chunk whole, and prove that it is as it was saved.
+
+        Raises
+        ------
+        MapDataError
+            It is not; or it cannot be read at all (cause ``unreadable``), or is not there any more (cause
+            ``missing``).
+        PackageMissing
+            The package for its codec is not installed.
+        """
+        path = self.path_of(key)
+        with _reading(path):
+            data = self.files.read(self.chunks[key])
+            view = ChunkView(decode_chunk(data, self.settings.identity(self.map_id, key, 0), path))
+            return read_file_header(data), view
+
+    def path_of(self, key: ChunkKey) -> str:
+        """Path of a chunk's file."""
+        return os.path.join(self.path, self.chunks[key])
+
+
+@contextlib.contextmanager
+def _reading(path: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        cause = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
+        raise MapDataError(f"it cannot be read: {error.strerror}", path=path, cause=cause) from error
+    except MapDataError as error:
+        error.hint = "`shmmap live fsck` finds all that is damaged, and puts it aside with --repair"
+        raise
+
+
+@contextlib.contextmanager
+def opened_folder_to_read(path: str) -> Iterator[FolderToRead]:
+    """The directory of a live map, which others may be changing.
+
+    Raises
+    ------
+    MapMissing
+        There is no live map, or it cannot be opened.
+    MapDataError
+        There are chunks, but nothing that says what they are.
+    """
+    folder = _opened(path)
+    with contextlib.closing(folder):
+        yield folder
+
+
+@contextlib.contextmanager
+def opened_folder(path: str, hint: str) -> Iterator[Folder]:
+    """The directory of a live map, for this process alone; ``hint`` says what to do if it is not.
+
+    Raises
+    ------
+    InstanceBusy
+        Somebody works with it.
+    MapMissing, MapDataError
+        As `opened_folder_to_read`.
+    """
+    _opened(path).close()  # a lock on what is no live map would make a directory
+    try:
+        folder = Folder(path)
+    except InstanceBusy as error:
+        raise InstanceBusy(error.message, hint=hint) from None
+    with contextlib.closing(folder):
+        yield folder
+
+
+def _opened(path: str) -> FolderToRead:
+    try:
+        folder = FolderToRead(path)
+    except (FileNotFoundError, NotADirectoryError):
+        raise MapMissing(f"there is no directory {path}", hint="name the directory of a live map") from None
+    except OSError as error:
+        raise MapMissing(
+            f"cannot open {path}: {error.strerror}", hint="the user whom the daemon runs as may, and root"
+        ) from error
+    names = folder.names()
+    if MAP_FILE in names:
+        return folder
+    folder.close()
+    if any(name.endswith(CHUNK) for name in names):
+        raise MapDataError(
+            f"there are chunks, but no {MAP_FILE} that says what they are",
+            path=path,
+            hint="bring the file back from a copy",
+        )
+    raise MapMissing(f"{path} is no live map: it has no {MAP_FILE}", hint="name the directory of a live map")

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A check of a live map finds whatever is not as it was written, and a repair destroys nothing."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from shmmap.chunks.chunk_file import encode_chunk
+from shmmap.chunks.layout import ChunkView, new_header
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.checking import CheckedMap, check, repair
+from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
+from shmmap.daemon.live.folder import Folder, FolderToRead
+from shmmap.daemon.live.map_files import MapFiles
+from shmmap.errors import InstanceBusy, MapDataError, MapMissing
+from tests.support.live_drive import SETTINGS
+from tests.support.stored_live_map import contents, stored_drive
+
+
+def checked(directory: Path) -> CheckedMap:
+    """Check a map as everybody may, who changes nothing."""
+    before = contents(directory)
+    with opened_folder_to_read(str(directory)) as files:
+        found = check(files, str(directory))
+    assert contents(directory) == before
+    return found
+
+
+def repaired(directory: Path) -> CheckedMap:
+    with opened_folder(str(directory), "") as folder:
+        found = check(folder, str(directory))
+        repair(folder, found)
+    return found
+
+
+def largest(directory: Path) -> Path:
+    return max(directory.glob("*.chunk"), key=lambda path: path.stat().st_size)
+
+
+@pytest.mark.parametrize("codec", ["raw", "zlib"])
+def test_a_good_map(tmp_path: Path, codec: str) -> None:
+    voxels = stored_drive(tmp_path, codec=codec)
+    found = checked(tmp_path)
+    assert found.good
+    assert found.manifest == "current"
+    assert found.total("active") == len(voxels)
+    assert found.total("occupied") == sum(value > 0 for value in voxels.values())
+    assert found.total("free") == sum(value < 0 for value in voxels.values())
+    files = list(tmp_path.glob("*.chunk"))
+    assert len(found.rows) == len(files) > 5
+    assert found.total("bytes") == sum(path.stat().st_size for path in files)
+    assert (found.resolution, found.frame_id) == (0.2, "map")
+    assert [*found.interim, *found.aside, *found.strange, *found.unreadable] == []
+    before = contents(tmp_path)
+    assert repaired(tmp_path).good
+    assert contents(tmp_path) == before
+
+
+def assert_found_and_put_aside(directory: Path, path: Path, damaged: bytes) -> None:
+    """The file is the only one that is damaged, and its bytes are kept."""
+    path.write_bytes(damaged)
+    found = repaired(directory)
+    assert [one.file for one in found.damaged] == [path.name]
+    assert not found.good
+    assert not path.exists()
+    kept = path.with_name(found.damaged[0].kept_as)
+    assert kept.read_bytes() == damaged
+    kept.unlink()
+
+
+def small_map(directory: Path) -> tuple[Path, bytes]:
+    """A map of one small chunk: its file, and what is in it."""
+    stored_drive(directory, 1)
+    keep = min(directory.glob("*.chunk"), key=lambda path: path.stat().st_size)
+    for path in directory.glob("*.chunk"):
+        if path != keep:
+            path.unlink()
+    return keep, keep.read_bytes()
+
+
+def test_a_file_that_was_cut_anywhere(tmp_path: Path) -> None:
+    path, whole = small_map(tmp_path)
+    for length in range(0, len(whole), 64):
+        assert_found_and_put_aside(tmp_path, path, whole[:length])
+    assert_found_and_put_aside(tmp_path, path, whole + b"\0")
+    path.write_bytes(whole)
+    assert not checked(tmp_path).damaged
+
+
+def test_a_file_with_one_bit_that_is_wrong(tmp_path: Path) -> None:
+    path, whole = small_map(tmp_path)
+    rng = random.Random(13)
+    for bit in [*range(0, 128 * 8, 5), *(rng.randrange(8 * len(whole)) for _ in range(200))]:
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert_found_and_put_aside(tmp_path, path, bytes(damaged))
+
+
+def test_a_file_that_contradicts_itself(tmp_path: Path) -> None:
+    """Its checksums are right, and its counters are not those of its voxels."""
+    path, _ = small_map(tmp_path)
+    files = MapFiles(folder := Folder(tmp_path), SETTINGS)
+    key = ChunkKey.from_text(path.name.removesuffix(".chunk"))
+    view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
+    view.state["active"] = 7
+    folder.close()
+    assert_found_and_put_aside(tmp_path, path, encode_chunk(view, "raw"))
+
+
+def test_a_file_of_another_chunk_or_map(tmp_path: Path) -> None:
+    stored_drive(tmp_path / "one")
+    stored_drive(tmp_path / "other")
+    first, second = sorted((tmp_path / "one").glob("*.chunk"))[:2]
+    assert_found_and_put_aside(tmp_path / "one", first, second.read_bytes())
+    assert_found_and_put_aside(tmp_path / "one", second, (tmp_path / "other" / second.name).read_bytes())
+
+
+def test_what_is_put_aside_never_takes_the_place_of_another(tmp_path: Path) -> None:
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    for number in (1, 2, 3):
+        path.write_bytes(b"%d" % number)
+        assert repaired(tmp_path).damaged[0].kept_as == f"{path.name}.damaged.{number}"
+    found = checked(tmp_path)
+    assert found.good
+    assert found.manifest == "current"
+    assert found.aside == [f"{path.name}.damaged.{number}" for number in (1, 2, 3)]
+    assert [(tmp_path / name).read_bytes() for name in found.aside] == [b"1", b"2", b"3"]
+    files = MapFiles(folder := Folder(tmp_path), SETTINGS)
+    assert files.rows == found.rows
+    assert not files.missing
+    folder.close()
+
+
+def test_chunks_that_are_missing(tmp_path: Path) -> None:
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    path.unlink()
+    key = path.name.removesuffix(".chunk")
+    (lost,) = checked(tmp_path).missing
+    assert (lost.chunk, lost.found) == (key, 0)
+    assert lost.version > 0
+    assert not checked(tmp_path).good
+    assert repaired(tmp_path).missing == [lost]
+    assert checked(tmp_path).good
+
+
+def save_newer(folder: Folder, path: Path) -> tuple[ChunkKey, int]:
+    """Save another state of a chunk, and list it; returns the chunk and that version."""
+    files = MapFiles(folder, SETTINGS)
+    key = ChunkKey.from_text(path.name.removesuffix(".chunk"))
+    version = files.rows[key].version + 5
+    view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
+    view.state["version"] = version
+    files.save(key, encode_chunk(view, "raw"))
+    files.write_manifest()
+    return key, version
+
+
+def test_a_chunk_of_which_only_an_older_state_is_there(tmp_path: Path) -> None:
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    old = path.read_bytes()
+    folder = Folder(tmp_path)
+    key, version = save_newer(folder, path)
+    folder.close()
+    path.write_bytes(old)
+    (lost,) = checked(tmp_path).missing
+    assert (lost.chunk, lost.version, lost.found) == (key.text, version, version - 5)
+
+
+def test_a_chunk_that_is_saved_while_the_map_is_checked(tmp_path: Path) -> None:
+    """A newer state of it is listed then than was read: nothing is missing."""
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    folder = Folder(tmp_path)
+
+    class Saving(FolderToRead):
+        saved = False
+
+        def read(self, name: str, most: int = -1) -> bytes:
+            data = super().read(name, most)
+            if name == path.name and not self.saved:
+                self.saved = True
+                save_newer(folder, path)
+            return data
+
+    files = Saving(tmp_path)
+    assert check(files, str(tmp_path)).good
+    assert files.saved
+    files.close()
+    folder.close()
+
+
+def _remove(manifest: Path) -> None:
+    manifest.unlink()
+
+
+def _spoil(manifest: Path) -> None:
+    manifest.write_bytes(manifest.read_bytes()[:-9])
+
+
+def _forget_one(manifest: Path) -> None:
+    folder = Folder(manifest.parent)
+    files = MapFiles(folder, SETTINGS)
+    files.rows.popitem()
+    files.write_manifest()
+    folder.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "manifest", "good"),
+    [(_remove, "absent", True), (_spoil, "unreadable", False), (_forget_one, "stale", True)],
+)
+def test_the_manifest(tmp_path: Path, change: Callable[[Path], None], manifest: str, good: bool) -> None:
+    stored_drive(tmp_path)
+    change(tmp_path / "manifest.json")
+    found = checked(tmp_path)
+    assert (found.manifest, found.good, found.rewritten) == (manifest, good, False)
+    assert repaired(tmp_path).rewritten
+    assert checked(tmp_path).manifest == "current"
+    assert checked(tmp_path).good
+
+
+def test_a_file_that_cannot_be_opened_is_not_taken_for_a_damaged_one(tmp_path: Path) -> None:
+    """It may be as good as ever: it stays, and the manifest that lists it."""
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to("elsewhere")
+    before = (tmp_path / "manifest.json").read_bytes()
+    found = repaired(tmp_path)
+    assert list(found.unreadable) == [path.name]
+    assert not found.good
+    assert [*found.damaged, *found.missing] == []
+    assert not found.rewritten
+    assert path.is_symlink()
+    assert (tmp_path / "manifest.json").read_bytes() == before
+
+
+def test_files_that_are_no_chunks(tmp_path: Path) -> None:
+    stored_drive(tmp_path)
+    names = [".0_0_0.chunk.abcd.tmp", "0_0.chunk", "9_9_9.chunk.damaged.1", "notes.txt"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"mine")
+    found = repaired(tmp_path)
+    assert found.good
+    assert (found.interim, found.strange, found.aside) == (names[:1], names[1:2], names[2:3])
+    assert all((tmp_path / name).read_bytes() == b"mine" for name in names)
+
+
+def test_what_is_no_live_map_stays_as_it_is(tmp_path: Path) -> None:
+    with pytest.raises(MapMissing, match="no directory"), opened_folder(str(tmp_path / "none"), ""):
+        pass
+    assert not (tmp_path / "none").exists()
+    with pytest.raises(MapMissing, match="no live map"), opened_folder(str(tmp_path), ""):
+        pass
+    (tmp_path / "0_0_0.chunk").write_bytes(b"x")
+    with pytest.raises(MapDataError, match="chunks, but no map"), opened_folder_to_read(str(tmp_path)):
+        pass
+    (tmp_path / "map.json").write_bytes(b"{")
+    with opened_folder_to_read(str(tmp_path)) as files, pytest.raises(MapDataError) as caught:
+        check(files, str(tmp_path))
+    assert str(tmp_path) in caught.value.message
+    assert "live reset" in caught.value.hint
+    assert contents(tmp_path) == {"0_0_0.chunk": b"x", "map.json": b"{"}
+
+
+def test_somebody_works_with_it(tmp_path: Path) -> None:
+    stored_drive(tmp_path)
+    folder = Folder(tmp_path)
+    with pytest.raises(InstanceBusy) as caught, opened_folder(str(tmp_path), "do this"):
+        pass
+    assert caught.value.hint == "do this"
+    assert checked(tmp_path).good
+    folder.close()
+    with opened_folder(str(tmp_path), ""), pytest.raises(InstanceBusy):
+        Folder(tmp_path)
+
+
+def test_a_file_that_goes_while_the_map_is_checked(tmp_path: Path) -> None:
+    """A daemon has put it aside: it is missing, and not damaged."""
+    stored_drive(tmp_path)
+    gone = largest(tmp_path)
+
+    class Going(FolderToRead):
+        def names(self) -> list[str]:
+            names = super().names()
+            if gone.exists():
+                os.rename(gone, tmp_path / f"{gone.name}.damaged.1")
+            return names
+
+    files = Going(tmp_path)
+    found = check(files, str(tmp_path))
+    files.close()
+    assert [*found.damaged, *found.unreadable] == []
+    assert [lost.chunk for lost in found.missing] == [gone.name.removesuffix(".chunk")]
