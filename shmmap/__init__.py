@@ -36,6 +36,9 @@ if TYPE_CHECKING:
         WindowUpdate,
         connect,
     )
+    from shmmap.client.live.live_map import ChunkInfo, LiveMap, Sphere
+    from shmmap.client.live.mapper import LiveMapper
+    from shmmap.client.live.voxels import Voxels
     from shmmap.errors import (
         BadRequest,
         Busy,
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
         DaemonUnreachable,
         InstanceBusy,
         InternalError,
+        LiveInterrupted,
         LoadFailed,
         LoadTimeout,
         MapDataError,
@@ -78,6 +82,7 @@ if TYPE_CHECKING:
     from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
     from shmmap.optional_packages import needed_packages
+    from shmmap.protocol.live import LiveMapRow
     from shmmap.protocol.messages import HeldCell, Holder, Intent
 
 __version__ = "0.2.0"
@@ -94,6 +99,7 @@ __all__ = [
     "CellError",
     "CellInfo",
     "CellSet",
+    "ChunkInfo",
     "Circle",
     "Client",
     "ConfigError",
@@ -109,6 +115,10 @@ __all__ = [
     "InternalError",
     "LayerKind",
     "LayerTable",
+    "LiveInterrupted",
+    "LiveMap",
+    "LiveMapRow",
+    "LiveMapper",
     "LoadFailed",
     "LoadTimeout",
     "MapDataError",
@@ -136,9 +146,11 @@ __all__ = [
     "SegmentError",
     "ShmmapError",
     "SocketPermission",
+    "Sphere",
     "StaleHandle",
     "StaleSocket",
     "UnknownCell",
+    "Voxels",
     "WindowUpdate",
     "ZRange",
     "__version__",
@@ -155,6 +167,14 @@ __all__ = [
 _GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
 _MESSAGES: Final = frozenset({"HeldCell", "Holder", "Intent"})
 _CHUNKS: Final = {"Counts": "scan_filter", "Occupancy": "occupancy", "ScanFilter": "scan_filter"}
+_LIVE: Final = {
+    "ChunkInfo": "client.live.live_map",
+    "LiveMap": "client.live.live_map",
+    "LiveMapRow": "protocol.live",
+    "LiveMapper": "client.live.mapper",
+    "Sphere": "client.live.live_map",
+    "Voxels": "client.live.voxels",
+}
 _LAYERS: Final = {
     "LayerKind": "contract",
     "LayerTable": "contract",
@@ -193,6 +213,8 @@ def __getattr__(name: str) -> Any:
         module = "shmmap.protocol.messages"
     elif name in _CHUNKS:
         module = f"shmmap.chunks.{_CHUNKS[name]}"
+    elif name in _LIVE:
+        module = f"shmmap.{_LIVE[name]}"
     elif name in _LAYERS:
         module = f"shmmap.layers.{_LAYERS[name]}"
     elif name == "read_cloud":

@@ -232,6 +232,8 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
         The mapper's number, and the least that a new scan of it may have.
     most_marks_bytes
         The longest file of marks.
+    probabilities
+        The six that the log-odds stand for, as they were set.
     """
 
     request: int
@@ -251,6 +253,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     mapper: int = 0
     next_scan: int = 1
     most_marks_bytes: int = 0
+    probabilities: tuple[float, ...] = ()
 
 
 class LiveApplied(msgspec.Struct, array_like=True, tag="live_applied"):

@@ -7,8 +7,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from shmmap import BadRequest, Counts
-from shmmap_clients.rolling_map.live_interface import Live, Mapper
+from shmmap import BadRequest, Counts, LiveMapper
 from shmmap_clients.scans.scan_sequence import Scan
 
 __all__ = ["MappedScan", "map_drive"]
@@ -39,15 +38,15 @@ class MappedScan:
     add_s: float
 
 
-def map_drive(scans: Iterable[Scan], live: Live, mapper: Mapper) -> Iterator[MappedScan]:
+def map_drive(scans: Iterable[Scan], mapper: LiveMapper) -> Iterator[MappedScan]:
     """Map scan after scan.
 
     Parameters
     ----------
     scans
         With poses.
-    live, mapper
-        The map, and what sends scans to it.
+    mapper
+        What sends scans to the map, whose window follows them.
 
     Raises
     ------
@@ -61,7 +60,6 @@ def map_drive(scans: Iterable[Scan], live: Live, mapper: Mapper) -> Iterator[Map
         if T is None:
             raise BadRequest(f"scan {scan.name} has no pose", hint="give poses with --poses FILE")
         begin_s = time.perf_counter()
-        live.move_to(*(float(value) for value in T[:3, 3]))
         number = mapper.add(scan.xyz, T)
         add_s = time.perf_counter() - begin_s
         yield MappedScan(scan, number, mapper.counts, max(0, number - mapper.applied), add_s)

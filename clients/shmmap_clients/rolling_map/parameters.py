@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from shmmap import ConfigError, Occupancy, ScanFilter
+from shmmap import ConfigError, Occupancy, ScanFilter, LiveMap
 from shmmap_clients.rolling_map.foreign_names import VERSION_2, is_version_2, version_2_advice
 from shmmap_clients.rolling_map.live_section import LiveSettings
 from shmmap_clients.rolling_map.parameter_file import Entry, Value, read_parameter_file
@@ -100,7 +100,7 @@ class Parameters(msgspec.Struct, frozen=True):
             f"{', '.join(names)} ({reason})" for reason, names in by_reason.items()
         )
 
-    def check_map(self, name: str, resolution: float, frame_id: str, occupancy: Occupancy) -> None:
+    def check_map(self, live: LiveMap) -> None:
         """Refuse a live map that is not as the file has it; what the file leaves out may be anything.
 
         Raises
@@ -108,15 +108,18 @@ class Parameters(msgspec.Struct, frozen=True):
         ConfigError
             It differs.
         """
-        has = {"m_resolution": resolution, "map_frame": frame_id}
-        wants = {"m_resolution": self.live.resolution, "map_frame": self.live.frame_id}
+        has: dict[str, float | str] = {"m_resolution": live.resolution, "map_frame": live.frame_id}
+        wants: dict[str, float | str] = {
+            "m_resolution": self.live.resolution, "map_frame": self.live.frame_id,
+        }  # fmt: skip
         for theirs, ours in _OCCUPANCY.items():
-            has[theirs], wants[theirs] = getattr(occupancy, ours), getattr(self.live.occupancy, ours)
+            wants[theirs] = getattr(self.live.occupancy, ours)
+            has[theirs] = getattr(live.occupancy, ours)
         for key, value in wants.items():
             if key in self.origins and has[key] != value:
                 origin = self.origins[key]
                 raise ConfigError(
-                    f"{origin}: {key} is {value}, but the live map {name} has {has[key]}",
+                    f"{origin}: {key} is {value}, but the live map {live.name} has {has[key]}",
                     key=key,
                     origin=origin,
                     hint="`shmmap-rolling config` says how the daemon makes a map as the file has it",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shmmap_clients.png import png_bytes
 from shmmap_clients.rolling_map.heights import HeightColours
-from shmmap_clients.rolling_map.live_interface import ChunkRow
+from shmmap import ChunkInfo
 from shmmap_clients.rolling_map.picture_legend import STATES, chunk_style, legend
 
 __all__ = ["MapContent", "map_picture"]
@@ -58,7 +58,7 @@ class MapContent:
     resolution: float
     occupied: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
     free: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
-    chunks: Sequence[ChunkRow] = ()
+    chunks: Sequence[ChunkInfo] = ()
     path: Sequence[tuple[float, float, float]] = ()
     usage: str = ""
 
@@ -136,7 +136,7 @@ def _extent(content: MapContent) -> tuple[NDArray[np.float64], NDArray[np.float6
     return low - air, high + air
 
 
-def _keys(chunks: Iterable[ChunkRow]) -> NDArray[np.int64]:
+def _keys(chunks: Iterable[ChunkInfo]) -> NDArray[np.int64]:
     return np.array([tuple(row.key) for row in chunks], np.int64).reshape(-1, 3)
 
 

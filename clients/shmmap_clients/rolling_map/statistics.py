@@ -10,7 +10,7 @@ from typing import Any
 from shmmap import Counts
 from shmmap_clients.decimation import Decimated
 from shmmap_clients.rolling_map.drive import MappedScan
-from shmmap_clients.rolling_map.live_interface import ChunkRow, Usage
+from shmmap import ChunkInfo, LiveMapRow
 from shmmap_clients.spread import RunningSpread
 
 __all__ = ["DriveStatistics", "states_text", "usage_text"]
@@ -86,14 +86,14 @@ class DriveStatistics:
         }
 
 
-def usage_text(usage: Usage) -> str:
+def usage_text(usage: LiveMapRow) -> str:
     """What a map takes, in words: 1 234 567 active cells, 12.3 MB, 27 chunks."""
     waiting = f", {usage.waiting_bytes / 1e6:.1f} MB waiting" if usage.waiting_bytes else ""
     active = f"{usage.active:,}".replace(",", " ")
     return f"{active} active cells, {usage.bytes / 1e6:.1f} MB, {usage.chunks} chunks{waiting}"
 
 
-def states_text(chunks: Sequence[ChunkRow]) -> str:
+def states_text(chunks: Sequence[ChunkInfo]) -> str:
     """How many chunks are in which state, in words; the most frequent first."""
     states = Counter(row.state for row in chunks)
     return ", ".join(f"{count} {state}" for state, count in states.most_common())

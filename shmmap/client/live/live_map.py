@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shmmap import geometry
+from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey, in_chunk, voxel_indices
 from shmmap.client.live.attached_chunk import AttachedChunk
 from shmmap.client.live.patience import until_served
@@ -113,6 +114,11 @@ class LiveMap:
         return until_served(
             lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
         )
+
+    @property
+    def occupancy(self) -> Occupancy:
+        """What a hit and a miss are worth, as it was set when the map was made."""
+        return Occupancy(*self._opened.probabilities)
 
     def __repr__(self) -> str:
         return f"<LiveMap {self.name}, voxels of {self.resolution} m in frame {self.frame_id}>"

@@ -17,6 +17,7 @@ from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.host.signals import StartSignals
+from shmmap.daemon.live.relay import NoLiveMaps
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
 from shmmap.daemon.map_in_memory import MapInMemory
@@ -61,7 +62,7 @@ class WholeDaemon:
         signals = cast("StartSignals", SimpleNamespace(keep=False, reload_wanted=False))
         reloader = Reloader(origin, lambda: self.memory.cache.catalogue)
         self.service = Service(
-            config, self.memory, reloader, ServiceManager(), path, -1, signals, activated=None
+            config, self.memory, NoLiveMaps(), reloader, ServiceManager(), path, -1, signals, activated=None
         )
         self.service._listen()
         self._context: zmq.Context[Any] = zmq.Context()

@@ -34,7 +34,7 @@ from shmmap_clients.rolling_map.cli.map_options import (
 from shmmap_clients.shared_options import add_quiet_option, add_scans_option
 
 if TYPE_CHECKING:
-    from shmmap_clients.rolling_map.live_interface import Live, Mapper
+    from shmmap import LiveMap, LiveMapper
     from shmmap_clients.rolling_map.parameters import Parameters, Shown
     from shmmap_clients.rolling_map.statistics import DriveStatistics
 
@@ -124,16 +124,15 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         scans = open_scans(args.scans, args.poses, stack)
         client = stack.enter_context(connect(args, _NAME))
-        live: Live = client.live(args.live)  # type: ignore[attr-defined]
+        live = client.live(args.live, frame_id=_frame(args, parameters))
         if parameters is not None:
-            parameters.check_map(live.name, live.resolution, live.frame_id, live.occupancy)
-        frame_id = _frame(args, parameters, live)
-        mapper: Mapper = live.mapper(args.mapper, scan_filter=scan_filter, frame_id=frame_id)
+            parameters.check_map(live)
+        mapper = stack.enter_context(live.mapper(args.mapper, scan_filter))
         announce_scans(args)
-        for mapped in map_drive(scans, live, mapper):
+        for mapped in map_drive(scans, mapper):
             statistics.add(mapped)
             if not args.quiet:
-                usage = f"; {usage_text(live.usage())}" if shown.usage else ""
+                usage = f"; {usage_text(live.status())}" if shown.usage else ""
                 print_line(statistics.line(mapped) + usage, file=sys.stderr)
         code = _settled(args, mapper, statistics)
         if args.picture:
@@ -142,15 +141,16 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _frame(args: argparse.Namespace, parameters: Parameters | None, live: Live) -> str:
+def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
+    """Frame of the poses; empty for the map's."""
     if args.frame is not None:
         return str(args.frame)
     if parameters is not None and "map_frame" in parameters.origins:
         return parameters.live.frame_id
-    return live.frame_id
+    return ""
 
 
-def _settled(args: argparse.Namespace, mapper: Mapper, statistics: DriveStatistics) -> int:
+def _settled(args: argparse.Namespace, mapper: LiveMapper, statistics: DriveStatistics) -> int:
     """Wait until everything is in memory and on the disk; returns the exit code."""
     from shmmap import NoAnswer
 
@@ -170,7 +170,7 @@ def _settled(args: argparse.Namespace, mapper: Mapper, statistics: DriveStatisti
     return 0
 
 
-def _draw(args: argparse.Namespace, live: Live, shown: Shown, statistics: DriveStatistics) -> None:
+def _draw(args: argparse.Namespace, live: LiveMap, shown: Shown, statistics: DriveStatistics) -> None:
     import numpy as np
 
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
@@ -181,20 +181,20 @@ def _draw(args: argparse.Namespace, live: Live, shown: Shown, statistics: DriveS
         live.resolution,
         live.occupied() if shown.occupied else nothing,
         live.free() if shown.free else nothing,
-        live.chunks() if shown.chunks else (),
+        live.chunks(saved=True) if shown.chunks else (),
         statistics.path,
-        usage_text(live.usage()) if shown.usage else "",
+        usage_text(live.status()) if shown.usage else "",
     )
     note = f"{statistics.scans} scans, voxels of {live.resolution:g} m, frame {live.frame_id}"
     write_text(args.picture, map_picture(content, f"live map {live.name}", note))
 
 
-def _report(args: argparse.Namespace, live: Live, mapper: Mapper, statistics: DriveStatistics) -> None:
+def _report(args: argparse.Namespace, live: LiveMap, mapper: LiveMapper, statistics: DriveStatistics) -> None:
     from collections import Counter
 
     from shmmap_clients.rolling_map.statistics import states_text, usage_text
 
-    usage, chunks = live.usage(), live.chunks()
+    usage, chunks = live.status(), live.chunks(saved=True)
     summary = statistics.summary(applied=mapper.applied, durable=mapper.durable)
     if args.json:
         fields = ("active", "bytes", "chunks", "waiting_bytes")

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
+import msgspec
+
 from shmmap.chunks.marks import decode_marks
 from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX, ChunkKey
 from shmmap.daemon.config_live import LiveSettings
@@ -130,6 +132,7 @@ class ServedMap:
         reply = messages.LiveOpened(
             message.request, live.files.map_id, fixed.resolution, fixed.frame_id, hit, miss, low, high, above,
             below, self._lists.path, live.memory.prefix, ask.session,
+            probabilities=msgspec.structs.astuple(fixed.occupancy),
         )  # fmt: skip
         if message.mapper:
             if not ask.maps:

@@ -93,8 +93,11 @@ def test_a_reader_sees_it_grow_and_keeps_what_is_given_up(memory: ChunkMemory, d
         assert list(memory.names()) == []
         assert int(seen.state["state"]) == OUT_OF_SERVICE
         assert int(seen.bricks[0, 0]) == 9
-        assert os.fstat(kept).st_nlink == 0
-        os.close(kept)
+        assert [key for key, _ in memory.given_up()] == [IDENTITY.key]
+        seen_by_kernel = kept.is_mapped
+        memory.forget(kept)
+        assert seen_by_kernel
+        assert not list(directory.iterdir())
 
 
 def test_who_may_read_it(directory: Path) -> None:

@@ -202,7 +202,7 @@ def test_very_much_is_let_go_in_parts(inner: Inner, made: DividedMap) -> None:
     assert len(session.held) == CELLS
     dispatch = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
     dispatch.cells = one.cells
-    work = dispatch._route(session.connection, Release(2, pack_versions(versions[1:]))) or ()
+    work = dispatch._route(session.connection, Release(2, pack_versions(versions[1:])), b"") or ()
     assert [len(session.held) for _ in work] == [CELLS - CELLS_A_STEP * part for part in range(1, PARTS)]
     assert list(session.held) == versions[:1]
     assert one.replies[-1][1].request == 2
