@@ -175,9 +175,7 @@ def built_octomap(folder: Path) -> Path | None:
         print("OctoMap: not measured, g++ is missing")
         return None
     command = ["g++", "-O3", "-march=native", "-std=c++17", str(source), "-o", str(program)]
-    done = subprocess.run(
-        [*command, "-loctomap", "-loctomath"], check=False, capture_output=True, text=True
-    )
+    done = subprocess.run([*command, "-loctomap", "-loctomath"], check=False, capture_output=True, text=True)
     if done.returncode:
         print(f"OctoMap: not measured, is liboctomap-dev installed? {done.stderr.splitlines()[0]}")
         return None
