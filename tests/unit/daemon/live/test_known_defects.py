@@ -7,10 +7,13 @@ and of adding evidence are in ``tests/unit/chunks/test_known_defects_of_marking.
 
 from __future__ import annotations
 
+import errno
+import os
 import tempfile
 import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -293,14 +296,30 @@ def test_reload_before_save(
     world = World(shm, folder := _HeldFolder(tmp_path), saves=100)
     world.send(marks, at)
     folder.goes_on.clear()
-    world.map.move("mapper", FAR_AWAY)
-    world.turn()
-    assert world.map.residency.saving == len(marks.keys), "all of it is on its way to the disk"
-    world.send(marks, at)
-    assert world.map.residency.saving == len(marks.keys), "and still is"
-    folder.goes_on.set()
+    try:
+        world.map.move("mapper", FAR_AWAY)
+        world.turn()
+        assert world.map.residency.saving == len(marks.keys), "all of it is on its way to the disk"
+        world.send(marks, at)
+        assert world.map.residency.saving == len(marks.keys), "and still is"
+    finally:
+        folder.goes_on.set()
     assert (world.voxels() == unbounded([marks, marks])) == right
     folder.close()
+
+
+@dataclass
+class _FullAtFirst(CutDisk):
+    """Has no room for the first three chunks that are written."""
+
+    failures: int = 3
+
+    def write(self, name: str, data: bytes) -> None:
+        if ".chunk." in name and self.failures:
+            self.failures -= 1
+            super().write(name, data[:100])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        super().write(name, data)
 
 
 class _StopsAtOnce(LiveMap):
@@ -321,10 +340,10 @@ class _LeavesWhatIsOnItsWay(LiveMap):
 def test_dirty_chunks_lost_at_exit(shm: Path, kind: type[LiveMap], *, right: bool) -> None:
     """v1 and v2: who stopped looked at the flag before the queue; 29 changed chunks, none of them written.
 
-    Here the machine goes off at that, too.
+    Here the disk is full for a while, and the machine goes off at the end.
     """
     marks, at = crossing()[0]
-    world = World(shm, disk := CutDisk(), kind)
+    world = World(shm, disk := _FullAtFirst(), kind)
     world.send(marks, at)
     world.until(lambda: world.map.all_durable, save_all=True)
     found = MapFiles(disk.after(lambda: False, lambda _size: 0), SETTINGS)
