@@ -134,7 +134,8 @@ class Ours:
     def close(self) -> None:
         """Remove all of it."""
         for chunk in self.chunks.values():
-            os.close(self._memory.give_up(chunk))
+            chunk.close()
+            self._memory.remove(chunk.name)
         self._memory.close()
         (self.folder / "undo").unlink()
 

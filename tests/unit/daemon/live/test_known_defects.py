@@ -221,7 +221,7 @@ def test_rays_lost_while_a_chunk_loads(driven: Callable[[type[LiveMap]], dict[Vo
 
 class _KeepsAll(LiveMap):
     def add(self, mapper: int, number: int, marks: Marks, nbytes: int) -> Scan:
-        self.__dict__.setdefault("kept", []).append(marks)
+        self.__dict__.setdefault("hoard", []).append(marks)
         return super().add(mapper, number, marks, nbytes)
 
 
