@@ -18,7 +18,6 @@ import numpy as np
 
 from shmmap.chunks import applying_kernels as kernels
 from shmmap.chunks.layout import (
-    BRICK_BYTES,
     HEADER_BYTES,
     MAPPERS,
     MOST_BYTES,
@@ -26,7 +25,7 @@ from shmmap.chunks.layout import (
     ChunkView,
 )
 from shmmap.chunks.occupancy import Occupancy
-from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.chunks.voxels import BRICK_VOXELS, BRICKS, ChunkKey
 from shmmap.errors import SegmentCorrupt
 from shmmap.failpoints import step
 
@@ -60,8 +59,8 @@ class UndoRecord:
         self._header: NDArray[np.uint8] = np.ndarray(
             (HEADER_BYTES,), np.uint8, self._data, _BODY_AT + 2 * BRICKS
         )
-        self._bricks: NDArray[np.uint8] = np.ndarray(
-            (BRICKS, BRICK_BYTES), np.uint8, self._data, _BODY_AT + 2 * BRICKS + HEADER_BYTES
+        self._bricks: NDArray[np.int16] = np.ndarray(
+            (BRICKS, BRICK_VOXELS), "<i2", self._data, _BODY_AT + 2 * BRICKS + HEADER_BYTES
         )
 
     @property
@@ -77,7 +76,8 @@ class UndoRecord:
         _UNDO.pack_into(self._data, 0, _MAGIC, 0, identity.generation, *identity.key, count)
         self._numbers[:count] = touched
         self._header[:] = view.data[:HEADER_BYTES]
-        self._bricks[:count] = view.bricks[touched - 1].view(np.uint8)
+        # nothing is clipped: in any other mode numpy copies twice
+        np.take(view.bricks, touched - 1, axis=0, out=self._bricks[:count], mode="clip")
         step("live.copied")
         kernels.begin_writing(self._in_force)
 
@@ -101,7 +101,7 @@ class UndoRecord:
         numbers = self._numbers[: min(count, BRICKS)]
         if count > BRICKS or bricks > len(view.bricks) or (numbers == 0).any() or (numbers > bricks).any():
             raise SegmentCorrupt("undo record: it is not one of this chunk")
-        view.bricks[numbers.astype(np.intp) - 1] = self._bricks[: len(numbers)].view("<i2")
+        view.bricks[numbers.astype(np.intp) - 1] = self._bricks[: len(numbers)]
         view.bricks[bricks:] = 0
         view.data[STATE_AT + 8 : HEADER_BYTES] = self._header[STATE_AT + 8 :].tobytes()
         kernels.end_writing(sequence)

@@ -101,6 +101,16 @@ def test_any_scan(
     assert_equal_to_the_slow_one(Marker(0.5, ScanFilter(0.0, 7.0, -9.0, 9.0)), scan, pose_at(sensor, yaw))
 
 
+def test_the_longest_rays() -> None:
+    """4000 steps along every axis, up and down, and to the middle between two voxels."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-40.0, 40.0, (24, 3))
+    points[np.arange(24), np.arange(24) % 3] = rng.choice([-40.0, 40.0], 24)
+    points[12:, :2] = np.sign(points[12:, :2]) * [40.0, 20.0]
+    marker = Marker(0.01, ScanFilter(0.5, 40.3, -99.0, 99.0))
+    assert_equal_to_the_slow_one(marker, points, pose_at((0.005, -0.005, 0.005)))
+
+
 def test_the_order_of_points_does_not_count() -> None:
     """A ray that is cut may end in a voxel that another one hits: in Bonxai whichever comes first counts."""
     marker = Marker(0.5, ScanFilter(0.0, 4.1, -9.0, 9.0))
