@@ -36,7 +36,8 @@ if TYPE_CHECKING:
         WindowUpdate,
         connect,
     )
-    from shmmap.client.live.live_map import ChunkInfo, LiveMap, Sphere
+    from shmmap.client.live.chunk_reader import ChunkInfo
+    from shmmap.client.live.live_map import LiveMap, Sphere
     from shmmap.client.live.mapper import LiveMapper
     from shmmap.client.live.voxels import Voxels
     from shmmap.errors import (
@@ -168,7 +169,7 @@ _GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange
 _MESSAGES: Final = frozenset({"HeldCell", "Holder", "Intent"})
 _CHUNKS: Final = {"Counts": "scan_filter", "Occupancy": "occupancy", "ScanFilter": "scan_filter"}
 _LIVE: Final = {
-    "ChunkInfo": "client.live.live_map",
+    "ChunkInfo": "client.live.chunk_reader",
     "LiveMap": "client.live.live_map",
     "LiveMapRow": "protocol.live",
     "LiveMapper": "client.live.mapper",

@@ -36,8 +36,7 @@
     ├── PackageMissing         a Python package is not installed                  exit 69
     └── InternalError          a defect in shmmap: please report it               exit 70
 
-``code`` is what travels on the wire, ``exit_code`` what the command line returns, ``hint`` what the
-reader can do about it.
+``code`` travels on the wire, the command line returns ``exit_code``, ``hint`` says what can be done.
 """
 
 from __future__ import annotations
@@ -90,10 +89,8 @@ class ShmmapError(Exception):
 
     Parameters
     ----------
-    message
-        What is wrong and where, in one sentence.
-    hint
-        What the reader can do about it; empty when there is nothing to add.
+    message, hint
+        What is wrong and where, in one sentence; and what the reader can do about it, if anything.
     """
 
     code: ClassVar[str] = "error"
@@ -135,10 +132,9 @@ class NoColumn(BadRequest, KeyError):
 
 
 class MapDataError(ShmmapError):
-    """A file, ``path``, is not what it claims to be.
+    """A file, ``path``, is not what it claims to be: at byte ``offset``, None where it has no place.
 
-    ``offset`` is the byte at which the contradiction was found, None where it has no place; ``cause`` is one
-    of a small set of names, for programs: ``truncated``, ``lfs_pointer``, ``zero_filled``, ...
+    ``cause`` is one of a small set of names, for programs: ``truncated``, ``zero_filled``, ...
     """
 
     code = "bad_map_data"
@@ -242,21 +238,17 @@ class NotPermitted(ShmmapError):
 
 
 class Busy(ShmmapError):
-    """The daemon has so many unanswered requests of this process that it takes no more: wait for some."""
+    """Too many requests of this process wait for their answers: wait for some."""
 
     code = "busy"
     exit_code = 75
 
 
 class LiveInterrupted(ShmmapError):
-    """The process that keeps live maps ended before it answered, and is started anew: send the same again.
-
-    Nothing that was answered is lost, and a scan that is sent again counts once.
-    """
+    """The process that keeps live maps ended before it answered: send the same again, it counts once."""
 
     code = "live_interrupted"
     exit_code = 75
-    advice = "ask again"
 
 
 class SegmentError(ShmmapError):
@@ -280,10 +272,9 @@ class SegmentCorrupt(SegmentError):
 
 
 class CellError(ShmmapError):
-    """One cell could not be had; other cells and requests are unaffected.
+    """One cell, ``cell_id``, ``layer``, could not be had; other cells and requests are unaffected.
 
-    ``cell_id`` and ``layer`` say which cell, and which of its layers; ``holders``, for `OverBudget`, who uses
-    the memory, a `Holder` each: ``str`` of one is a line to read.
+    ``holders``, for `OverBudget`, says who uses the memory; ``str`` of each is a line to read.
     """
 
     code = "cell_error"
@@ -350,12 +341,9 @@ class InternalError(ShmmapError):
     code = "internal"
 
 
-def _tree(root: type[ShmmapError]) -> dict[str, type[ShmmapError]]:
-    below = (_tree(child).items() for child in root.__subclasses__())
-    return {root.code: root, **dict(item for items in below for item in items)}
-
-
 def error_from_wire(code: str, message: str, hint: str = "") -> ShmmapError:
     """Return the error a daemon's reply describes; an unknown code becomes `ShmmapError`."""
-    kind = _tree(ShmmapError).get(code, ShmmapError)
-    return kind(message, hint=hint)
+    kinds: list[type[ShmmapError]] = [ShmmapError]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+    return next((kind for kind in kinds if kind.code == code), ShmmapError)(message, hint=hint)

@@ -54,7 +54,7 @@ PARTS = {
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},
     "client": {
-        "errors", "columns", "failpoints", "geometry", "optional_packages", "segment", "protocol",
+        "errors", "columns", "failpoints", "geometry", "optional_packages", "chunks", "segment", "protocol",
         "statistics.layout",
     },
     "daemon": BASE | {
@@ -82,7 +82,7 @@ PARTS = {
 ROOMS = [
     {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
     {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"map", "pins"},
-    {"host", "service_manager"}, {"config"}, {"config_file", "records"},
+    {"host", "service_manager"}, {"config"}, {"config_file", "config_live", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 MOST_MODULES = 12

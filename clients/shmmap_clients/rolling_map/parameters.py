@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from shmmap import ConfigError, Occupancy, ScanFilter, LiveMap
+from shmmap import ConfigError, LiveMap, Occupancy, ScanFilter
 from shmmap_clients.rolling_map.foreign_names import VERSION_2, is_version_2, version_2_advice
 from shmmap_clients.rolling_map.live_section import LiveSettings
 from shmmap_clients.rolling_map.parameter_file import Entry, Value, read_parameter_file

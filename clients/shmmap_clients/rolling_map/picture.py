@@ -13,9 +13,9 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap import ChunkInfo
 from shmmap_clients.png import png_bytes
 from shmmap_clients.rolling_map.heights import HeightColours
-from shmmap import ChunkInfo
 from shmmap_clients.rolling_map.picture_legend import STATES, chunk_style, legend
 
 __all__ = ["MapContent", "map_picture"]

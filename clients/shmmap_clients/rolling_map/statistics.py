@@ -7,10 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from shmmap import Counts
+from shmmap import ChunkInfo, Counts, LiveMapRow
 from shmmap_clients.decimation import Decimated
 from shmmap_clients.rolling_map.drive import MappedScan
-from shmmap import ChunkInfo, LiveMapRow
 from shmmap_clients.spread import RunningSpread
 
 __all__ = ["DriveStatistics", "states_text", "usage_text"]

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from shmmap import geometry
 from shmmap.chunks.occupancy import Occupancy
-from shmmap.chunks.voxels import ChunkKey, in_chunk, voxel_indices
-from shmmap.client.live.attached_chunk import AttachedChunk
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
 from shmmap.client.live.patience import until_served
 from shmmap.client.live.voxels import Voxels, open_voxels
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest, SegmentError, StaleHandle
+from shmmap.errors import BadRequest, StaleHandle
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage, area_to_message
 
@@ -33,11 +33,6 @@ R = TypeVar("R")
 LIST_S: Final = 60.0
 """How long putting voxels together may take, beside what any request may."""
 SAVE_S: Final = 300.0
-MOST_ATTACHED: Final = 512
-"""Chunks that are kept mapped; the longest unused go first."""
-VOXELS_AT_ONCE: Final = 1 << 20
-"""Of rays, that are looked up at a time."""
-_ROUNDS: Final = 4
 
 
 class Sphere(msgspec.Struct, frozen=True):
@@ -47,36 +42,6 @@ class Sphere(msgspec.Struct, frozen=True):
     y: float
     z: float
     radius: float
-
-
-class ChunkInfo(msgspec.Struct, frozen=True):
-    """One chunk of a live map.
-
-    Attributes
-    ----------
-    key
-        Which one.
-    state
-        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, or
-        ``saved``: on disk alone.
-    active, occupied, free
-        Known voxels, and of these occupied and free ones.
-    bytes
-        Its memory, or its file.
-    version
-        Rises with each scan that it takes in.
-    generation
-        Another one each time that it comes into memory; 0 where it is not.
-    """
-
-    key: ChunkKey
-    state: str
-    active: int
-    occupied: int
-    free: int
-    bytes: int
-    version: int
-    generation: int
 
 
 class LiveMap:
@@ -96,10 +61,8 @@ class LiveMap:
         self._session = session
         self.name = name
         self._frame_id = frame_id
-        self._chunks: dict[ChunkKey, AttachedChunk] = {}
-        self._rows: dict[ChunkKey, ChunkInfo] = {}
-        self._change = 0
         self._open()
+        self._reader = ChunkReader(self._place, lambda since: self._pages(None, since))
 
     def _open(self) -> None:
         self._opened = self._ask(
@@ -107,7 +70,6 @@ class LiveMap:
         )
         opened = self._opened
         self.map_id, self.resolution, self.frame_id = opened.map_id, opened.resolution, opened.frame_id
-        self._slot = self._session.welcome.session
 
     def _ask(self, make: Callable[[int], messages.LiveRequest], kind: type[R], *, quiet_s: float = 0.0) -> R:
         """Send a request; again if the process that keeps live maps is started anew."""
@@ -216,30 +178,12 @@ class LiveMap:
                 return found, gone, change, known
             after = page.rows[-1].key
 
-    def _refresh(self) -> None:
-        """Learn which chunks are in memory now."""
-        rows, gone, change, known = self._pages(None, self._change)
-        if not known or not self._change:
-            self._rows = rows
-        else:
-            for key in gone:
-                self._rows.pop(key, None)
-            self._rows.update(rows)
-        self._change = change
-
-    def _attached(self, key: ChunkKey) -> AttachedChunk | None:
-        """A chunk in memory, mapped; None where there is none."""
-        row = self._rows.get(key)
-        mapped = self._chunks.pop(key, None)
-        if row is None or row.generation == 0:
-            return None
-        if mapped is None or not mapped.in_service:
-            path = f"{self._shm_dir}{self._opened.prefix}{key.text}.{row.generation}"
-            mapped = AttachedChunk(path, key, row.generation, self.map_id, self._session.welcome.session)
-        self._chunks[key] = mapped  # the last used comes last
-        while len(self._chunks) > MOST_ATTACHED:
-            self._chunks.pop(next(iter(self._chunks)))
-        return mapped
+    def _place(self) -> Place:
+        opened = self._opened
+        return Place(
+            self._shm_dir + opened.prefix, self.map_id, self._session.welcome.session, self.resolution,
+            opened.occupied_above,
+        )  # fmt: skip
 
     @property
     def _shm_dir(self) -> str:
@@ -304,8 +248,7 @@ class LiveMap:
         -------
         (N,) int16, thousandths: above `occupied_above` occupied, below `free_below` free, 0 unknown.
         """
-        self._refresh()
-        return self._look_up(voxel_indices(np.asarray(xyz, np.float64).reshape(-1, 3), self.resolution))
+        return self._reader.look_up(np.asarray(xyz, np.float64).reshape(-1, 3))
 
     @property
     def occupied_above(self) -> int:
@@ -316,34 +259,6 @@ class LiveMap:
     def free_below(self) -> int:
         """Voxels of less log-odds are free; thousandths."""
         return self._opened.free_below
-
-    def _look_up(self, indices: NDArray[np.int32]) -> NDArray[np.int16]:
-        found = np.zeros(len(indices), np.int16)
-        if not len(indices):
-            return found
-        keys, places = in_chunk(indices)
-        chunks, which = np.unique(keys, axis=0, return_inverse=True)
-        which = which.reshape(-1)
-        order = np.argsort(which, kind="stable")
-        ends = np.cumsum(np.bincount(which, minlength=len(chunks)))
-        begin = 0
-        for key, end in zip(chunks.tolist(), ends.tolist(), strict=True):
-            rows = order[begin:end]
-            begin = end
-            dense = self._dense(ChunkKey(*key))
-            if dense is not None:
-                found[rows] = dense[places[rows]]
-        return found
-
-    def _dense(self, key: ChunkKey) -> NDArray[np.int16] | None:
-        for _ in range(_ROUNDS):
-            try:
-                chunk = self._attached(key)
-                return chunk.dense() if chunk is not None else None
-            except StaleHandle:  # noqa: PERF203  asked again, a few times
-                self._chunks.pop(key, None)
-                self._refresh()
-        raise SegmentError(f"chunk {key.text} is written and given up all the time", hint="ask again")
 
     def first_hits(self, origins: ArrayLike, ends: ArrayLike) -> NDArray[np.float64]:
         """How far rays get: the distance to the first occupied voxel on each.
@@ -362,37 +277,7 @@ class LiveMap:
         """
         ends = np.asarray(ends, np.float64).reshape(-1, 3)
         origins = np.broadcast_to(np.asarray(origins, np.float64).reshape(-1, 3), ends.shape)
-        first, last = voxel_indices(origins, self.resolution), voxel_indices(ends, self.resolution)
-        steps = np.abs(last.astype(np.int64) - first).max(axis=1, initial=0)
-        found = np.full(len(ends), np.inf)
-        self._refresh()
-        size = max(1, VOXELS_AT_ONCE // (int(steps.max(initial=0)) + 1))
-        for begin in range(0, len(ends), size):
-            part = slice(begin, begin + size)
-            found[part] = self._hits(origins[part], first[part], last[part], steps[part])
-        return found
-
-    def _hits(
-        self,
-        origins: NDArray[np.float64],
-        first: NDArray[np.int32],
-        last: NDArray[np.int32],
-        steps: NDArray[np.int64],
-    ) -> NDArray[np.float64]:
-        count = int(steps.max(initial=0)) + 1
-        at = np.minimum(np.arange(count), steps[:, None])
-        delta = last.astype(np.int64) - first
-        way = np.abs(delta)[:, None, :] * at[:, :, None]
-        whole = np.maximum(steps, 1)[:, None, None]
-        moved = np.sign(delta)[:, None, :] * ((2 * way + whole) // (2 * whole))
-        voxels = (first[:, None, :] + moved).astype(np.int32)
-        hit = self._look_up(voxels.reshape(-1, 3)).reshape(len(first), count) > self.occupied_above
-        which = hit.argmax(axis=1)
-        rows = np.arange(len(first))
-        away = (voxels[rows, which] + 0.5) * self.resolution - origins
-        distance = np.sqrt((away * away).sum(axis=1))
-        found: NDArray[np.float64] = np.where(hit.any(axis=1), distance, np.inf)
-        return found
+        return self._reader.first_hits(origins, ends)
 
 
 def _area(area: geometry.Box | Sphere | None) -> messages.LiveArea | None:

@@ -188,7 +188,7 @@ class LiveMapper:
     ----------
     name
         Under which it maps.
-    counts : Counts or None
+    counts : Counts
         What became of the points of the last scan.
     """
 
@@ -199,7 +199,7 @@ class LiveMapper:
         if not name:
             raise BadRequest("a mapper needs a name", hint="one that the program keeps: 'front_lidar'")
         self.name = name
-        self.counts: Counts | None = None
+        self.counts = Counts(0, 0, 0, 0, 0)
         self._timeout_s = timeout_s
         sender = self._sender = _Sender(session.path, live_map, name, frame_id, session.timeout_s, timeout_s)
         # also when nobody calls close(), and at the end of the program

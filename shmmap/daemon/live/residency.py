@@ -8,8 +8,8 @@ next (`next_load`, `ready`, `next_save`, `next_eviction`) and tells when it was 
   holds any more, or when memory is short: the furthest first.
 - A scan is never dropped: for a chunk that is not in memory it waits, and scans are applied in the order in
   which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
-- A chunk that was written is saved before it is given up, and after `Limits.checkpoint_s` at the latest.  It
-  may be written while it is saved: then it is dirty again.
+- A chunk that was written is saved before it is given up, and after `Limits.checkpoint_s` at the latest;
+  one that is written while it is saved is dirty again.
 """
 
 from __future__ import annotations
@@ -73,8 +73,6 @@ class Residency:
         self._leases_given = 0
         self.durability = Durability()
 
-    # --- sums -----------------------------------------------------------------------------------
-
     def _fits(self, more_bytes: int) -> bool:
         chunks = self.chunk_bytes + more_bytes
         return chunks + self.leased_bytes <= self.limits.budget_bytes or chunks <= self.limits.reserve_bytes
@@ -112,11 +110,6 @@ class Residency:
     def has_room(self, nbytes: int) -> bool:
         """Whether a scan may come: what waits is bounded, and a single one may always wait."""
         return not self.waiting_bytes or self.waiting_bytes + nbytes <= self.limits.waiting_bytes
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether a chunk has to take in a scan."""
-        return bool(self._needing)
 
     def add(self, scan: Scan) -> None:
         """A scan has come: every chunk that it touches is wanted until it has taken it in."""
@@ -184,16 +177,15 @@ class Residency:
         """A chunk on disk takes so much memory."""
         self._sizes[key] = nbytes
 
-    def _size(self, key: ChunkKey) -> int:
-        return self._sizes.get(key, self._new_bytes)
-
     def next_load(self, now_s: float) -> Chunk | None:
         """The chunk to load now: those that scans wait for first, then what is nearest to a client."""
         if self.loading >= self.limits.loads:
             return None
         kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # room was made for these
         for chunk in self._needing.values():
-            if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes):
+            if self._can_load(chunk, now_s) and self._fits(
+                self._sizes.get(chunk.key, self._new_bytes) + kept_bytes
+            ):
                 return self._begin_load(chunk)
         if self._is_short(now_s):
             return None
@@ -201,7 +193,7 @@ class Residency:
             key = self._missing[-1]
             if key in self.chunks:
                 self._missing.pop()
-            elif self._fits(self._size(key) + kept_bytes):
+            elif self._fits(self._sizes.get(key, self._new_bytes) + kept_bytes):
                 self._missing.pop()
                 return self._begin_load(self.chunks.setdefault(key, Chunk(key)))
             else:
@@ -213,7 +205,7 @@ class Residency:
 
     def _begin_load(self, chunk: Chunk) -> Chunk:
         chunk.under_way = True
-        self._resize(chunk, self._size(chunk.key), 0)
+        self._resize(chunk, self._sizes.get(chunk.key, self._new_bytes), 0)
         self.loading += 1
         return chunk
 
@@ -245,7 +237,7 @@ class Residency:
             if chunk.missing_bytes:
                 if not self._fits(chunk.missing_bytes):
                     return True
-            elif self._can_load(chunk, now_s) and not self._fits(self._size(chunk.key)):
+            elif self._can_load(chunk, now_s) and not self._fits(self._sizes.get(chunk.key, self._new_bytes)):
                 return True
         return False
 
@@ -348,12 +340,10 @@ class Residency:
         del self.leases[lease.number]
         self.leased_bytes -= lease.nbytes
 
-    # --- times ----------------------------------------------------------------------------------
-
     def next_event_s(self, now_s: float) -> float:
         """When there is something to do although nothing happens; infinity for never."""
         times = [chunk.dirty_since_s + self.limits.checkpoint_s for chunk in islice(self._dirty.values(), 1)]
         times += [chunk.retry_s for chunk in self._needing.values() if chunk.state is State.LOADING]
-        if len(self.chunks) > sum(key in self.chunks for key in self.windows.near):
+        if self._needing or len(self.chunks) > sum(key in self.chunks for key in self.windows.near):
             times.append(now_s + REVIEW_S)
         return max(now_s, min(times, default=math.inf))

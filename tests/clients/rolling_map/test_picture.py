@@ -7,7 +7,6 @@ import base64
 import io
 import re
 import xml.etree.ElementTree as ElementTree
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,17 +16,19 @@ from shmmap_clients.rolling_map.heights import HeightColours
 from shmmap_clients.rolling_map.picture import MapContent, map_picture
 from shmmap_clients.rolling_map.picture_legend import STATES
 
+from shmmap import ChunkInfo
+from shmmap.chunks.voxels import ChunkKey
+
 SVG = "{http://www.w3.org/2000/svg}"
 RESOLUTION = 0.5
 SIDE = 64 * RESOLUTION
 
 
-class Row(NamedTuple):
-    key: tuple[int, int, int]
-    state: str
+def chunk(key: tuple[int, int, int], state: str) -> ChunkInfo:
+    return ChunkInfo(ChunkKey(*key), state, 0, 0, 0, 4096, 1, 1)
 
 
-def centers(*indices: tuple[int, int, int]) -> NDArray[np.float64]:
+def centers(*indices: tuple[int, ...]) -> NDArray[np.float64]:
     return (np.array(indices, np.float64).reshape(-1, 3) + 0.5) * RESOLUTION
 
 
@@ -85,7 +86,7 @@ def test_heights_never_look_like_clean_or_dirty_chunks() -> None:
 def test_voxels_lie_in_their_chunk(key: tuple[int, int, int]) -> None:
     first = tuple(64 * part for part in key)
     last = tuple(64 * part + 63 for part in key)
-    content = MapContent(RESOLUTION, centers(first, last), chunks=[Row(key, "dirty")])  # type: ignore[arg-type]
+    content = MapContent(RESOLUTION, centers(first, last), chunks=[chunk(key, "dirty")])
     root = drawn(content)
     views = images(root)
     assert len(views) == 2
@@ -95,7 +96,7 @@ def test_voxels_lie_in_their_chunk(key: tuple[int, int, int]) -> None:
 
 
 def test_chunks_have_the_colours_of_rolling_bonxai() -> None:
-    rows = [Row((at, 0, 0), state) for at, state in enumerate(STATES)]
+    rows = [chunk((at, 0, 0), state) for at, state in enumerate(STATES)]
     root = drawn(MapContent(RESOLUTION, chunks=rows))
     seen = dict(squares(root))
     assert seen.keys() == {look.colour for look in STATES.values()}
@@ -115,7 +116,7 @@ def test_chunks_have_the_colours_of_rolling_bonxai() -> None:
 
 
 def test_of_chunks_above_one_another_the_most_urgent_state_is_seen() -> None:
-    rows = [Row((0, 0, at), state) for at, state in enumerate(("saved", "dirty", "clean"))]
+    rows = [chunk((0, 0, at), state) for at, state in enumerate(("saved", "dirty", "clean"))]
     root = drawn(MapContent(RESOLUTION, chunks=rows))
     found = squares(root)
     assert sum(len(places) for _, places in found) == 1 + 3, "one from above, three from the south"
@@ -140,7 +141,7 @@ def test_only_what_is_chosen_is_in_the_legend() -> None:
 def test_the_path_is_where_the_sensor_was() -> None:
     key = (2, -1, 0)
     middle = tuple((part + 0.5) * SIDE for part in key)
-    root = drawn(MapContent(RESOLUTION, chunks=[Row(key, "clean")], path=[middle]))  # type: ignore[list-item]
+    root = drawn(MapContent(RESOLUTION, chunks=[chunk(key, "clean")], path=[middle]))  # type: ignore[list-item]
     boxes = [box for _, found in squares(root) for box in found]
     points = [line.attrib["points"] for line in root.iter(f"{SVG}polyline")][::2]
     for (left, top, size), place in zip(boxes, points, strict=True):

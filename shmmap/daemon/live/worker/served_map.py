@@ -3,17 +3,16 @@
 
 from __future__ import annotations
 
-import heapq
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeVar
 
 import msgspec
 
 from shmmap.chunks.marks import decode_marks
-from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX, ChunkKey
+from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import Ask
@@ -21,7 +20,8 @@ from shmmap.daemon.live.records import Chunk, Scan, State
 from shmmap.daemon.live.worker.changes import Changes
 from shmmap.daemon.live.worker.mappers import Mappers
 from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
-from shmmap.daemon.live.worker.voxel_lists import VoxelLists, check_area, touches
+from shmmap.daemon.live.worker.readers import Readers
+from shmmap.daemon.live.worker.voxel_lists import VoxelLists
 from shmmap.errors import BadRequest, CannotWrite, NotPermitted, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import live as messages
@@ -74,13 +74,12 @@ class ServedMap:
         self.live = live
         self.changes = Changes(time.time_ns())
         self.mappers = Mappers(live.files)
-        self._lists = lists
+        self.readers = Readers(live, self.changes, lists, answer)
         self._marks = marks
         self._answer = answer
         self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans that are on their way
         self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
         self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
-        self._lists_begun: deque[tuple[Ask, int, Iterator[messages.LiveVoxelsReply | None]]] = deque()
         self._places: dict[int, _Place] = {}
         self._scans = self._durable = 0
         self._leases_s = self._manifest_s = 0.0
@@ -113,11 +112,11 @@ class ServedMap:
             ]
             self._saves.append((ask, message, unsaved))
         elif isinstance(message, messages.LiveChunks):
-            self._answer(ask.ticket, self._page(message))
+            self._answer(ask.ticket, self.readers.page(message))
         elif isinstance(message, messages.LiveVoxels):
-            self._begin_list(ask, message)
+            self.readers.begin_list(ask, message)
         elif isinstance(message, messages.LiveRelease):
-            self._lists.release(ask.session, message.segment)
+            self.readers.lists.release(ask.session, message.segment)
             self._answer(ask.ticket, messages.LiveReleased(message.request))
 
     def _open(self, ask: Ask, message: messages.LiveOpen) -> messages.LiveOpened:
@@ -131,7 +130,7 @@ class ServedMap:
         above, below = fixed.occupancy.thresholds
         reply = messages.LiveOpened(
             message.request, live.files.map_id, fixed.resolution, fixed.frame_id, hit, miss, low, high, above,
-            below, self._lists.path, live.memory.prefix, ask.session,
+            below, self.readers.lists.path, live.memory.prefix, ask.session,
             probabilities=msgspec.structs.astuple(fixed.occupancy),
         )  # fmt: skip
         if message.mapper:
@@ -209,83 +208,9 @@ class ServedMap:
             self.live.residency.leave(client)
         self._places.pop(session, None)
         self.mappers.left(session)
-        self._lists.left(session)
+        self.readers.left(session)
         self._waiting = deque(row for row in self._waiting if row[0].session != session)
         self._saves = [row for row in self._saves if row[0].session != session]
-        self._lists_begun = deque(row for row in self._lists_begun if row[0].session != session)
-
-    # --- readers --------------------------------------------------------------------------------
-
-    def _page(self, message: messages.LiveChunks) -> messages.LiveChunkPage:
-        live, resolution = self.live, self.live.files.settings.resolution
-        if message.area is not None:
-            check_area(message.area)
-        known = not message.since or self.changes.known(message.since)
-        since = message.since if known else 0
-        keys = (key for key in live.chunks if not since or self.changes.is_newer(key, since))
-        wanted: list[ChunkKey] = [key for key in keys if touches(message.area, key, resolution)]
-        if message.saved:
-            wanted += [
-                key for key in live.files.rows
-                if key not in live.chunks and touches(message.area, key, resolution)
-            ]  # fmt: skip
-        if message.after is not None:
-            wanted = [key for key in wanted if key > message.after]
-        page = heapq.nsmallest(messages.MOST_CHUNK_ROWS, wanted)
-        first = since and message.after is None
-        gone = (
-            [key for key in self.changes.left(since) if touches(message.area, key, resolution)]
-            if first
-            else []
-        )
-        return messages.LiveChunkPage(
-            message.request, self.changes.number, tuple(self._row(key) for key in page),
-            len(wanted) > len(page), tuple(gone), known,
-        )  # fmt: skip
-
-    def _row(self, key: ChunkKey) -> messages.LiveChunkRow:
-        there = self.live.chunks.get(key)
-        if there is None:
-            row = self.live.files.rows[key]
-            return messages.LiveChunkRow(
-                key, 0, row.version, "saved", row.active, row.occupied, row.free, row.bytes
-            )
-        state, known = there.view.state, self.live.residency.chunks[key]
-        return messages.LiveChunkRow(
-            key, there.view.identity.generation, int(state["version"]), known.state.value,
-            int(state["active"]), int(state["occupied"]), int(state["free"]), known.nbytes,
-        )  # fmt: skip
-
-    def _begin_list(self, ask: Ask, message: messages.LiveVoxels) -> None:
-        if message.scope not in ("memory", "disk", "all"):
-            raise BadRequest(f"scope {message.scope!r}", hint="ask for memory, disk or all")
-        if message.area is not None:
-            check_area(message.area)
-        resolution, since = self.live.files.settings.resolution, message.since
-        since = since if self.changes.known(since) else 0
-        keys = set() if message.scope == "disk" else {
-            key for key in self.live.chunks if not since or self.changes.is_newer(key, since)
-        }  # fmt: skip
-        if message.scope != "memory" and not since:
-            keys |= set(self.live.files.rows)
-        chosen = sorted(key for key in keys if touches(message.area, key, resolution))
-        work = self._lists.collect(message, chosen, ask.session, self.changes.number)
-        self._lists_begun.append((ask, message.request, work))
-
-    def _go_on_with_lists(self) -> None:
-        ask, request, work = self._lists_begun[0]
-        try:
-            reply = next(work)
-        except ShmmapError as error:
-            self._refuse(ask, request, error)
-        except OSError as error:
-            self._refuse(ask, request, CannotWrite(f"the list of voxels: {error.strerror}"))
-        else:
-            if reply is None:
-                self._lists_begun.rotate(-1)
-                return
-            self._answer(ask.ticket, reply)
-        self._lists_begun.popleft()
 
     # --- answers --------------------------------------------------------------------------------
 
@@ -324,8 +249,8 @@ class ServedMap:
         self.live.turn(now_s, time.time_ns(), save_all=save_all or bool(self._saves))
         if self._saves:
             self._answer_saves()
-        if self._lists_begun:
-            self._go_on_with_lists()
+        if self.readers.are_waiting:
+            self.readers.go_on()
         if self.live.kept and now_s >= self._leases_s:
             self.live.look_at_leases()
             self._leases_s = now_s + LEASES_S
@@ -336,12 +261,12 @@ class ServedMap:
     def next_turn_s(self, now_s: float) -> float:
         """When the next turn is due, if nothing happens before."""
         residency = self.live.residency
-        if self._lists_begun or any(not chunk.missing_bytes for chunk, _ in residency.ready()):
+        if self.readers.are_waiting or any(not chunk.missing_bytes for chunk, _ in residency.ready()):
             return now_s
         times = [residency.next_event_s(now_s)]
         if self.live.kept:
             times.append(self._leases_s)
-        if self._waiting or residency.is_waiting:
+        if self._waiting:
             times.append(now_s + LEASES_S)
         return min(times)
 
@@ -378,7 +303,7 @@ class ServedMap:
 
     def end(self, *, keep: bool) -> int:
         """End it; returns how many chunks stay in memory because they are nowhere else."""
-        self._lists.remove_all()
+        self.readers.lists.remove_all()
         unsaved = sum(chunk.version > chunk.saved for chunk in self.live.residency.chunks.values())
         if not keep and not unsaved:
             try:

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What readers of a live map ask: which chunks there are, and which voxels lie in an area."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.messages import Ask
+from shmmap.daemon.live.worker.changes import Changes
+from shmmap.daemon.live.worker.voxel_lists import VoxelLists, check_area, touches
+from shmmap.errors import BadRequest, CannotWrite, ShmmapError
+from shmmap.protocol import live as messages
+from shmmap.protocol.messages import ErrorReply
+
+__all__ = ["Readers"]
+
+
+@dataclass(eq=False, slots=True)
+class Readers:
+    """Answers those who read one map.
+
+    Parameters
+    ----------
+    live, changes, lists
+        The map, what changed in it, and lists of its voxels.
+    answer
+        Takes a ticket and the reply to it.
+    """
+
+    live: LiveMap
+    changes: Changes
+    lists: VoxelLists
+    answer: Callable[[int, Any], None]
+    _begun: deque[tuple[Ask, int, Iterator[messages.LiveVoxelsReply | None]]] = field(default_factory=deque)
+
+    @property
+    def are_waiting(self) -> bool:
+        """Whether a list of voxels is being made."""
+        return bool(self._begun)
+
+    def left(self, session: int) -> None:
+        """A session has ended."""
+        self.lists.left(session)
+        self._begun = deque(row for row in self._begun if row[0].session != session)
+
+    def page(self, message: messages.LiveChunks) -> messages.LiveChunkPage:
+        """Which chunks there are."""
+        live, resolution = self.live, self.live.files.settings.resolution
+        if message.area is not None:
+            check_area(message.area)
+        known = not message.since or self.changes.known(message.since)
+        since = message.since if known else 0
+        keys = (key for key in live.chunks if not since or self.changes.is_newer(key, since))
+        wanted: list[ChunkKey] = [key for key in keys if touches(message.area, key, resolution)]
+        if message.saved:
+            wanted += [
+                key for key in live.files.rows
+                if key not in live.chunks and touches(message.area, key, resolution)
+            ]  # fmt: skip
+        if message.after is not None:
+            wanted = [key for key in wanted if key > message.after]
+        page = heapq.nsmallest(messages.MOST_CHUNK_ROWS, wanted)
+        first = since and message.after is None
+        gone = (
+            [key for key in self.changes.left(since) if touches(message.area, key, resolution)]
+            if first
+            else []
+        )
+        return messages.LiveChunkPage(
+            message.request, self.changes.number, tuple(self._row(key) for key in page),
+            len(wanted) > len(page), tuple(gone), known,
+        )  # fmt: skip
+
+    def _row(self, key: ChunkKey) -> messages.LiveChunkRow:
+        there = self.live.chunks.get(key)
+        if there is None:
+            row = self.live.files.rows[key]
+            return messages.LiveChunkRow(
+                key, 0, row.version, "saved", row.active, row.occupied, row.free, row.bytes
+            )
+        state, known = there.view.state, self.live.residency.chunks[key]
+        return messages.LiveChunkRow(
+            key, there.view.identity.generation, int(state["version"]), known.state.value,
+            int(state["active"]), int(state["occupied"]), int(state["free"]), known.nbytes,
+        )  # fmt: skip
+
+    def begin_list(self, ask: Ask, message: messages.LiveVoxels) -> None:
+        """Begin a list of voxels; `go_on` answers it."""
+        if message.scope not in ("memory", "disk", "all"):
+            raise BadRequest(f"scope {message.scope!r}", hint="ask for memory, disk or all")
+        if message.area is not None:
+            check_area(message.area)
+        resolution, since = self.live.files.settings.resolution, message.since
+        since = since if self.changes.known(since) else 0
+        keys = set() if message.scope == "disk" else {
+            key for key in self.live.chunks if not since or self.changes.is_newer(key, since)
+        }  # fmt: skip
+        if message.scope != "memory" and not since:
+            keys |= set(self.live.files.rows)
+        chosen = sorted(key for key in keys if touches(message.area, key, resolution))
+        work = self.lists.collect(message, chosen, ask.session, self.changes.number)
+        self._begun.append((ask, message.request, work))
+
+    def go_on(self) -> None:
+        """Make another part of a list."""
+        ask, request, work = self._begun[0]
+        try:
+            reply = next(work)
+        except ShmmapError as error:
+            self._refuse(ask, request, error)
+        except OSError as error:
+            self._refuse(ask, request, CannotWrite(f"the list of voxels: {error.strerror}"))
+        else:
+            if reply is None:
+                self._begun.rotate(-1)
+                return
+            self.answer(ask.ticket, reply)
+        self._begun.popleft()
+
+    def _refuse(self, ask: Ask, request: int, error: ShmmapError) -> None:
+        self.answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))
