@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from shmmap import errors
-from shmmap.protocol import events
+from shmmap.protocol import events, live
 from shmmap.protocol import messages as m
 from shmmap.segment import header, layout, publish_block
 from shmmap.statistics import layout as statistics_layout
@@ -91,6 +91,8 @@ def test_events(kind: Any) -> None:
         ("Segment", m.ShownSegment),
         ("Pinned", m.PinnedCell),
         ("Intent", m.Intent),
+        ("LiveMap", live.LiveMapRow),
+        ("Chunk", live.LiveChunkRow),
     ],
 )
 def test_rows(name: str, kind: Any) -> None:
