@@ -14,6 +14,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from shmmap.chunks.chunk_file import decode_chunk, read_file_header
+from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent
+from shmmap.chunks.marks import decode_marks, encode_marks
 from shmmap.daemon.transport.zmtp import Incoming
 from shmmap.errors import BadRequest, MapDataError, ProtocolMismatch, SegmentError
 from shmmap.formats.causes import CAUSES
@@ -178,6 +181,37 @@ def check_pcd(data: bytes) -> str:
     return "read"
 
 
+# --- live maps ----------------------------------------------------------------------------------
+
+MARKS_OF: Final = (bytes(range(16)), 1, 2)
+"""Map, mapper and scan that the marks of the corpus are for."""
+
+
+def check_marks(data: bytes) -> str:
+    """What a mapper sends: refused, or marks that encode to the same bytes."""
+    try:
+        marks = decode_marks(data, *MARKS_OF)
+    except BadRequest:
+        return "refused"
+    if len(encode_marks(marks, *MARKS_OF)) != len(data):
+        raise AssertionError("marks change when they are sent on")
+    if int(marks.starts[-1]) != len(marks.words) or len(marks.words) != len(marks.bits):
+        raise AssertionError("words are left over")
+    return f"{len(marks.keys)} chunks"
+
+
+def check_chunk(data: bytes) -> str:
+    """A chunk's file: refused, or a chunk that is consistent in itself."""
+    try:
+        header = read_file_header(data)
+        identity = ChunkIdentity(header.map_id, header.key, header.resolution, -1992, 3476, 0, 0, 1, "map")
+        view = ChunkView(decode_chunk(data, identity))
+        check_consistent(view)
+    except MapDataError:
+        return "refused"
+    return "read"
+
+
 def mutate_protocol(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
     """As a tree half of the time, as bytes otherwise."""
     return (mutate_message if rng.random() < 0.5 else mutate_bytes)(data, rng, pool)
@@ -188,4 +222,6 @@ TARGETS: Final = {
     "zmtp": Target(mutate_bytes, check_zmtp),
     "segment": Target(mutate_segment, check_segment),
     "pcd": Target(mutate_bytes, check_pcd),
+    "marks": Target(mutate_bytes, check_marks),
+    "chunk": Target(mutate_bytes, check_chunk),
 }

@@ -24,7 +24,7 @@ def test_kept_inputs(name: str) -> None:
     wellformed = [
         key
         for key, outcome in outcomes.items()
-        if outcome not in ("refused/refused", "SegmentCorrupt", "ProtocolMismatch")
+        if outcome not in ("refused/refused", "refused", "SegmentCorrupt", "ProtocolMismatch")
     ]
     assert len(wellformed) >= 2
 
