@@ -4,13 +4,20 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from shmmap.daemon.config import FILE_NAMES, DaemonConfig, load_config
+from shmmap.daemon.config_live import LiveSettings, live_settings
 from tests.support.daemon_process import ROOT
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 EXAMPLE = ROOT / "systemd" / "shmmap.toml"
 ASSIGNMENT = re.compile(r"#?([a-z_]+) = (.+)")
@@ -29,7 +36,17 @@ def assignments() -> dict[str, str]:
 
 def test_every_setting_is_explained() -> None:
     """A new setting of `DaemonConfig` needs its lines in systemd/shmmap.toml."""
-    assert sorted(assignments()) == sorted(field.name for field in fields(DaemonConfig))
+    assert sorted([*assignments(), "live"]) == sorted(field.name for field in fields(DaemonConfig))
+
+
+def test_every_setting_of_a_live_map_is_explained_with_its_default() -> None:
+    text = EXAMPLE.read_text(encoding="utf-8")
+    table = text[text.index("#[live.lidar]") :].replace("#", "", 1)
+    rows = {match[1]: match[2] for match in re.finditer(r"^#  ([a-z_]+) = (.+)$", table, re.MULTILINE)}
+    default = LiveSettings("lidar")
+    assert set(rows) == set(default.__struct_fields__) - {"name"}
+    lines = [re.sub(r"^#  (?=[a-z_]+ = )", "", line) for line in table.splitlines()]
+    assert live_settings((), tomllib.loads("\n".join(lines))["live"]) == (default,)
 
 
 @pytest.mark.parametrize("name", sorted(assignments()))
