@@ -23,6 +23,7 @@ from shmmap.protocol.messages import Intent, Welcome
 if TYPE_CHECKING:
     from shmmap.client.live.live_map import LiveMap
     from shmmap.client.map_listing import MapListing
+    from shmmap.protocol.live import LiveMapRow
 
 __all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
 
@@ -256,6 +257,13 @@ class Client(OperatorRequests):
         from shmmap.client.live.live_map import LiveMap  # most clients never do
 
         return LiveMap(self._session, name, frame_id)
+
+    def live_maps(self) -> tuple[LiveMapRow, ...]:
+        """Which live maps the daemon keeps, and how they are."""
+        from shmmap.client.live.patience import until_served
+        from shmmap.protocol.live import LiveList, LiveListed
+
+        return until_served(lambda: self._session.ask(LiveList, LiveListed).maps, self.timeout)
 
     # --- the map ------------------------------------------------------------------------------------
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TextIO
 
 from shmmap.quantities import counted, format_bytes, format_duration, format_metres
@@ -40,12 +41,14 @@ _NARROWEST: Final = 20  # columns that text needs to be worth breaking
 class Column(NamedTuple):
     """One column of a table; numbers are aligned right.
 
-    A terminal too narrow for the table shows of the ``spare`` columns those that fit, lowest first.
+    A terminal too narrow for the table shows of the ``spare`` columns those that fit, lowest first;
+    ``looks`` are colours of some of its words.
     """
 
     name: str
     align: Literal["left", "right"] = "left"
     spare: int = 0
+    looks: Mapping[str, str] = MappingProxyType({})
 
 
 def printable(text: str) -> str:
@@ -131,7 +134,11 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         column = columns[index]
         table.add_column(column.name, justify=column.align, overflow="fold", no_wrap=index > 0)
     for row in rows:
-        table.add_row(*(Text(row[index]) for index in shown))
+        looks = [columns[index].looks for index in shown]
+        texts = [row[index] for index in shown]
+        table.add_row(
+            *(Text(text, style=look.get(text, "")) for text, look in zip(texts, looks, strict=True))
+        )
     console.print(table)
     if missing := [column.name for index, column in enumerate(columns) if index not in shown]:
         hidden = Text(f"hidden (narrow terminal): {', '.join(missing)}", style="bright_black")

@@ -114,10 +114,11 @@ def run_show(args: argparse.Namespace) -> int:
     file = args.file or installed_config_file()
     settings = trace_settings({}, file=file)
     if args.json:
-        shown = {name: {"value": one.value, "origin": one.origin} for name, one in settings.items()}
+        shown = {name: {"value": _plain(one.value), "origin": one.origin} for name, one in settings.items()}
         shown |= {called: shown[name] for name, called in FILE_NAMES.items()}
         print_json({"file": file or None, "settings": shown})
         return 0
+    live = settings.pop("live")
     lines = {
         name: f"{FILE_NAMES.get(name, name)} = {_toml(one.value, size=name in FILE_NAMES)}"
         for name, one in settings.items()
@@ -128,7 +129,19 @@ def run_show(args: argparse.Namespace) -> int:
         if not settings[name].value and name in _CHOSEN:
             remarks.append(_CHOSEN[name])
         print_line(f"{line.ljust(width)}  # {': '.join(remarks)}" if remarks else line)
+    for table in _plain(live.value):
+        print_line()
+        print_line(f"[live.{table.pop('name')}]" + (f"  # {live.origin}" if args.origin else ""))
+        for name, value in table.items():
+            print_line(f"{name} = {_toml(value, size=False)}")
     return 0
+
+
+def _plain(value: Any) -> Any:
+    """Settings of live maps as what JSON and TOML can say."""
+    import msgspec
+
+    return [msgspec.structs.asdict(one) for one in value] if isinstance(value, tuple) else value
 
 
 def _toml(value: Any, *, size: bool) -> str:

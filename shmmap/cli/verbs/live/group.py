@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from shmmap.cli.options import Subparsers, add_verb
-from shmmap.cli.verbs.live import export, fsck, reset
+from shmmap.cli.verbs.live import export, fsck, ls, reset, save, show
 
 __all__ = ["add_parser"]
 
@@ -15,9 +15,9 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "live",
         fsck.run,
-        help="check, export or reset a live map",
+        help="look at live maps, save, check, export or reset one",
         description="Look after live maps: what programs map while they drive.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    for action in (fsck, export, reset):
+    for action in (ls, show, save, fsck, export, reset):
         action.add_parser(actions)
