@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +23,7 @@ from shmmap.errors import BadRequest, ConfigError, LiveInterrupted
 from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked
 from tests.support.live_reference import held, reference
 from tests.support.patience import Patience
@@ -316,3 +319,42 @@ def test_requests_that_wait_when_the_worker_dies_are_told(live_daemon: LiveDaemo
             except LiveInterrupted:
                 continue
         assert len(told) <= 1
+
+
+def test_an_operator_looks_and_saves(live_daemon: LiveDaemon) -> None:
+    """`shmmap live ls`, `show` and `save`, as words and as JSON."""
+    one = live_daemon(checkpoint=600.0)
+    address = ("--endpoint", one.endpoint)
+    assert "lidar" in shmmap_command("live", "ls", *address)
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            for points, pose in drive(3):
+                mapper.add(points, pose)
+            mapper.wait_applied()
+        (row,) = json.loads(shmmap_command("live", "ls", "--json", *address))["maps"]
+        assert (row["name"], row["scans"], row["mappers"]) == ("lidar", 3, [f"{os.getuid()}/front"])
+        assert row["dirty"] > 0 == row["files"]
+        shown = shmmap_command("live", "show", "lidar", *address)
+        assert "3 applied since the start, 0 of them on the disk" in shown
+        assert "dirty" in shown
+        assert f"{row['dirty']} chunks on the disk" in shmmap_command("live", "save", "lidar", *address)
+        found = json.loads(shmmap_command("live", "show", "lidar", "--saved", "--json", *address))
+        assert (found["map"]["dirty"], found["map"]["files"]) == (0, row["dirty"])
+        assert {chunk["state"] for chunk in found["chunks"]} <= {"clean", "saved"}
+        known = sum(chunk["active"] for chunk in found["chunks"])
+        assert known == len(reference(drive(3)))
+        box = found["chunks"][0]["box"]
+        assert box[3] - box[0] == pytest.approx(64 * RESOLUTION)
+    refused = subprocess.run(
+        [sys.executable, "-m", "shmmap.cli", "live", "show", "radar", *address],
+        capture_output=True, text=True, cwd=ROOT,
+    )  # fmt: skip
+    assert refused.returncode == BadRequest.exit_code
+    assert "there is no live map 'radar'" in refused.stderr
+
+
+def shmmap_command(*words: str) -> str:
+    """What a command prints, which is to succeed."""
+    command = [sys.executable, "-m", "shmmap.cli", *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout

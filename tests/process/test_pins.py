@@ -66,12 +66,14 @@ def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unk
         one.start()
         client.hello()
         # while a loader compares it with its checksums, who else has it cannot be told
-        while (stats := client.ask("stats"))[6] == 0:
+        waiting = Patience()
+        while waiting((stats := client.ask("stats"))[6] == 0):
             pass
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
         client.ask("evict")
         assert len(one.segments()) == 1
-        while (stats := client.ask("stats"))[6] == 0:
+        waiting = Patience()
+        while waiting((stats := client.ask("stats"))[6] == 0):
             pass
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
         os.kill(stranger.pid, signal.SIGCONT)

@@ -74,7 +74,8 @@ PARTS = {
     },
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
-        "segment", "service", "statistics", "daemon.config", "daemon.config_file", "daemon.live.disk",
+        "segment", "service", "statistics", "daemon.config", "daemon.config_file", "daemon.config_live",
+        "daemon.live.disk",
         "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip

@@ -1,20 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which live map is meant: the directory that has its files."""
+"""Which live map is meant: the directory that has its files, or its name."""
 
 from __future__ import annotations
 
 import argparse
 import os
+from typing import Final
+
+from shmmap.errors import ConfigError
 
 __all__ = ["add_directory", "directory_from"]
+
+SERVICE_STATE: Final = "/var/lib/shmmap"
+"""State directory of the installed service."""
 
 
 def add_directory(parser: argparse.ArgumentParser) -> None:
     """Add ``DIR``."""
-    parser.add_argument("directory", metavar="DIR", help="the directory of the live map")
+    parser.add_argument(
+        "directory", metavar="DIR", help="the directory of the live map, or its name in the daemon's settings"
+    )
 
 
 def directory_from(args: argparse.Namespace) -> str:
-    """Return its path."""
-    directory: str = args.directory
-    return os.path.abspath(directory)
+    """Return its path: what is no directory may be the name of a map that has one."""
+    given: str = args.directory
+    if os.path.isdir(given) or os.sep in given:
+        return os.path.abspath(given)
+    return next(filter(os.path.isdir, _places(given)), os.path.abspath(given))
+
+
+def _places(name: str) -> list[str]:
+    """Where a live map of a name may have its files, as settings and custom say."""
+    from shmmap.daemon.config import load_config
+    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.config_live import live_directory
+
+    config = load_config({}, file=installed_config_file())
+    places = [one.path for one in config.live if one.name == name and one.path]
+    try:
+        places.append(live_directory(config.instance, name))
+    except ConfigError:
+        pass  # no home, no state of its own
+    return [*places, f"{SERVICE_STATE}/live/{name}"]

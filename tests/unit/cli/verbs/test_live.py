@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -163,3 +164,23 @@ def test_resets(directory: Path, capsys: Captured) -> None:
     assert main(["live", "fsck", str(directory)]) == 66
     assert main(["live", "reset", str(directory / "reset.1"), "--yes", "--delete"]) == 0
     assert contents(directory) == {}
+
+
+def test_a_name_stands_for_its_directory(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+) -> None:
+    """By the state directory, or by the settings; a directory of that name here comes first."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.chdir(tmp_path)
+    place = tmp_path / "state" / "shmmap" / "default" / "live" / "radar"
+    place.parent.mkdir(parents=True)
+    shutil.copytree(directory, place)
+    assert main(["live", "fsck", "radar", "--json"]) == 0
+    settings = tmp_path / "config" / "shmmap" / "shmmap.toml"
+    settings.parent.mkdir(parents=True)
+    settings.write_text(f'[live.radar]\npath = "{directory}"\n')
+    damage(directory)
+    assert main(["live", "fsck", "radar", "--read-only"]) == 65
+    assert main(["live", "fsck", "sonar"]) == 66
+    capsys.readouterr()
