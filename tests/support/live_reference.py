@@ -18,11 +18,11 @@ __all__ = ["held", "reference"]
 Scan = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def reference(scans: Iterable[Scan]) -> dict[Voxel, int]:
+def reference(scans: Iterable[Scan], scan_filter: shmmap.ScanFilter = FILTER) -> dict[Voxel, int]:
     """Log-odds of all known voxels after these scans."""
     slow = SlowOccupancy(
-        RESOLUTION, min_range=FILTER.min_range, max_range=FILTER.max_range, min_z=FILTER.min_z,
-        max_z=FILTER.max_z,
+        RESOLUTION, min_range=scan_filter.min_range, max_range=scan_filter.max_range,
+        min_z=scan_filter.min_z, max_z=scan_filter.max_z,
     )  # fmt: skip
     for points, pose in scans:
         slow.insert(points.tolist(), pose[:3].tolist())

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
@@ -114,7 +115,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Map the scans to their end."""
     from shmmap_clients.rolling_map.drive import map_drive
-    from shmmap_clients.rolling_map.statistics import DriveStatistics, usage_text
+    from shmmap_clients.rolling_map.statistics import DriveStatistics
     from shmmap_clients.scans.scan_source import open_scans
 
     parameters = parameters_from(args)
@@ -132,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
         for mapped in map_drive(scans, mapper):
             statistics.add(mapped)
             if not args.quiet:
-                usage = f"; {usage_text(live.status())}" if shown.usage else ""
+                usage = f"; {_usage_now(live)}" if shown.usage else ""
                 print_line(statistics.line(mapped) + usage, file=sys.stderr)
         code = _settled(args, mapper, statistics)
         if args.picture:
@@ -150,6 +151,17 @@ def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
     return ""
 
 
+def _usage_now(live: LiveMap) -> str:
+    """What the map takes; a daemon that is away keeps no scan from being read."""
+    from shmmap import DaemonUnreachable, LiveInterrupted
+    from shmmap_clients.rolling_map.statistics import usage_text
+
+    try:
+        return usage_text(live.status())
+    except (DaemonUnreachable, LiveInterrupted):
+        return "the daemon does not answer"
+
+
 def _settled(args: argparse.Namespace, mapper: LiveMapper, statistics: DriveStatistics) -> int:
     """Wait until everything is in memory and on the disk; returns the exit code."""
     from shmmap import NoAnswer
@@ -158,8 +170,10 @@ def _settled(args: argparse.Namespace, mapper: LiveMapper, statistics: DriveStat
     if last is None:
         return nothing_found(args, f"no scan came from {args.scans}", name=_NAME)
     if args.wait > 0:
+        end_s = time.monotonic() + args.wait
         with contextlib.suppress(NoAnswer):  # what is missing is told below
-            mapper.wait_durable(args.wait)
+            mapper.wait_applied(args.wait)
+            mapper.wait_durable(max(0.1, end_s - time.monotonic()))
         if mapper.durable < last:
             missing = f"scan {last} is not on the disk after {args.wait:g} s, but scan {mapper.durable}"
             complain(_NAME, missing, "the daemon goes on; `shmmap live show` says how far it is")
@@ -175,12 +189,13 @@ def _draw(args: argparse.Namespace, live: LiveMap, shown: Shown, statistics: Dri
 
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
     from shmmap_clients.rolling_map.statistics import usage_text
+    from shmmap_clients.rolling_map.voxel_parts import all_voxels
 
     nothing = np.empty((0, 3))
     content = MapContent(
         live.resolution,
-        live.occupied() if shown.occupied else nothing,
-        live.free() if shown.free else nothing,
+        all_voxels(live, "occupied") if shown.occupied else nothing,
+        all_voxels(live, "free") if shown.free else nothing,
         live.chunks(saved=True) if shown.chunks else (),
         statistics.path,
         usage_text(live.status()) if shown.usage else "",
