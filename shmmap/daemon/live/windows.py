@@ -4,10 +4,32 @@
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 from shmmap.chunks.voxels import ChunkKey
 
-__all__ = ["Windows"]
+__all__ = ["Windows", "place_ahead"]
+
+Place: TypeAlias = tuple[float, float, float]
+
+
+def place_ahead(before: Place, here: Place, passed_s: float, ahead_s: float, most: float) -> Place:
+    """Where a client will be if it goes on as it does.
+
+    Parameters
+    ----------
+    before, here
+        Where it was, and where it is now.
+    passed_s, ahead_s
+        Seconds between the two, and from now on.
+    most
+        It is not looked further ahead along any axis; the direction stays the same.
+    """
+    way = [now - then for now, then in zip(here, before, strict=True)]
+    longest = max(map(abs, way))
+    factor = min(ahead_s / passed_s, most / longest) if longest else 0.0
+    x, y, z = (at + part * factor for at, part in zip(here, way, strict=True))
+    return x, y, z
 
 
 class Windows:

@@ -17,6 +17,7 @@ from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import Ask
 from shmmap.daemon.live.records import Chunk, Scan, State
+from shmmap.daemon.live.windows import place_ahead
 from shmmap.daemon.live.worker.changes import Changes
 from shmmap.daemon.live.worker.mappers import Mappers
 from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
@@ -195,12 +196,9 @@ class ServedMap:
         self._places[session] = _Place(position, now_s)
         if before is None or now_s <= before.seen_s:
             return
-        step = MOST_AHEAD_CHUNKS * CHUNK_SIDE * self.live.files.settings.resolution
-        ahead = [
-            here + min(max((here - there) / (now_s - before.seen_s) * AHEAD_S, -step), step)
-            for here, there in zip(position, before.xyz, strict=True)
-        ]
-        self.live.move((session, "ahead"), (ahead[0], ahead[1], ahead[2]))
+        most = MOST_AHEAD_CHUNKS * CHUNK_SIDE * self.live.files.settings.resolution
+        ahead = place_ahead(before.xyz, position, now_s - before.seen_s, AHEAD_S, most)
+        self.live.move((session, "ahead"), ahead)
 
     def left(self, session: int) -> None:
         """A session has ended: what it sent goes on, what it asked for does not."""
