@@ -37,6 +37,8 @@ class Program:
         Directory for what it writes.
     piped
         Whether stdout is read while it runs, see `lines`, and not in the end, see `document`.
+    fed
+        Whether it reads lines from stdin, see `tell`.
     own_session
         Whether a Ctrl-C is kept from it, and it is ended with all that it has started.
 
@@ -52,11 +54,12 @@ class Program:
         work: Path,
         *,
         piped: bool = False,
+        fed: bool = False,
         own_session: bool = True,
     ) -> None:
         self.name = name
         self._command = [sys.executable, "-m", module, *words]
-        self._piped, self._own_session = piped, own_session
+        self._piped, self._fed, self._own_session = piped, fed, own_session
         self._out, self._err = work / f"{name}.out", work / f"{name}.err"
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -88,12 +91,33 @@ class Program:
         with open(self._out, "wb") as out, open(self._err, "wb") as err, interrupts_later():
             self._process = subprocess.Popen(
                 self._command,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if self._fed else subprocess.DEVNULL,
                 stdout=subprocess.PIPE if self._piped else out,
                 stderr=err,
                 env=without_settings(),
                 start_new_session=self._own_session,
             )
+
+    def tell(self, line: str) -> None:
+        """Write a line to the stdin of a ``fed`` one.
+
+        Raises
+        ------
+        InternalError
+            It has ended.
+        """
+        if self._process is None or self._process.stdin is None:
+            raise InternalError(f"{self.name} hears nobody")
+        try:
+            self._process.stdin.write(line.encode() + b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise InternalError(f"{self.name} ended early: {self.last_words()}") from None
+
+    def tell_no_more(self) -> None:
+        """End the stdin of a ``fed`` one."""
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
 
     def lines(self, patience_s: float) -> Iterator[str]:
         """What a ``piped`` one writes to stdout, line by line, until it ends.
@@ -164,6 +188,8 @@ class Program:
                 with contextlib.suppress(ProcessLookupError):
                     (os.killpg if self._own_session else os.kill)(self._process.pid, signal.SIGKILL)
                 self._process.wait()
-                if self._process.stdout is not None:
-                    self._process.stdout.close()
+                for pipe in (self._process.stdin, self._process.stdout):
+                    if pipe is not None:
+                        with contextlib.suppress(BrokenPipeError):
+                            pipe.close()
                 self._process = None

@@ -5,12 +5,8 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import shutil
 import signal
-import subprocess
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,47 +17,10 @@ from shmmap.cli.screens.demo_report import print_report
 from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.errors import BadRequest
-from tests.support.daemon_process import ROOT, processes_marked, wait_ended
+from tests.support.daemon_process import processes_marked, wait_ended
+from tests.support.demo_process import Demo, until
 from tests.support.patience import Patience
 from tests.support.small_demo import SMALL
-
-
-class Demo:
-    """A demonstration in its own process, with marked descendants and a temporary directory of its own.
-
-    Parameters
-    ----------
-    *words
-        What the demonstration is told.
-    command
-        The module, and its words.
-    """
-
-    def __init__(
-        self, cwd: Path, *words: str, command: Sequence[str] = ("tests.support.small_demo",)
-    ) -> None:
-        self.mark = secrets.token_hex(8)
-        self.cwd = cwd
-        self.scratch = cwd / "tmp"
-        self.scratch.mkdir()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", *command, *words],
-            cwd=cwd,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
-            | {"PYTHONPATH": str(ROOT), "TMPDIR": str(self.scratch), "SHMMAP_TEST_RUN": self.mark}
-            # settings of a real daemon must not matter
-            | {"SHMMAP_SHM_DIR": "/nowhere", "SHMMAP_ENDPOINT": "/nowhere.sock", "SHMMAP_INSTANCE": "other"},
-        )
-
-    def leftovers(self) -> list[str]:
-        """Processes, segments, sockets and files that should not be there any more."""
-        found = [f"process {pid}" for pid in processes_marked(self.mark)]
-        found += [f"segment {n}" for n in os.listdir("/dev/shm") if f"test-{self.process.pid}-" in n]
-        found += [f"/tmp/{n}" for n in os.listdir("/tmp") if f"-test-{self.process.pid}-" in n]
-        return found + [str(path) for path in self.scratch.iterdir()]
 
 
 def test_demo_measures_and_draws(tmp_path: Path) -> None:
@@ -132,15 +91,6 @@ STAGES = (
     "  The daemon starts again",
     "Localizing",
 )
-
-
-def until(demo: Demo, stage: str) -> None:
-    """Read what the demonstration says until a stage or an event begins."""
-    assert demo.process.stdout is not None
-    for line in demo.process.stdout:
-        if line.startswith(stage):
-            return
-    pytest.fail(f"it never said {stage!r}")
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,7 @@ PARTS = {
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},
     "demo": BASE | {
         "formats", "origin", "layers", "segment", "protocol", "client", "statistics", "simulation", "testing",
+        "chunks", "daemon.live.disk",
     },
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",

@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_line, print_table
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from shmmap.demo.drive import DriveResult
     from shmmap.demo.localization import LocalizationResult
 
-__all__ = ["draw", "print_report"]
+__all__ = ["draw", "print_report", "print_texts"]
 
 _WIDTH: Final = 79  # columns, of which every line has to make do
 _NARROWEST: Final = 30
@@ -27,9 +28,13 @@ def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
     print_line()
     _print_table(result)
     print_line()
+    print_texts([*_lines(result), ("duration", f"{format_duration(duration_s)}; picture: {picture}")])
+
+
+def print_texts(texts: Sequence[tuple[str, str]]) -> None:
+    """Print texts, each with its name in front; in a pipe, too, lines of a page's width."""
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
-    for name, text in [*_lines(result), ("duration", f"{format_duration(duration_s)}; picture: {picture}")]:
-        # in a pipe, too: what reads along is a log or a page
+    for name, text in texts:
         for line in textwrap.wrap(
             text,
             max(min(width, _WIDTH), _NARROWEST),

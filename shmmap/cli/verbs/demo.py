@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line
-from shmmap.errors import CannotWrite
+from shmmap.errors import BadRequest, CannotWrite
 
 if TYPE_CHECKING:
     from shmmap.demo.demo import DemoResult
@@ -51,7 +51,14 @@ _JSON = """\
   printed}, "memory": {...: {"own_bytes", "growth_bytes": more in the last third of the drive than
   in the middle one, "shared_bytes": of the map, mapped}}, "errors": {"ndt": {"mean_m", "max_m"},
   "compare": {"moving_kept", "still_kept": shares of points}, "elevation": {"mean_m", "max_m",
-  "places"}}}; exit code 1 where a scan was lost or not trusted"""
+  "places"}}}; exit code 1 where a scan was lost or not trusted
+  With --live instead of all this: {"scans", "points", "length_m", "mapping_s",
+  "chunks", "file_bytes": of the map on disk, "budget_bytes", "most_bytes": memory of chunks,
+  "given_up", "came_back": how often a chunk left memory, and came into it again,
+  "active", "active_bytes": known voxels in memory in the end, and their memory,
+  "daemon": {"killed_at": scan, "down_s", "chunks": in memory when it was back},
+  "mapper": {"killed_at", "resumed_at"}, "voxels", "differing": compared with a map without
+  bounds, "svg", "seconds"}; exit code 1 where a voxel differs"""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -63,13 +70,15 @@ def add_parser(subparsers: Subparsers) -> None:
         help="see it work: no map needed, about a minute",
         description="Build a town and drive through it with one process, then with eight: each with a private"
         " copy of the map, then all on one copy that shmmap shares.  Kill the daemon, and see the processes"
-        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.",
+        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.  With --live: map"
+        " a drive.",
         json=_JSON,
     )
     parser.add_argument(
         "--svg",
         metavar="FILE",
-        help="where the picture goes (default: ./shmmap-demo.svg, with --full ./shmmap-demo-full.svg)",
+        help="where the picture goes (default: ./shmmap-demo.svg, with --full or --live ./shmmap-demo-full.svg"
+        " or -live.svg)",
     )
     parser.add_argument("--keep-map", metavar="DIR", help="build the map in DIR, and leave it there")
     parser.add_argument(
@@ -78,7 +87,14 @@ def add_parser(subparsers: Subparsers) -> None:
         type=_density,
         help="points per square metre of ground, 2 to 1000; fewer are quicker (default: 100, or what fits)",
     )
-    parser.add_argument(
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--live",
+        action="store_true",
+        help="map a drive into a live map with too little memory, and kill daemon and mapping program on the"
+        " way: no voxel is lost (less than a minute)",
+    )
+    instead.add_argument(
         "--full",
         action="store_true",
         help="1, 2, 4, 8 and 16 processes, and three programs beside one another: localization, compare"
@@ -99,6 +115,8 @@ def _density(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Run the demonstration and print what it measured."""
+    if args.live:
+        return _run_live(args)
     import time
     from dataclasses import replace
 
@@ -122,11 +140,40 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_as_json(result, str(picture), duration_s))
     else:
-        near = os.path.relpath(picture)
-        print_report(result, str(picture) if near.startswith("..") else near, duration_s)
+        print_report(result, _near(picture), duration_s)
         if args.keep_map:
             print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
     return 0 if _complete(result) else 1
+
+
+def _run_live(args: argparse.Namespace) -> int:
+    """Map a drive, and say whether a voxel was lost."""
+    import time
+
+    from shmmap.cli.screens.demo_progress import progress_for
+    from shmmap.cli.screens.live_demo_report import live_demo_json, print_live_report
+    from shmmap.demo.live_drive import LiveDriveSettings, run_live_drive
+    from shmmap.processes.interrupts import signals_interrupt
+
+    if args.keep_map or args.density:
+        raise BadRequest("--live drives in a town of its own", hint="leave out --keep-map and --density")
+    picture = _picture_path(args.svg, "shmmap-demo-live.svg")
+    started_s = time.monotonic()
+    with signals_interrupt(), progress_for(quiet=args.json) as progress:
+        result = run_live_drive(LiveDriveSettings(), progress)
+    duration_s = time.monotonic() - started_s
+    picture.write_text(result.picture_svg, encoding="utf-8")
+    if args.json:
+        print_json(live_demo_json(result, str(picture), duration_s))
+    else:
+        print_live_report(result, _near(picture), duration_s)
+    return 1 if result.differing else 0
+
+
+def _near(picture: Path) -> str:
+    """Its path, as short as it can be told from here."""
+    near = os.path.relpath(picture)
+    return str(picture) if near.startswith("..") else near
 
 
 def _complete(result: DemoResult) -> bool:

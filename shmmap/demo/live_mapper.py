@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program of the live demonstration that maps: it is killed on the way, and started again.
+
+``python -m shmmap.demo.live_mapper ENDPOINT NAME SCANS`` reads the number of a scan a line from stdin, adds
+``SCANS/<number>.npz`` to the live map NAME, and answers with a line of JSON, ``{"applied": n}``: how many are
+in the map by now.  Its first line is ``{"next": n}``, the scan that the map wants next; the last comes after
+the end of stdin, when all are in the map.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from shmmap.chunks.scan_filter import ScanFilter
+from shmmap.errors import InternalError
+
+__all__ = ["FILTER", "main"]
+
+FILTER: Final = ScanFilter(min_range=1.0, max_range=30.0, min_z=-8.0, max_z=12.0)
+"""Which points of the demonstration's scans count."""
+
+
+def main(argv: list[str]) -> int:
+    """Map until stdin ends."""
+    import shmmap
+
+    endpoint, name, scans = argv
+    with shmmap.connect(endpoint, name="demo mapper") as client:
+        with client.live(name).mapper("demo", FILTER) as mapper:
+            _say("next", mapper.applied + 1)
+            for line in sys.stdin:
+                number = int(line)
+                with np.load(Path(scans, f"{number}.npz")) as scan:
+                    sent = mapper.add(scan["xyz"], scan["pose"])
+                if sent != number:
+                    raise InternalError(f"scan {number} was sent as {sent}")
+                _say("applied", mapper.applied)
+            mapper.wait_applied()
+            _say("applied", mapper.applied)
+    return 0
+
+
+def _say(what: str, number: int) -> None:
+    sys.stdout.write(json.dumps({what: number}) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap demo --live``: chunks go and come, daemon and mapping program die, and no voxel is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from shmmap import cli
+from shmmap.cli.screens import demo_progress
+from shmmap.demo import live_drive
+from tests.support.daemon_process import wait_ended
+from tests.support.demo_process import Demo, until
+from tests.support.small_demo import SMALL_LIVE
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def test_nothing_is_lost(tmp_path: Path) -> None:
+    demo = Demo(tmp_path, "--live", "--json", "--svg", "picture.svg")
+    out, err = demo.process.communicate()
+    assert (demo.process.returncode, err) == (0, "")
+    told = json.loads(out)
+    assert sorted(told) == [
+        "active", "active_bytes", "budget_bytes", "came_back", "chunks", "daemon", "differing", "file_bytes",
+        "given_up", "length_m", "mapper", "mapping_s", "most_bytes", "points", "scans", "seconds", "svg",
+        "voxels",
+    ]  # fmt: skip
+    assert told["scans"] == 61
+    assert told["differing"] == 0
+    assert 0 < told["active"] < told["voxels"], "a part of the map is on disk alone"
+    assert told["most_bytes"] <= told["budget_bytes"] == 4 << 20
+    # it went round, and once more along the first streets
+    assert told["given_up"] >= told["came_back"] > 0
+    assert told["daemon"]["killed_at"] == 20
+    assert told["daemon"]["chunks"] > 0, "those that were in memory"
+    assert told["mapper"]["killed_at"] == 40
+    assert told["mapper"]["resumed_at"] in (38, 39, 40, 41), "three scans may have been on their way"
+    picture = ElementTree.parse(told["svg"]).getroot()
+    text = " ".join(element.text or "" for element in picture.iter(f"{SVG}text"))
+    for word in ("61 scans", "height", "on disk only", "sensor's path", "active cells"):
+        assert word in text
+    assert demo.leftovers() == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["picture.svg", "tmp"]
+
+
+STAGES = ("Driving through", "Mapping", "  The daemon is killed", "  The mapping program", "Drawing")
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_interrupted_drive_leaves_nothing(tmp_path: Path, stage: str) -> None:
+    demo = Demo(tmp_path, "--live")
+    until(demo, stage)
+    demo.process.send_signal(signal.SIGINT)
+    assert wait_ended(demo.process.pid)
+    _, err = demo.process.communicate()
+    assert (demo.process.returncode, err) == (130, "")
+    assert demo.leftovers() == []
+    assert [path.name for path in tmp_path.iterdir()] == ["tmp"], "no picture of half a drive"
+
+
+def test_a_voxel_that_differs_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The mapping program gets another scan than the map without bounds had."""
+
+    class Saboteur(demo_progress.QuietProgress):
+        def stage(self, text: str, total: int) -> None:
+            if text.startswith("Mapping"):
+                (scan,) = tmp_path.glob("shmmap-demo-*/scans/7.npz")
+                with np.load(scan) as found:
+                    xyz, pose = found["xyz"], found["pose"]
+                np.savez(scan, xyz=xyz[::2], pose=pose)
+
+    @contextlib.contextmanager
+    def progress(*, quiet: bool) -> Iterator[Saboteur]:
+        assert not quiet
+        yield Saboteur()
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(demo_progress, "progress_for", progress)
+    monkeypatch.setattr(live_drive, "LiveDriveSettings", lambda: SMALL_LIVE)
+    assert cli.main(["demo", "--live", "--svg", str(tmp_path / "picture.svg")]) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert " voxels on disk are NOT as in a map without bounds of the same scans" in out
+
+
+def test_what_is_of_the_other_demonstration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--live", "--density", "4"]) == 2
+    assert "leave out --keep-map and --density" in capsys.readouterr().err
