@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,44 +22,12 @@ from shmmap.errors import BadRequest, ConfigError, LiveInterrupted
 from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT
+from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked
 from tests.support.live_reference import held, reference
 from tests.support.patience import Patience
 from tests.support.slow_occupancy import walk
-
-SETTINGS = """\
-[live.lidar]
-resolution = {resolution}
-linger_s = 0.05
-checkpoint_s = {checkpoint}
-path = "{path}"
-"""
-
-LiveDaemon = Callable[..., DaemonProcess]
-
-
-@pytest.fixture
-def live_daemon(daemon: DaemonFactory, tmp_path: Path) -> LiveDaemon:
-    """Start a daemon that keeps the live map ``lidar`` alone."""
-
-    def make(
-        *flags: str, resolution: float = RESOLUTION, checkpoint: float = 0.2, start: bool = True
-    ) -> DaemonProcess:
-        file = tmp_path / "shmmap.toml"
-        file.write_text(
-            SETTINGS.format(resolution=resolution, checkpoint=checkpoint, path=tmp_path / "lidar")
-        )
-        one: DaemonProcess = daemon("", "--config", str(file), "--live-budget", "16M", *flags, start=start)
-        return one
-
-    return make
-
-
-def worker_of(one: DaemonProcess) -> int:
-    """Id of the live worker."""
-    (found,) = (pid for pid in one.children() if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
-    return found
 
 
 def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -> None:
