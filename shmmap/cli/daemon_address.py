@@ -13,7 +13,7 @@ from shmmap.protocol.endpoint import DEFAULT_INSTANCE, endpoint_path, runtime_di
 if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.reader import Snapshot
+    from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
 

@@ -24,7 +24,7 @@ from shmmap.client.connection import Connection
 from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import candidates
 from shmmap.errors import BadRequest, NoAnswer, ProtocolMismatch
-from shmmap.protocol.events import Beat, Event, EventPage, Recent, decode_event
+from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, decode_event
 
 __all__ = ["EventStream", "Missed"]
 
@@ -175,13 +175,15 @@ class EventStream:
             self._miss(self._highest)
             self.epoch, self._expected, self._highest = epoch, 1, 0
         self._highest = max(self._highest, number)
-        before = number if isinstance(event, Beat) else number - 1
+        numbered = not isinstance(event, UNNUMBERED)
+        before = number - 1 if numbered else number
         if before >= self._expected and not self._try_to_catch_up():
             self._miss(before)
-        if number == self._expected and not isinstance(event, Beat):
-            self._expected += 1
-            if event is not None:
-                self._ready.append(event)
+        if numbered and number != self._expected:
+            return  # a repetition
+        self._expected += numbered
+        if event is not None and not isinstance(event, Beat):
+            self._ready.append(event)
 
     def _miss(self, last: int) -> None:
         """Nobody will ever tell what is missing up to this number: its epoch has ended."""

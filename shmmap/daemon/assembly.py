@@ -154,6 +154,7 @@ class Service:
                 watched.watch(heard.fd, lambda: self._on_signals(heard))
                 self._listen()
                 self._tell_epoch("started")
+                self._live.tell()
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
                 log.info(

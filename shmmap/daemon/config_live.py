@@ -16,7 +16,10 @@ from shmmap.chunks.layout import MOST_FRAME_BYTES
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.errors import ConfigError
 
-__all__ = ["LiveSettings", "live_directory", "live_settings"]
+__all__ = ["SERVICE_STATE", "LiveSettings", "live_directory", "live_settings"]
+
+SERVICE_STATE: Final = "/var/lib/shmmap/state"
+"""Where each instance of the installed service has its state directory (StateDirectory= of the units)."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _RANGES: Final = {

@@ -34,6 +34,7 @@ from typing import Final
 from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
@@ -166,7 +167,8 @@ def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay
         cells_budget_bytes=memory.cache.ledger.budget_bytes, shm_dir=config.live_shm_dir,
         budget_bytes=config.live_budget_bytes, gid=gid, marks_gid=mappers.gid,
     )  # fmt: skip
-    relay = LiveRelay(begin, memory.watched, mappers.allow)
+    events = LiveEvents(memory.event_log, memory.statistics)
+    relay = LiveRelay(begin, memory.watched, mappers.allow, events)
     try:
         relay.start()
         relay.wait_until_serving()

@@ -49,7 +49,9 @@ class UnboundedMap:
         from shmmap.chunks.marking import Marker  # imports compiled kernels
 
         self._marker = Marker(resolution, scan_filter)
-        self._said: dict[ChunkKey, list[tuple[NDArray[np.uint16], NDArray[np.uint64], int]]] = defaultdict(list)
+        self._said: dict[ChunkKey, list[tuple[NDArray[np.uint16], NDArray[np.uint64], int]]] = defaultdict(
+            list
+        )
 
     def add(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
         """Take in a scan: (N, 3) metres in the sensor's frame, and T_map_sensor."""

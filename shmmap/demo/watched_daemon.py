@@ -13,7 +13,8 @@ from typing import Final
 
 from shmmap.demo.process_cpu import cpu_seconds
 from shmmap.demo.process_memory import descendants
-from shmmap.statistics.reader import Snapshot, read_statistics
+from shmmap.statistics.reader import read_statistics
+from shmmap.statistics.snapshot import Snapshot
 from shmmap.testing.daemon_process import DaemonProcess
 
 __all__ = ["Traffic", "WatchedDaemon", "statistics_now"]

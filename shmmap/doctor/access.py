@@ -16,7 +16,15 @@ from shmmap.doctor.patient import Patient
 from shmmap.errors import DaemonUnreachable, NoAnswer, NoSocket, ProtocolMismatch, SocketPermission
 from shmmap.quantities import counted
 
-__all__ = ["check_group", "check_map_access", "check_socket"]
+__all__ = [
+    "account_name",
+    "check_group",
+    "check_map_access",
+    "check_socket",
+    "drop_ins",
+    "group_name",
+    "groups_of",
+]
 
 ANSWER_S: Final = 2.0
 LOOKED_AT: Final = 256
@@ -24,22 +32,24 @@ LOOKED_AT: Final = 256
 _UNITS: Final = "/etc/systemd/system"
 
 
-def _account(uid: int) -> str:
+def account_name(uid: int) -> str:
+    """Return what an account is called."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
         return str(uid)
 
 
-def _group(gid: int) -> str:
+def group_name(gid: int) -> str:
+    """Return what a group is called."""
     try:
         return grp.getgrgid(gid).gr_name
     except KeyError:
         return str(gid)
 
 
-def _groups(uid: int) -> set[int]:
-    """Groups of an account as its next login has them."""
+def groups_of(uid: int) -> set[int]:
+    """Return the groups of an account as its next login has them."""
     try:
         entry = pwd.getpwuid(uid)
     except KeyError:
@@ -70,12 +80,12 @@ def check_group(patient: Patient) -> Finding:
             pass
     if gid < 0:
         return ok(name, "none is set: only the daemon's own user may connect")
-    group, account = _group(gid), _account(patient.uid)
+    group, account = group_name(gid), account_name(patient.uid)
     if patient.uid in (0, patient.runs_as):
         return ok(name, f"members of {group} may connect; {account} may anyway")
     if gid in (os.getegid(), *os.getgroups()):
         return ok(name, f"{account} is a member of {group}")
-    if gid in _groups(patient.uid):
+    if gid in groups_of(patient.uid):
         return warn(
             name,
             f"{account} joined {group}, this session is older",
@@ -119,12 +129,14 @@ def _access(path: str) -> str:
         status = os.stat(path)
     except OSError:
         return "its directory is closed to this user"
-    return f"{stat.filemode(status.st_mode)} {_account(status.st_uid)}:{_group(status.st_gid)}"
+    return f"{stat.filemode(status.st_mode)} {account_name(status.st_uid)}:{group_name(status.st_gid)}"
 
 
 def check_map_access(patient: Patient) -> Finding:
     """Can the daemon read the map, wherever it lies?"""
     name, path = "map", patient.map_path
+    if not path and (patient.config.live or (patient.seen is not None and patient.seen.live)):
+        return ok(name, "none is served: the daemon keeps live maps alone")
     if not path:
         return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
     if patient.alive:
@@ -155,13 +167,14 @@ def check_map_access(patient: Patient) -> Finding:
     if closed:
         return fail(
             name,
-            f"{_account(uid)} may not read {closed}",
+            f"{account_name(uid)} may not read {closed}",
             f"chmod -R a+rX {path}, and a+x on what is above it",
         )
-    return ok(name, f"{path} can be read by {_account(uid)}")
+    return ok(name, f"{path} can be read by {account_name(uid)}")
 
 
-def _drop_ins(patient: Patient) -> str:
+def drop_ins(patient: Patient) -> str:
+    """Return what was added to the service's unit."""
     directory = patient.machine.path(f"{_UNITS}/shmmapd.service.d")
     try:
         return "\n".join(one.read_text(errors="replace") for one in sorted(directory.glob("*.conf")))
@@ -172,7 +185,7 @@ def _drop_ins(patient: Patient) -> str:
 def _shown_to_service(patient: Patient, path: str) -> bool:
     shown = [
         word.split(":")[0].strip('"')
-        for line in _drop_ins(patient).splitlines()
+        for line in drop_ins(patient).splitlines()
         if line.startswith(("BindReadOnlyPaths=", "BindPaths="))
         for word in line.split("=", 1)[1].split()
     ]
@@ -191,7 +204,7 @@ def _closed_to(uid: int, path: str, *, parents: bool) -> str:
     """First directory or file on the way to ``path`` that an account may not pass or read; or empty."""
     if uid == 0:
         return ""
-    groups = _groups(uid)
+    groups = groups_of(uid)
     real = os.path.realpath(path)
     above = [os.path.dirname(real)]
     while above[-1] != "/":

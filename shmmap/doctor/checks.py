@@ -11,6 +11,7 @@ from shmmap.doctor.cells import check_cells
 from shmmap.doctor.finding import Finding
 from shmmap.doctor.kernel import check_descriptors, check_pins
 from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
+from shmmap.doctor.live import check_live_disk, check_live_maps, check_live_memory
 from shmmap.doctor.memory import (
     check_cache,
     check_container,
@@ -34,6 +35,9 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_memory_limit,
     check_container,
     check_huge_pages,
+    check_live_maps,
+    check_live_disk,
+    check_live_memory,
     check_pins,
     check_descriptors,
     check_leftovers,

@@ -15,6 +15,7 @@ from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes
+from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
 
 __all__ = ["check_daemon", "check_leftovers", "check_logind", "check_reload"]
@@ -22,7 +23,10 @@ __all__ = ["check_daemon", "check_leftovers", "check_logind", "check_reload"]
 SYSTEM_UIDS: Final = 999
 """logind spares the accounts below (SYS_UID_MAX, as Debian, Ubuntu, Fedora and systemd itself have it)."""
 
-_SEGMENT: Final = re.compile(r"shmmap\.([A-Za-z0-9_-]{1,64})\.[0-9a-f]{16}(\.zombie)?")
+_SEGMENT: Final = re.compile(r"shmmap\.([A-Za-z0-9_-]{1,64})\.[0-9a-f]{16}(?:\.zombie)?")
+_CHUNK: Final = re.compile(
+    r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+(?:\.gone)?"
+)
 
 
 def check_daemon(patient: Patient) -> Finding:
@@ -72,15 +76,18 @@ def check_leftovers(patient: Patient) -> Finding:
     """Is memory held by segments that no daemon looks after?"""
     name = "leftovers"
     found: dict[str, tuple[int, int]] = {}
+    with_chunks: set[str] = set()
     try:
         with os.scandir(patient.machine.path(patient.shm_dir)) as entries:
             for entry in entries:
-                match = _SEGMENT.fullmatch(entry.name)
+                chunk = _CHUNK.fullmatch(entry.name)
+                match = chunk or _SEGMENT.fullmatch(entry.name)
                 with contextlib.suppress(FileNotFoundError):  # a daemon that lives frees some meanwhile
                     if match:
                         held = entry.stat(follow_symlinks=False).st_blocks * 512
                         count, nbytes = found.get(match[1], (0, 0))
                         found[match[1]] = (count + 1, nbytes + held)
+                        with_chunks |= {match[1]} if chunk else set()
     except OSError as error:
         return warn(name, f"{patient.shm_dir}: {error.strerror}", "run it with sudo")
     orphans = {name: held for name, held in found.items() if not _looked_after(patient, name)}
@@ -90,6 +97,12 @@ def check_leftovers(patient: Patient) -> Finding:
         f"{one}: {counted(count, 'segment')}, {format_bytes(n)}"
         for one, (count, n) in sorted(orphans.items())
     )
+    if with_chunks & set(orphans):
+        return warn(
+            name,
+            f"segments and chunks of live maps of daemons that do not run: {listed}",
+            "start that instance with its live maps: chunks may be in memory alone, and are saved then",
+        )
     return warn(
         name,
         f"segments of daemons that do not run: {listed}",
@@ -100,8 +113,10 @@ def check_leftovers(patient: Patient) -> Finding:
 def _looked_after(patient: Patient, instance: str) -> bool:
     if instance == patient.config.instance:
         return patient.alive or patient.seen is None
+    places = {patient.shm_dir, usual_directory(instance)}  # live maps may be elsewhere than cells
     try:
-        return read_statistics(instance, patient.shm_dir).state not in ("dead", "absent")
+        states = [read_statistics(instance, place).state for place in places]
+        return any(state not in ("dead", "absent") for state in states)
     except (ShmmapError, OSError):
         return True  # not ours to judge
 

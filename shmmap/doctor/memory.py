@@ -14,7 +14,14 @@ from shmmap.doctor.patient import Machine, Patient
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
-__all__ = ["check_cache", "check_container", "check_huge_pages", "check_memory_limit", "check_shared_memory"]
+__all__ = [
+    "check_cache",
+    "check_container",
+    "check_huge_pages",
+    "check_memory_limit",
+    "check_shared_memory",
+    "mount_of",
+]
 
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
 OVERHEAD_BYTES: Final = 512 << 20
@@ -27,7 +34,8 @@ class _Mount(NamedTuple):
     options: tuple[str, ...]
 
 
-def _mount_of(machine: Machine, path: str) -> _Mount:
+def mount_of(machine: Machine, path: str) -> _Mount:
+    """Return the mount that a path is on."""
     found = _Mount("/", "unknown", ())
     for line in machine.text("/proc/self/mounts").splitlines():
         _, point, kind, options, *_ = line.split()
@@ -45,7 +53,7 @@ def check_shared_memory(patient: Patient) -> Finding:
         state = os.statvfs(patient.machine.path(path))
     except OSError as error:
         return fail(name, f"{path}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
-    mount = _mount_of(patient.machine, path)
+    mount = mount_of(patient.machine, path)
     if mount.kind not in ("tmpfs", "ramfs", "unknown"):
         return fail(
             name,
@@ -150,7 +158,7 @@ def check_memory_limit(patient: Patient) -> Finding:
 def check_huge_pages(patient: Patient) -> Finding:
     """Are segments on huge pages, and does that pay on this kernel?"""
     name, machine = "huge pages", patient.machine
-    mount = _mount_of(machine, patient.shm_dir)
+    mount = mount_of(machine, patient.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
     switch = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled"))
     release = machine.text("/proc/sys/kernel/osrelease")

@@ -14,7 +14,8 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.errors import ShmmapError
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import usual_directory
-from shmmap.statistics.reader import Snapshot, read_statistics
+from shmmap.statistics.reader import read_statistics
+from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["Machine", "Patient", "examine"]
 
@@ -107,11 +108,16 @@ class Patient:
         return pid if self.machine.path(f"/proc/{pid}").exists() else 0
 
     @property
+    def is_service(self) -> bool:
+        """Whether the settings are those of the installed service."""
+        return self.file.startswith("/etc/") and self.machine.path(_UNIT).exists()
+
+    @property
     def runs_as(self) -> int:
         """Account of the daemon: the living one's, else the installed service's, else who asks."""
         if self.pid:
             return self.machine.path(f"/proc/{self.pid}").stat().st_uid
-        if self.file.startswith("/etc/") and self.machine.path(_UNIT).exists():
+        if self.is_service:
             try:
                 return pwd.getpwnam("shmmap").pw_uid
             except KeyError:

@@ -2,7 +2,8 @@
 """What the daemon tells everybody who listens.  ``PROTOCOL.md`` is the byte-exact document.
 
 An event is one MessagePack array: its kind, its number, the epoch it belongs to, when it happened, and
-what happened.  Events of one epoch are numbered from 1 without gaps, so that whoever misses one knows.
+what happened.  Events of one epoch are numbered from 1 without gaps, so that whoever misses one knows;
+`UNNUMBERED` ones have the number of the last that is.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import msgspec
 from shmmap.errors import ProtocolMismatch
 
 __all__ = [
+    "UNNUMBERED",
     "Beat",
     "Changed",
     "Epoch",
@@ -24,6 +26,11 @@ __all__ = [
     "Failed",
     "Joined",
     "Left",
+    "LiveChanged",
+    "LiveDamaged",
+    "LiveEnded",
+    "LiveProblem",
+    "LiveStarted",
     "Loaded",
     "LongTurn",
     "Pressure",
@@ -164,6 +171,43 @@ class Left(_Numbered, tag="left", frozen=True):
     bytes: int
 
 
+class LiveStarted(_Numbered, tag="live_started", frozen=True):
+    """The process that keeps live maps serves them; so many chunks it found in memory."""
+
+    maps: int
+    chunks: int
+
+
+class LiveEnded(_Numbered, tag="live_ended", frozen=True):
+    """The process that keeps live maps ended, for the ``restarts``-th time, and is started anew."""
+
+    restarts: int
+
+
+class LiveProblem(_Numbered, tag="live_problem", frozen=True):
+    """What keeps chunks of a live map from being loaded or saved; empty: nothing does any more."""
+
+    map: str
+    problem: str
+
+
+class LiveDamaged(_Numbered, tag="live_damaged", frozen=True):
+    """A file of a live map was damaged and put aside, or a chunk is missing: which, and why."""
+
+    map: str
+    what: str
+
+
+class LiveChanged(_Numbered, tag="live_changed", frozen=True):
+    """A live map has changed; ``change`` is the number of its last change, as in `LiveChunkPage`.
+
+    Sent at most twice a second for a map, and not remembered: whoever misses one hears the next.
+    """
+
+    map: str
+    change: int
+
+
 class Beat(_Numbered, tag="beat", frozen=True):
     """Nothing happened: ``seq`` is the last event's number.
 
@@ -183,8 +227,17 @@ Event: TypeAlias = (
     | LongTurn
     | Joined
     | Left
+    | LiveStarted
+    | LiveEnded
+    | LiveProblem
+    | LiveDamaged
+    | LiveChanged
     | Beat
 )
+
+
+UNNUMBERED: Final = (LiveChanged, Beat)
+"""Kinds that take no number: ``seq`` is the last event's, and the daemon does not remember them."""
 
 
 class Recent(msgspec.Struct, array_like=True, tag="recent"):

@@ -179,6 +179,8 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
         Who has mapped, ``uid/name``.
     problem
         What keeps chunks from being saved or loaded just now; empty: nothing.
+    change
+        Number of the map's last change, as in `LiveChunkPage`.
     """
 
     name: str
@@ -202,6 +204,7 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
     damaged: tuple[str, ...] = ()
     mappers: tuple[str, ...] = ()
     problem: str = ""
+    change: int = 0
 
 
 class LiveListed(msgspec.Struct, array_like=True, tag="live_listed"):

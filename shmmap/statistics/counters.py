@@ -98,6 +98,9 @@ COUNTERS: Final = (
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
+    Counter(
+        "live_restarts", "counter", "", "Times the process that keeps live maps ended, and was started anew"
+    ),
     *(
         Counter(f"longest_turn_{kind}_ns", "gauge", "ns", f"Longest turn in which {text}")
         for kind, text in TURN_KINDS.items()

@@ -16,6 +16,7 @@ from shmmap.statistics.cell_rows import CELL_ROW_BYTES, MAX_CELLS
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS
 from shmmap.statistics.counters import Counter
 from shmmap.statistics.histogram import BUCKETS
+from shmmap.statistics.live_rows import LIVE_ROW_BYTES, MAX_LIVE
 
 __all__ = [
     "LAYOUT_VERSION",
@@ -31,12 +32,12 @@ __all__ = [
 ]
 
 MAGIC: Final = b"SHMSTAT\x01"
-LAYOUT_VERSION: Final = (1, 2)
+LAYOUT_VERSION: Final = (1, 3)
 BYTE_ORDER: Final = 0x01020304
 PAGE_BYTES: Final = 4096
 
 START: Final = struct.Struct("<8sHHI12I")
-EXTENSION: Final = struct.Struct("<6I36xI")
+EXTENSION: Final = struct.Struct("<9I24xI")
 DESCRIPTIONS_OFFSET: Final = START.size + EXTENSION.size
 DESCRIPTION: Final = struct.Struct("<32s16sB111s")
 IDENTITY: Final = struct.Struct("<QII")
@@ -69,6 +70,9 @@ class Header(NamedTuple):
     client_row_bytes: int = 0
     max_clients: int = 0
     changes_offset: int = 0
+    live_offset: int = 0
+    live_row_bytes: int = 0
+    max_live: int = 0
 
     @property
     def descriptions_end(self) -> int:
@@ -103,6 +107,7 @@ def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Hea
     table_offset = state_offset + 2 * state_bytes
     changes_offset = table_offset + 64
     clients_offset = _up(changes_offset + 64, PAGE_BYTES)
+    live_offset = _up(clients_offset + MAX_CLIENTS * CLIENT_ROW_BYTES, PAGE_BYTES)
     return Header(
         counters=tuple(counters),
         identity_offset=identity_offset,
@@ -110,7 +115,7 @@ def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Hea
         state_offset=state_offset,
         state_bytes=state_bytes,
         table_offset=table_offset,
-        rows_offset=_up(clients_offset + MAX_CLIENTS * CLIENT_ROW_BYTES, PAGE_BYTES),
+        rows_offset=_up(live_offset + MAX_LIVE * LIVE_ROW_BYTES, PAGE_BYTES),
         row_bytes=CELL_ROW_BYTES,
         max_rows=MAX_CELLS,
         histograms=tuple(histograms),
@@ -119,6 +124,9 @@ def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Hea
         client_row_bytes=CLIENT_ROW_BYTES,
         max_clients=MAX_CLIENTS,
         changes_offset=changes_offset,
+        live_offset=live_offset,
+        live_row_bytes=LIVE_ROW_BYTES,
+        max_live=MAX_LIVE,
     )
 
 
@@ -178,9 +186,7 @@ def unpack_header(data: bytes) -> Header:
     header = Header(counters, *places)
     if at < START.size + EXTENSION.size:  # layout 1.0
         return header
-    histogram_count, buckets, clients_at, client_row, max_clients, changes_at, crc = EXTENSION.unpack_from(
-        data, START.size
-    )
+    histogram_count, buckets, *tables, crc = EXTENSION.unpack_from(data, START.size)
     last = end + histogram_count * row
     if last > len(data):
         raise SegmentCorrupt("the statistics' histogram table lies outside the segment")
@@ -191,10 +197,7 @@ def unpack_header(data: bytes) -> Header:
     return header._replace(
         histograms=_unpack_descriptions(data, end, histogram_count, row),
         bucket_count=buckets,
-        clients_offset=clients_at,
-        client_row_bytes=client_row,
-        max_clients=max_clients,
-        changes_offset=changes_at,
+        **dict(zip(Header._fields[11:], tables, strict=True)),
     )
 
 

@@ -6,13 +6,30 @@ https://prometheus.io/docs/instrumenting/exposition_formats/ says what a line ma
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from shmmap.statistics.counters import SPANS, WINDOWED
 from shmmap.statistics.histogram import STEPS, Histogram, lower_bound_ns
-from shmmap.statistics.reader import Snapshot
+from shmmap.statistics.live_rows import LiveRow
+from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["exposition"]
+
+_LIVE = {
+    # attribute of a row: name, kind, help
+    "states": ("chunks", "gauge", "Chunks by state; evicting ones were given up and are still mapped"),
+    "bytes": ("bytes", "gauge", "Memory of chunks in service"),
+    "evicting_bytes": ("evicting_bytes", "gauge", "Memory of chunks given up that somebody still maps"),
+    "waiting_bytes": ("waiting_bytes", "gauge", "Scans that wait for chunks or for memory"),
+    "budget_bytes": ("budget_bytes", "gauge", "Most memory of the map's chunks"),
+    "active": ("active_voxels", "gauge", "Known voxels in memory"),
+    "files": ("files", "gauge", "Chunks on disk"),
+    "file_bytes": ("file_bytes", "gauge", "Chunks on disk: bytes of their files"),
+    "scans": ("scans_applied_total", "counter", "Scans applied"),
+    "durable": ("scans_durable_total", "counter", "Scans applied that are on disk"),
+    "damaged": ("damaged_files", "gauge", "Files put aside as damaged, and chunks that are missing"),
+    "failing": ("failing", "gauge", "1 while chunks cannot be loaded or saved"),
+}
 
 _TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
 
@@ -68,11 +85,26 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
         if counter.kind == "counter":
             name += "_total"
         yield from one(name, counter.kind, counter.help, value)
+    yield from _live_maps(found.live, label)
     for described in found.histogram_descriptions:
         name = f"shmmap_{described.name}_seconds"
         yield f"# HELP {name} {_escaped_help(described.help)}"
         yield f"# TYPE {name} histogram"
         yield from _histogram(name, label, found.histograms[described.name])
+
+
+def _live_maps(rows: Sequence[LiveRow], label: str) -> Iterator[str]:
+    """Each family once, with a sample for each map."""
+    labels = [f'{label},map="{_escaped(row.name)}"' for row in rows]
+    for field, (name, kind, text) in _LIVE.items() if rows else ():
+        yield f"# HELP shmmap_live_{name} {_escaped_help(text)}"
+        yield f"# TYPE shmmap_live_{name} {kind}"
+        for row, mine in zip(rows, labels, strict=True):
+            if field == "states":
+                for state, count in row.states.items():
+                    yield f'shmmap_live_{name}{{{mine},state="{state}"}} {count}'
+            else:
+                yield f"shmmap_live_{name}{{{mine}}} {int(getattr(row, field))}"
 
 
 def _histogram(name: str, label: str, histogram: Histogram) -> Iterator[str]:

@@ -9,18 +9,11 @@ from __future__ import annotations
 import os
 import stat
 import time
-from collections.abc import Callable
-from functools import cached_property
 from types import TracebackType
-from typing import Literal, TypeVar
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.names import statistics_name
-from shmmap.statistics.cell_rows import CellRow, unpack_cell
-from shmmap.statistics.client_rows import ClientRow, unpack_client
-from shmmap.statistics.counters import Counter
-from shmmap.statistics.histogram import Histogram
-from shmmap.statistics.identity import DaemonIdentity, DaemonState, WriterProcess
+from shmmap.statistics.identity import DaemonIdentity, WriterProcess
 from shmmap.statistics.layout import (
     IDENTITY,
     TABLE,
@@ -30,122 +23,14 @@ from shmmap.statistics.layout import (
     unpack_identity,
     unpack_state,
 )
+from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["Snapshot", "StatisticsReader", "read_statistics"]
-
-_Row = TypeVar("_Row")
+__all__ = ["StatisticsReader", "read_statistics"]
 
 _ATTEMPTS = 100
 _TABLE_ATTEMPTS = 16
 _HEADER_BYTES = 16384
 _DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108  as shmmap.segment.directory, which would load numpy
-
-
-class Snapshot:
-    """The statistics at one moment.
-
-    Attributes
-    ----------
-    state : str
-        ``healthy``; ``stopped`` (SIGSTOP, a debugger); ``hung`` (runs, but has not beaten for 5 s);
-        ``dead`` (the process is gone and left its segment); ``absent`` (no segment: never started,
-        or stopped cleanly).  All but ``absent`` come with an identity.
-    identity : DaemonIdentity or None
-        Who wrote the statistics; None when absent.
-    beat_age_s : float
-        Seconds since the daemon last wrote; infinite when absent.
-    beat_monotonic_ns : int
-        When that was, CLOCK_MONOTONIC.
-    rows_missing : int
-        Cells the table had no room for.
-    size_bytes : int
-        Memory of the segment.
-    """
-
-    def __init__(
-        self,
-        state: DaemonState | Literal["absent"],
-        identity: DaemonIdentity | None,
-        header: Header | None = None,
-        values: State | None = None,
-        *,
-        beat_age_s: float = float("inf"),
-        size_bytes: int = 0,
-        rows: bytes = b"",
-        clients: bytes = b"",
-    ) -> None:
-        self.state: DaemonState | Literal["absent"] = state
-        self.identity = identity
-        self.beat_age_s = beat_age_s
-        self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
-        self.rows_missing = values.rows_missing if values is not None else 0
-        self.size_bytes = size_bytes
-        self._header = header
-        self._values = values
-        self._rows = rows
-        self._clients = clients
-
-    @cached_property
-    def counters(self) -> dict[str, int]:
-        """Values by name."""
-        if self._header is None or self._values is None:
-            return {}
-        names = (counter.name for counter in self._header.counters)
-        return dict(zip(names, self._values.values, strict=False))
-
-    @property
-    def descriptions(self) -> tuple[Counter, ...]:
-        """What the counters mean, in the daemon's order."""
-        return self._header.counters if self._header is not None else ()
-
-    @property
-    def histogram_descriptions(self) -> tuple[Counter, ...]:
-        """What the histograms mean, in the daemon's order."""
-        return self._header.histograms if self._header is not None else ()
-
-    @cached_property
-    def histograms(self) -> dict[str, Histogram]:
-        """Durations by name."""
-        if self._header is None or self._values is None:
-            return {}
-        step = 1 + self._header.bucket_count
-        values = self._values.histograms
-        return {
-            description.name: Histogram.of(values[index * step : (index + 1) * step])
-            for index, description in enumerate(self._header.histograms)
-            if (index + 1) * step <= len(values)
-        }
-
-    @cached_property
-    def cells(self) -> list[CellRow]:
-        """The segments the daemon keeps, in id order, then layer and version.
-
-        A row the daemon was changing at that very moment (it was stopped in mid-write) is left out.
-        """
-        step = self._header.row_bytes if self._header is not None else 0
-        return sorted(
-            _in_use(self._rows, step, unpack_cell), key=lambda row: (row.id, row.layer, row.version)
-        )
-
-    @cached_property
-    def clients(self) -> list[ClientRow]:
-        """The clients there is room for in the table, in the order they came."""
-        step = self._header.client_row_bytes if self._header is not None else 0
-        return _in_use(self._clients, step, unpack_client)
-
-
-def _in_use(data: bytes, step: int, unpack: Callable[[memoryview], _Row | None]) -> list[_Row]:
-    """The rows of a table that are in use, but for those that were being changed."""
-    found = []
-    view = memoryview(data)
-    for at in range(0, len(view) - step + 1, step) if step else ():
-        try:
-            row = unpack(view[at : at + step])
-        except SegmentCorrupt:
-            continue
-        if row is not None:
-            found.append(row)
-    return found
 
 
 class StatisticsReader:
@@ -237,6 +122,7 @@ class StatisticsReader:
             size_bytes=status.st_blocks * 512,
             rows=_rows(self._fd, header, state.rows_used) if tables and cells else b"",
             clients=_clients(self._fd, header, state.clients_used) if tables else b"",
+            live=_live(self._fd, header) if tables else b"",
         )
 
     def _who(self, header: Header) -> tuple[DaemonIdentity, WriterProcess]:
@@ -340,6 +226,11 @@ def _rows(fd: int, header: Header, used: int) -> bytes:
 def _clients(fd: int, header: Header, used: int) -> bytes:
     nbytes = min(used, header.max_clients) * header.client_row_bytes
     return os.pread(fd, _within(fd, header.clients_offset, nbytes), header.clients_offset)
+
+
+def _live(fd: int, header: Header) -> bytes:
+    nbytes = _within(fd, header.live_offset, header.max_live * header.live_row_bytes)
+    return os.pread(fd, nbytes, header.live_offset)
 
 
 def _within(fd: int, offset: int, nbytes: int) -> int:

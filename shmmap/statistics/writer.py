@@ -36,6 +36,8 @@ from shmmap.statistics.layout import (
     pack_state,
     plan,
 )
+from shmmap.statistics.live_rows import LIVE_ROW_BYTES, MAX_LIVE, LiveRow, pack_live
+from shmmap.statistics.row_table import RowTable
 
 __all__ = ["StatisticsWriter"]
 
@@ -107,9 +109,13 @@ class StatisticsWriter:
         self._free: list[int] = []
         self._used = 0
         self._allocated = 0
-        self._clients: list[ClientRow | None] = []
-        self._clients_allocated = _CLIENTS_A_PAGE
-        self._clients_used = 0
+        self._clients: RowTable[ClientRow] = RowTable(
+            self._layout.clients_offset, CLIENT_ROW_BYTES, MAX_CLIENTS, pack_client, self._write,
+            self._allocate, allocated=_CLIENTS_A_PAGE,
+        )  # fmt: skip
+        self._live: RowTable[LiveRow] = RowTable(
+            self._layout.live_offset, LIVE_ROW_BYTES, MAX_LIVE, pack_live, self._write, self._allocate
+        )
         self._changed: dict[Hashable, CellRow] = {}
         self._missing: dict[Hashable, CellRow] = {}  # there was no room for these, or no writing them
         self._removed: list[int] = []
@@ -166,25 +172,11 @@ class StatisticsWriter:
 
     def show_clients(self, rows: Sequence[ClientRow]) -> None:
         """Show these clients, from the next beat on; at most 256, and as many as there is room for."""
-        count = min(len(rows), self._room_for_clients(min(len(rows), MAX_CLIENTS)))
-        self._clients += [None] * (count - len(self._clients))
-        self._clients_used = 0
-        for index, row in enumerate(rows[:count]):
-            place = self._layout.clients_offset + index * CLIENT_ROW_BYTES
-            if self._clients[index] != row and not self._write(pack_client(row), place):
-                break
-            self._clients[index] = row
-            self._clients_used += 1
+        self._clients.show(rows)
 
-    def _room_for_clients(self, wanted: int) -> int:
-        """Allocate rows as clients come, a page at a time; returns how many there are."""
-        while self._clients_allocated < wanted:
-            nbytes = _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
-            start = self._layout.clients_offset + self._clients_allocated * CLIENT_ROW_BYTES
-            if not self._allocate(start, nbytes):
-                break
-            self._clients_allocated += _CLIENTS_A_PAGE
-        return self._clients_allocated
+    def show_live_maps(self, rows: Sequence[LiveRow]) -> None:
+        """Show these live maps, always the same in the same order; at most 64."""
+        self._live.show(rows)
 
     def cell_changed(self, key: Hashable, row: CellRow) -> None:
         """Show ``row`` under ``key`` from one of the next beats on; it is read only then."""
@@ -236,7 +228,7 @@ class StatisticsWriter:
             self._used,
             len(self._missing),
             tuple(self.values.values()),
-            self._clients_used,
+            self._clients.used,
             tuple(chain.from_iterable(self._durations.values())),
         )
         block = self._layout.state_offset + sequence % 2 * self._layout.state_bytes

@@ -13,6 +13,7 @@ import pytest
 from shmmap.testing.fixtures import judged_daemons
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
+from tests.support.live_daemon import SETTINGS, LiveDaemon
 from tests.support.live_drive import RESOLUTION
 from tests.support.raw_client import RawClient
 
@@ -95,3 +96,20 @@ def connect(daemon: DaemonFactory) -> Iterator[Callable[..., RawClient]]:
 def divided_map(tmp_path: Path) -> DividedMap:
     """Return a map of 6 x 6 cells of 20 m, 500 points each, about the origin."""
     return make_map(tmp_path / "map")
+
+
+@pytest.fixture
+def live_daemon(daemon: DaemonFactory, tmp_path: Path) -> LiveDaemon:
+    """Start a daemon that keeps the live map ``lidar`` alone."""
+
+    def make(
+        *flags: str, resolution: float = RESOLUTION, checkpoint: float = 0.2, start: bool = True
+    ) -> DaemonProcess:
+        file = tmp_path / "shmmap.toml"
+        file.write_text(
+            SETTINGS.format(resolution=resolution, checkpoint=checkpoint, path=tmp_path / "lidar")
+        )
+        one: DaemonProcess = daemon("", "--config", str(file), "--live-budget", "16M", *flags, start=start)
+        return one
+
+    return make

@@ -21,18 +21,13 @@ from shmmap.client.live.live_map import Sphere
 from shmmap.errors import BadRequest, ConfigError, LiveInterrupted
 from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
-from tests.process.conftest import DaemonFactory, LiveDaemon
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT
+from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked
 from tests.support.live_reference import held, reference
 from tests.support.patience import Patience
 from tests.support.slow_occupancy import walk
-
-
-def worker_of(one: DaemonProcess) -> int:
-    """Id of the live worker."""
-    (found,) = (pid for pid in one.children() if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
-    return found
 
 
 def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -> None:

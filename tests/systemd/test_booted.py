@@ -263,6 +263,29 @@ def test_a_second_daemon_of_an_instance_stays_down(fresh: BootedSystemd) -> None
         fresh.shell("rm /etc/shmmap/default.toml")
 
 
+def test_live_maps_have_a_place_and_the_rights_that_they_need(fresh: BootedSystemd) -> None:
+    fresh.shell("""
+        mkdir -p /run/systemd/system/shmmapd.service.d
+        printf '[Service]\nEnvironment=SHMMAP_LIVE=lidar SHMMAP_LIVE_GROUP=shmmap\n' \
+            >/run/systemd/system/shmmapd.service.d/test.conf
+        systemctl daemon-reload
+        systemctl start shmmapd
+    """)
+    done = shmmap(fresh, "status", "--json", user="alice")
+    assert [row["name"] for row in json.loads(done.stdout)["live"]] == ["lidar"], done.stderr
+    places = "/var/lib/shmmap /var/lib/shmmap/state/default /var/lib/shmmap/state/default/live/lidar"
+    assert fresh.shell(f"stat -c '%a %U:%G' {places} /dev/shm/shmmap-live.default.marks").splitlines() == [
+        "755 root:root",
+        "750 shmmap:shmmap",
+        "700 shmmap:shmmap",
+        "1770 shmmap:shmmap",
+    ]
+    fresh.run("systemctl", "stop", "shmmapd")
+    unit = fresh.properties("shmmapd")
+    assert (unit["ActiveState"], unit["Result"], unit["ExecMainStatus"]) == ("inactive", "success", "0")
+    assert fresh.shell("ls /dev/shm") == ""
+
+
 def test_administrators_reload_and_stop(fresh: BootedSystemd) -> None:
     fresh.shell("""
         mkdir -p /run/systemd/system/shmmapd.service.d

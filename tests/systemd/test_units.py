@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.config_live import SERVICE_STATE, live_directory
+from shmmap.daemon.live.relay import END_S, START_S
 from shmmap.errors import (
     BadRequest,
     CannotStart,
@@ -88,6 +90,7 @@ def test_templates_differ_only_by_their_instance() -> None:
     assert [b for _, b in changed(*(UNITS / "system" / f"shmmapd{at}.service" for at in ("", "@")))] == [
         "Description=Point-cloud map %i in shared memory",
         "ExecStart=/usr/bin/shmmapd --instance %i --config %E/shmmap/%i.toml",
+        "StateDirectory=shmmap/state/%i",
     ]
     assert [b for _, b in changed(*(UNITS / "system" / f"shmmapd{at}.socket" for at in ("", "@")))] == [
         "Description=Requests for the point-cloud map %i in shared memory",
@@ -161,6 +164,28 @@ def test_what_can_get_better_is_tried_for_ever_after_a_growing_pause(path: Path,
     }
     stop_s = int(unit["Service"]["TimeoutStopSec"])
     assert stop_s > 20, "else systemd would cut the pause short"
+
+
+@pytest.mark.parametrize("path", SERVICES)
+def test_there_is_time_to_load_and_to_save_live_maps(path: Path) -> None:
+    """The daemon gives up first, and says why."""
+    service = parsed(path)["Service"]
+    assert int(service["TimeoutStartSec"]) > START_S
+    assert int(service["TimeoutStopSec"]) > END_S
+
+
+@pytest.mark.parametrize("path", [*(UNITS / "system").glob("*.service")], ids=lambda path: path.name)
+def test_live_maps_have_a_place_of_their_own(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the maps that are served: systemd gives all of it to the service's account."""
+    service = parsed(path)["Service"]
+    instance = "%i" if "@" in path.name else "default"
+    monkeypatch.setenv("STATE_DIRECTORY", f"/var/lib/{service['StateDirectory']}")
+    assert live_directory(instance, "lidar") == f"/var/lib/shmmap/state/{instance}/live/lidar"
+    assert f"{SERVICE_STATE}/{instance}" == f"/var/lib/{service['StateDirectory']}"
+    assert service["StateDirectoryMode"] == "0750"
+    tmpfiles = (UNITS / "tmpfiles.d" / "shmmap.conf").read_text()
+    assert "/var/lib/shmmap/maps " in tmpfiles
+    assert "/var/lib/shmmap/state" not in tmpfiles
 
 
 @pytest.mark.parametrize("path", SERVICES)

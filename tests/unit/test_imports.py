@@ -64,8 +64,8 @@ PARTS = {
     "service": BASE,
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
-        "daemon.config", "daemon.config_file", "daemon.prerequisites", "daemon.pins.probe",
-        "daemon.service_manager",
+        "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
+        "daemon.pins.probe", "daemon.service_manager",
     },
     "simulation": BASE | {"formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},

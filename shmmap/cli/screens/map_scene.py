@@ -26,6 +26,11 @@ GLYPHS: Final = {
     "stale": ("s", "yellow"),
     "zombie": ("r", "magenta"),
     "disk": (".", "bright_black"),
+    "saved": (".", "bright_black"),
+    "clean": ("#", "green"),
+    "loading": ("l", "bright_black"),
+    "saving": ("w", "cyan"),
+    "dirty": ("d", "blue"),
     "window": ("o", "red"),
     "client": ("@", "bold red"),
     "none": (" ", ""),
@@ -54,6 +59,8 @@ class Scene:
         Two lines.
     empty
         There is nothing to draw, not even on disk.
+    chunks
+        Columns of chunks of a live map, drawn instead of cells.
     """
 
     bounds: BoxTuple
@@ -64,6 +71,7 @@ class Scene:
     title: str
     note: str
     empty: bool = False
+    chunks: Sequence[CellSquare] = ()
 
     def by_cell(self) -> dict[str, list[CellRow]]:
         """Segments of each cell, the most telling state last."""
@@ -109,6 +117,8 @@ def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
         fill(box, "disk")
     for rows in scene.by_cell().values():
         fill(rows[-1].box, rows[-1].state)
+    for square in scene.chunks:
+        fill(square.box, square.state)
     for client in scene.clients:
         for x, y in _outline(client):
             if 0 <= line(y) < height and 0 <= column(x) < width:
@@ -145,6 +155,7 @@ def svg(scene: Scene) -> str:
     cells += [
         CellSquare(rows[-1].box, rows[-1].state, _cell_title(rows, scene.now_ns)) for rows in known.values()
     ]
+    cells += scene.chunks
     vehicles, windows = [], []
     for client in scene.clients:
         title, window = _client_title(client, scene.now_ns), client.window

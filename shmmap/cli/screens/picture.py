@@ -32,6 +32,11 @@ _STYLE: Final = """
   .resident { fill: #0b7285; fill-opacity: .20; stroke: #0b7285; stroke-opacity: .75; stroke-width: .9; }
   .stale { fill: #e8590c; fill-opacity: .30; stroke: #e8590c; stroke-width: .9; }
   .zombie { fill: #868e96; fill-opacity: .40; stroke: #495057; stroke-width: .9; stroke-dasharray: 3 2; }
+  .saved { stroke: #9aa5b1; stroke-opacity: .8; }
+  .clean { fill: #2f9e44; fill-opacity: .22; stroke: #2f9e44; stroke-opacity: .8; }
+  .dirty { fill: #2563eb; fill-opacity: .22; stroke: #2563eb; stroke-opacity: .8; }
+  .saving { fill: #0e9db8; fill-opacity: .26; stroke: #0e9db8; stroke-opacity: .8; }
+  .loading { fill: #111418; fill-opacity: .30; stroke: #111418; stroke-opacity: .8; }
   .route { fill: none; stroke: #c92a2a; stroke-width: 2.4; stroke-linejoin: round; stroke-linecap: round; }
   .ahead { stroke-dasharray: 1 6; }
   .window { fill: none; stroke: #c92a2a; stroke-width: 1.6; stroke-dasharray: 7 5; }
@@ -42,7 +47,7 @@ _STYLE: Final = """
 
 @dataclass(frozen=True, slots=True)
 class CellSquare:
-    """One cell: its box (metres), its state (resident, stale, zombie or empty) and a tooltip."""
+    """One cell: its box (metres), its state (a class of `_STYLE`, or empty) and a tooltip."""
 
     box: BoxTuple
     state: str = ""
@@ -240,6 +245,11 @@ def _legend(states: set[str], with_route: bool, with_clients: bool) -> list[tupl
         "resident": "cell in shared memory",
         "stale": "stale cell",
         "zombie": "zombie",
+        "saved": "chunk on disk",
+        "clean": "in memory, saved",
+        "dirty": "not saved yet",
+        "saving": "being saved",
+        "loading": "being loaded",
     }
     entries = [(label, square.format(state)) for state, label in names.items() if state in states]
     if with_route:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+from shmmap.cli.screens.live_maps import STATE_STYLES, live_problems
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.statistics.counters import TURN_KINDS
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from shmmap.statistics.client_rows import ClientRow
     from shmmap.statistics.histogram import Histogram
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.reader import Snapshot
+    from shmmap.statistics.live_rows import LiveRow
+    from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["Line", "budget_parts", "screen"]
 
@@ -97,6 +99,8 @@ def screen(
     lines += _flowing("loop", _longest_turns(counters), width)
     lines += _flowing("queue", _loads(counters), width)
     lines += _flowing("segments", _segments(counters), width)
+    for row in found.live:
+        lines += _live(row, width)
     lines.append([])
     lines += _clients(found.clients, counters["sessions"], found.beat_monotonic_ns, width, max_clients)
     return lines
@@ -237,6 +241,24 @@ def _segments(counters: dict[str, int]) -> list[Line]:
         [(f"retired {counters['zombies']:,}", "")],
         [(f"stale {counters['stale_cells']:,}", "")],
     ]
+
+
+def _live(row: LiveRow, width: int) -> list[Line]:
+    states = [[(f"{count:,} {state}", STATE_STYLES[state])] for state, count in row.states.items() if count]
+    memory = f"{format_bytes(row.bytes + row.evicting_bytes)} of {format_bytes(row.budget_bytes)}"
+    pieces: list[Line] = [
+        [(f"{row.name}:", "bold"), (f" {counted(row.chunks, 'chunk')}", "")],
+        *states,
+        [(memory, "")],
+        [(counted(row.active, "known voxel"), "")],
+        [(f"scans {row.scans:,}, on disk {row.durable:,}", "")],
+    ]
+    if row.waiting_bytes:
+        pieces.append([(f"waiting {format_bytes(row.waiting_bytes)}", "yellow")])
+    lines = _flowing("live", pieces, width)
+    for problem in live_problems(row):
+        lines += _flowing("", [[(word, "red")] for word in problem.split()], width, gap=1)
+    return lines
 
 
 def _clients(

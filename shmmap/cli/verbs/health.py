@@ -11,7 +11,7 @@ from shmmap.cli.screens.output import counted, format_duration, print_json, prin
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
-    from shmmap.statistics.reader import Snapshot
+    from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["add_parser", "run"]
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from shmmap.cli.screens.map_scene import BoxTuple, Scene
     from shmmap.geometry import Area
     from shmmap.statistics.cell_rows import CellRow
-    from shmmap.statistics.reader import Snapshot
+    from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["add_parser", "run"]
 
@@ -37,13 +37,15 @@ def add_parser(subparsers: Subparsers) -> None:
         help="the map from above: which cells are in memory, where the clients are",
         description="Draw the map from above, north up: its cells by state, the clients, and the areas they "
         "follow.  On the terminal, or into a file with a tooltip for each cell.  While the daemon does not "
-        "answer, only cells in memory are drawn.",
+        "answer, only cells in memory are drawn.  With --live the chunks of a live map instead of cells; of "
+        "chunks above one another the one that has most to do is seen.",
         epilog="Exit code: 0; 1 when an area touches no cell, 69 when the daemon is dead or was "
         "never started,\n"
         "73 a file cannot be written.",
     )
     parser.add_argument("--svg", metavar="FILE", type=Path, help="write an SVG picture")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page, complete in one file")
+    parser.add_argument("--live", metavar="NAME", help="draw this live map")
     add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
     add_allow_empty(parser)
     add_daemon_options(parser, json=False)
@@ -57,9 +59,15 @@ def run(args: argparse.Namespace) -> int:
 
     area = area_from(args)
     found, identity = snapshot(args)
-    disk, silent = _on_disk(args, found, identity.id_prefix)
-    everywhere = around([box for _, box in disk] + [row.box for row in found.cells])
-    scene = _scene(area, found, disk, everywhere, f"{identity.map_path} ({identity.instance})", silent=silent)
+    if args.live is not None:
+        what, silent = "chunk", False
+        scene, everywhere = _live_scene(args, area, found)
+    else:
+        what = "cell"
+        disk, silent = _on_disk(args, found, identity.id_prefix)
+        everywhere = around([box for _, box in disk] + [row.box for row in found.cells])
+        title = f"{identity.map_path} ({identity.instance})"
+        scene = _scene(area, found, disk, everywhere, title, silent=silent)
     for path, make in ((args.svg, svg), (args.html, html_page)):
         if path is not None:
             write_text(path, make(scene))
@@ -71,8 +79,37 @@ def run(args: argparse.Namespace) -> int:
         return DaemonUnreachable.exit_code
     if area is not None and scene.empty and everywhere is not None:
         spans = f"the {'cells in memory span' if silent else 'map spans'} {extent_text(everywhere)}"
-        return nothing_found(args, f"no cell {area_text(area)}; {spans}")
+        return nothing_found(args, f"no {what} {area_text(area)}; {spans}")
     return 0
+
+
+def _live_scene(
+    args: argparse.Namespace, area: Area | None, found: Snapshot
+) -> tuple[Scene, BoxTuple | None]:
+    """Ask for the chunks of a live map; also returns what all of them span."""
+    from shmmap.cli.daemon_address import connect
+    from shmmap.cli.screens.live_scene import chunk_squares
+    from shmmap.cli.screens.map_scene import Scene
+    from shmmap.geometry import Box
+
+    with connect(args) as client:
+        live = client.live(args.live)
+        chunks = live.chunks(saved=True)
+    squares = chunk_squares(chunks, live.resolution)
+    everywhere = around([square.box for square in squares])
+    bounds = everywhere or (0.0, 0.0, 1.0, 1.0)
+    if area is not None:
+        bounds = area.bounds
+        squares = [squares[index] for index in those_in(Box(*bounds), [square.box for square in squares])]
+    in_memory = [chunk for chunk in chunks if chunk.state != "saved"]
+    memory = format_bytes(sum(chunk.bytes for chunk in in_memory))
+    scene = Scene(
+        bounds=bounds, disk=[], rows=[], clients=found.clients, now_ns=time.monotonic_ns(),
+        title=f"live map {live.name}, voxels of {live.resolution:g} m",
+        note=f"{counted(len(chunks), 'chunk')}, {len(in_memory):,} of them in memory, {memory}",
+        empty=not squares, chunks=squares,
+    )  # fmt: skip
+    return scene, everywhere
 
 
 def _scene(
@@ -135,18 +172,13 @@ def _note(found: Snapshot, rows: list[CellRow], cells: int, *, left_out: bool, s
 
 
 def _print(scene: Scene) -> None:
+    from shmmap.cli.screens.live_scene import LIVE_STATES
     from shmmap.cli.screens.map_scene import GLYPHS, terminal_rows
 
     size = shutil.get_terminal_size((100, 40))
     grid = terminal_rows(scene, size.columns, max(size.lines - 6, 10))
-    legend = {
-        "resident": "in memory",
-        "stale": "stale",
-        "zombie": "retired",
-        "disk": "on disk",
-        "client": "client",
-        "window": "its area",
-    }
+    cells = {"resident": "in memory", "stale": "stale", "zombie": "retired", "disk": "on disk"}
+    legend = {**(LIVE_STATES if scene.chunks else cells), "client": "client", "window": "its area"}
     if not wants_style():
         for row in grid:
             print_line("".join(GLYPHS[state][0] for state in row).rstrip())
@@ -157,6 +189,7 @@ def _print(scene: Scene) -> None:
 
         console = Console(highlight=False)
         solid = {"resident": "█", "stale": "▓", "zombie": "▒", "disk": "·", "window": "○", "client": "●"}
+        solid |= {**dict.fromkeys(LIVE_STATES, "█"), "saved": "·"}
         for row in grid:
             console.print(Text.assemble(*((solid.get(state, " "), GLYPHS[state][1]) for state in row)))
         console.print(Text.assemble(*((f"{solid[s]} {text}  ", GLYPHS[s][1]) for s, text in legend.items())))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
+from shmmap.cli.screens.live_maps import status_lines
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -21,7 +22,7 @@ from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.reader import Snapshot
+    from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["add_parser", "run"]
 
@@ -29,7 +30,10 @@ _JSON = """\
   {"state": "healthy" | "stopped": paused by a signal or a debugger | "hung" | "dead",
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
-   "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so}}
+   "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
+   "live": [{"name", "problem": text, may be empty, "chunks": in memory, "active": known voxels in them,
+             "bytes", "budget_bytes", "loading", "dirty", "saving", "evicting", "evicting_bytes",
+             "waiting_bytes", "files", "file_bytes", "scans", "durable", "damaged", "mappers", "change"}]}
 Exit code: 0, or 69 when the daemon is dead or was never started."""
 
 
@@ -40,8 +44,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "status",
         run,
         help="state of the daemon: memory, clients, requests, cache size",
-        description="Show the state of the daemon: memory, clients, requests, loads, and whether the cache "
-        "is large enough.  Reads its statistics in shared memory: works while the daemon is paused "
+        description="Show the state of the daemon: memory, clients, requests, loads, live maps, and whether "
+        "the cache is large enough.  Reads its statistics in shared memory: works while the daemon is paused "
         "(SIGSTOP, a debugger) or hangs; not after `shmmap stop`.",
         json=_JSON,
     )
@@ -72,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
                 "frame_id": identity.frame_id,
                 "shm_dir": identity.shm_dir,
                 "counters": found.counters,
+                "live": [row._asdict() for row in found.live],
             }
         )
     else:
@@ -137,6 +142,7 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     ]
     if count["loads_failed"]:
         lines.append(("", "`shmmap doctor` names the cells that fail"))
+    lines += status_lines(found.live, count.get("live_restarts", 0))
     verdict = cache_verdict(count)
     lines.append(("cache", verdict.text))
     if verdict.hint:

@@ -30,8 +30,9 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   one object a line: {"event": "epoch" | "loaded" | "changed" | "evicted" | "failed" | "retried" |
-  "pressure" | "reload" | "long_turn" | "joined" | "left", "seq", "epoch": hex, "time": Unix seconds,
-  and what the protocol's table of events says of that kind; versions and sessions as hex}, or
+  "pressure" | "reload" | "long_turn" | "joined" | "left" | "live_started" | "live_ended" |
+  "live_problem" | "live_damaged" | "live_changed", "seq", "epoch": hex, "time": Unix seconds, and what
+  the protocol's table of events says of that kind; versions and sessions as hex}, or
   {"event": "missed", "epoch": hex, "first", "last"} for events that the daemon does not keep any more.
 Live on a terminal or with --follow; else it ends after the events the daemon has kept.
 Exit code: 0, or 69 when no daemon answers."""
@@ -49,7 +50,8 @@ def add_parser(subparsers: Subparsers) -> None:
         help="events: loads, evictions, failures, clients",
         description="Print the events of the last minute, then new ones as they happen: cells loaded, "
         "changed, evicted, failed, retried; cells refused for lack of memory; reloads; turns of the "
-        "daemon's loop that took long; clients that connect and leave; the daemon's start and end.",
+        "daemon's loop that took long; clients that connect and leave; the daemon's start and end; what is "
+        "wrong with live maps.  That a live map changes is told with --json alone, twice a second.",
         json=_JSON,
     )
     parser.add_argument(
@@ -133,9 +135,11 @@ def _print_text(happening: Happening | None) -> None:
         return
     fields = _fields(happening)
     kind = fields["event"]
+    if kind == "live_changed":
+        return
     at = time.strftime("%H:%M:%S", time.localtime(fields["unix_ns"] // 10**9)) if "unix_ns" in fields else ""
     millis = f".{fields['unix_ns'] // 10**6 % 1000:03d}" if at else " " * 12
-    print_hanging(f"{at}{millis}  {kind:8}  ", _SENTENCES[kind](fields))
+    print_hanging(f"{at}{millis}  {_COLUMN.get(kind, kind):8}  ", _SENTENCES[kind](fields))
 
 
 def _loaded(f: dict[str, Any]) -> str:
@@ -183,12 +187,20 @@ def _epoch(f: dict[str, Any]) -> str:
     return f"the daemon is {f['what']}: {f['cells']:,} cells in the map{adopted}"
 
 
+def _live_started(f: dict[str, Any]) -> str:
+    found = f", {counted(f['chunks'], 'chunk')} found in memory" if f["chunks"] else ""
+    return f"{counted(f['maps'], 'live map')} served{found}"
+
+
 _CHANGES: Final = {
     "changed": "its file changed",
     "moved": "its box changed",
     "added": "added to the map",
     "removed": "removed from the map",
 }
+
+_COLUMN: Final = dict.fromkeys(("live_started", "live_ended", "live_problem", "live_damaged"), "live")
+"""Kinds that have another name in the narrow column."""
 
 _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "epoch": _epoch,
@@ -202,5 +214,11 @@ _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "long_turn": _long_turn,
     "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",
     "left": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, held {format_bytes(f['bytes'])}",
+    "live_started": _live_started,
+    "live_ended": lambda f: (
+        f"the live worker ended ({counted(f['restarts'], 'time')} by now), and is started anew"
+    ),
+    "live_problem": lambda f: f"{f['map']}: {f['problem'] or 'chunks are loaded and saved again'}",
+    "live_damaged": lambda f: f"{f['map']}: {f['what']}",
     "missed": lambda f: f"events {f['first']:,} to {f['last']:,}: the daemon does not keep them any more",
 }

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from shmmap.cli.screens.top_screen import Line
-    from shmmap.statistics.reader import Snapshot, StatisticsReader
+    from shmmap.statistics.reader import StatisticsReader
+    from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["add_parser", "run"]
 
@@ -34,6 +35,7 @@ _JSON = """\
    "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
    "latency_s": {"request", "wait", "load": {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
    "evictions": for lack of room, "refused_over_budget", "refused_quota",
+   "live": as in `shmmap status`,
    "clients": [{"client", "command", "pid", "uid", "cells", "bytes", "requests", "idle_s", "pose"}]}
 Exit code: 0, or 69 when the daemon is dead or was never started."""
 
@@ -58,7 +60,7 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="live view: memory, latency, clients",
         description="Show how the memory budget is used, how many of the cells asked for were in memory, "
-        "latencies, loads, evictions, refusals and clients.  Live on a terminal, once in a pipe.\n"
+        "latencies, loads, evictions, refusals, live maps and clients.  Live on a terminal, once in a pipe.\n"
         "Budget: in use (mapped by clients; not `shmmap pin`), idle (in memory, mapped by no client), "
         "retired (out of service, freed when no process maps it), loading (reserved for loads under way), "
         "statistics (what this view reads), free.\n"
@@ -156,7 +158,7 @@ def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
         found,
         found.identity,
         width=width,
-        max_clients=max(height - 18, 1),
+        max_clients=max(height - 18 - 2 * len(found.live), 1),
         earlier=earlier[0] if earlier else None,
     )
     if not earlier or found.beat_monotonic_ns - earlier[-1].beat_monotonic_ns > 1e9:
@@ -202,6 +204,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
             for name, h in found.histograms.items()
         },
         **{name: count[name] for name in _TOLD_AS_THEY_ARE},
+        "live": [row._asdict() for row in found.live],
         "clients": [
             {
                 "client": client.client,

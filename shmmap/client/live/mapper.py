@@ -309,6 +309,7 @@ def _write(path: str, data: bytes) -> None:
     try:
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
         with open(fd, "wb") as file:
+            os.fchmod(fd, 0o644)  # whatever the umask: the daemon is another account
             file.write(data)
     except OSError as error:
         if error.errno in (errno.ENOENT, errno.ENOSPC):

@@ -63,13 +63,17 @@ class EventLog:
         self._kept.append((now_ns, data))
         self.send(data)
 
+    def mention(self, kind: Callable[..., events.Event], *fields: object) -> None:
+        """Send an event that takes no number to those who listen now."""
+        self.send(encode_event(kind(self.last, self.epoch, self._clock_ns(), *fields)))
+
     def standing(self) -> bytes:
         """Return the number of the last event, as an event."""
         return encode_event(events.Beat(self.last, self.epoch, self._clock_ns()))
 
     def beat(self) -> None:
         """Send the number of the last event."""
-        self.send(self.standing())
+        self.mention(events.Beat)
 
     def page(self, message: Recent) -> EventPage:
         """Answer who asks for events again."""

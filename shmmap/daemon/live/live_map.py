@@ -34,6 +34,8 @@ from shmmap.logfmt import log
 
 __all__ = ["LiveMap"]
 
+MOST_PROBLEMS: Final = 64
+"""Chunks whose problems are remembered."""
 CHUNKS_A_TURN: Final = 64
 """Chunks that take in a scan in one turn: 37 us each."""
 
@@ -71,8 +73,8 @@ class LiveMap:
     ----------
     kept : dict
         What is out of service and may still be mapped, by number of its lease.
-    problem : str
-        What keeps a chunk from being loaded or saved just now.
+    problems : dict
+        By chunk, why it could not be loaded or saved the last time; at most `MOST_PROBLEMS`.
     """
 
     files: MapFiles
@@ -88,7 +90,7 @@ class LiveMap:
     residency: Residency = field(init=False)
     chunks: dict[ChunkKey, ChunkFile] = field(default_factory=dict)
     kept: dict[int, GivenUp] = field(default_factory=dict)
-    problem: str = ""
+    problems: dict[ChunkKey, str] = field(default_factory=dict)
     _parts: dict[Scan, _Part] = field(default_factory=dict)
     _running: dict[Future[Any], Callable[[Future[Any], float], None]] = field(default_factory=dict)
     _generation: int = 0
@@ -237,9 +239,10 @@ class LiveMap:
             file = self.memory.create(content)
         except (OSError, PackageMissing) as error:
             log.warning("chunk not loaded", chunk=chunk.key.text, reason=str(error))
-            self.problem = f"chunk {chunk.key.text} cannot be loaded: {error}"
+            self._note_problem(chunk.key, f"chunk {chunk.key.text} cannot be loaded: {error}")
             self.residency.load_failed(chunk, now_s)
             return
+        self.problems.pop(chunk.key, None)
         self.chunks[chunk.key] = file
         state = file.view.state
         self.residency.loaded(
@@ -255,12 +258,16 @@ class LiveMap:
             future.result()
         except OSError as error:
             log.warning("chunk not saved", chunk=chunk.key.text, reason=error.strerror)
-            self.problem = f"chunk {chunk.key.text} cannot be saved: {error.strerror}"
+            self._note_problem(chunk.key, f"chunk {chunk.key.text} cannot be saved: {error.strerror}")
             self.residency.save_failed(chunk, now_s)
             return
-        self.problem = ""
+        self.problems.pop(chunk.key, None)
         self.residency.saved(chunk, version, now_s)
         self.chunks[chunk.key].view.state["saved_version"] = version
+
+    def _note_problem(self, key: ChunkKey, text: str) -> None:
+        if len(self.problems) < MOST_PROBLEMS or key in self.problems:
+            self.problems[key] = text
 
     def list_files(self) -> None:
         """Have the manifest written, beside the rest."""

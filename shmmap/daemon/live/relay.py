@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.live import messages
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
@@ -25,7 +26,7 @@ from shmmap.logfmt import log
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import start_child
 from shmmap.protocol.codec import encode
-from shmmap.protocol.live import LiveListed, LiveMapRow, LiveRequest
+from shmmap.protocol.live import LiveListed, LiveRequest
 
 __all__ = ["LiveRelay", "NoLiveMaps"]
 
@@ -46,7 +47,8 @@ MOST_BYTES: Final = 1 << 16
 class NoLiveMaps:
     """Where the daemon keeps none."""
 
-    maps: tuple[LiveMapRow, ...] = ()
+    def tell(self) -> None:
+        """Nothing has to be told."""
 
     def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
         """Say that there are none."""
@@ -80,23 +82,27 @@ class LiveRelay:
         Told of its descriptor.
     may_map
         Whether a process may change live maps.
+    events
+        Told how the maps are, twice a second, and when the worker ends and begins.
 
     Attributes
     ----------
-    maps : tuple
-        How the maps are, as of half a second ago.
     restarts : int
         Workers that ended without being told to.
     """
 
     def __init__(
-        self, begin: messages.Begin, watched: WatchedDescriptors, may_map: Callable[[Peer, float], bool]
+        self,
+        begin: messages.Begin,
+        watched: WatchedDescriptors,
+        may_map: Callable[[Peer, float], bool],
+        events: LiveEvents,
     ) -> None:
-        self.maps: tuple[LiveMapRow, ...] = ()
         self.restarts = 0
         self._begin = begin
         self._watched = watched
         self._may_map = may_map
+        self._events = events
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: socket.socket | None = None
         self._buffer = packet_buffer()
@@ -144,6 +150,10 @@ class LiveRelay:
                 "the process that keeps live maps did not begin", hint="see the lines of the log before this"
             )
 
+    def tell(self) -> None:
+        """Tell events from now on: clients are heard."""
+        self._events.begin(len(self._begin.maps))
+
     def beat(self, now_s: float) -> None:
         """Start another worker when it is time to."""
         if self._channel is None and now_s >= self._start_s:
@@ -175,10 +185,11 @@ class LiveRelay:
                 self._answered(session)
                 session.connection.reply(message.body)
         elif isinstance(message, messages.Status):
-            self.maps = message.maps
+            self._events.told(message.maps)
         elif isinstance(message, messages.Begun):
             self._serving, self._failures = True, 0
             log.info("live maps are served", maps=len(self._begin.maps), chunks=message.adopted)
+            self._events.started(len(self._begin.maps), message.adopted)
         elif isinstance(message, messages.Failed):
             self._why = error_from_wire(message.code, message.message, message.hint)
             log.error("live maps cannot be served", reason=message.message)
@@ -201,6 +212,7 @@ class LiveRelay:
         self._start_s = time.monotonic() + PAUSES_S[min(self._failures, len(PAUSES_S) - 1)]
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
+        self._events.ended(self.restarts)
         error = LiveInterrupted("the process that keeps live maps ended, and is started anew")
         tickets, self._tickets = self._tickets, {}
         self._waiting.clear()

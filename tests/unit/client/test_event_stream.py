@@ -73,3 +73,12 @@ def test_a_beat_tells_of_what_was_last() -> None:
     assert stream.hear(e.encode_event(e.Beat(3, 1, 0))) == []
     stream.kept = [9, 10]
     assert stream.hear(changed(1, 10)) == [Missed(1, 4, 8), (1, 9), (1, 10)]
+
+
+def test_what_takes_no_number_comes_after_all_that_was_before_it() -> None:
+    stream = Played()
+    stream.kept = [1, 2]
+    live = e.encode_event(e.LiveChanged(2, 1, 0, "lidar", 7))
+    assert stream.hear(live) == [(1, 1), (1, 2), (1, 2)]
+    assert stream.hear(live, changed(1, 3), live) == [(1, 2), (1, 3), (1, 2)]
+    assert stream.hear(changed(1, 4)) == [(1, 4)]

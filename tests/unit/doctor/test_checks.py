@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,13 +15,17 @@ import pytest
 
 import shmmap
 from shmmap.daemon.config import DaemonConfig
-from shmmap.doctor import access, kernel, lifetime, memory
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.doctor import access, kernel, lifetime, live, memory
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
+from shmmap.segment.pins import lock_slot
+from shmmap.statistics.client_rows import ClientRow
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.reader import Snapshot
+from shmmap.statistics.live_rows import LiveRow
+from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
 
 USER = 61005
@@ -189,6 +195,155 @@ def test_huge_pages(
         assert ("for cells of all sizes" in found.fact) == (release != OLD)
 
 
+# --- live maps ---
+
+LIDAR = LiveRow("lidar", "", 12, 1000, 4 << 20, 0, 3, 1, 0, 0, 0, 40, 9 << 20, 100, 93, 16 << 20, 0, 1, 7)
+
+
+def with_live(*rows: LiveRow, clients: Sequence[ClientRow] = (), **counters: int) -> Snapshot:
+    """A daemon that keeps these live maps, and lets nobody connect."""
+    seen = told("hung")
+    seen.__dict__ |= {"counters": counters, "live": list(rows), "clients": list(clients)}
+    return seen
+
+
+def marks(ward: Ward, mode: int = 0o700) -> None:
+    path = ward.root / "dev/shm/shmmap-live.default.marks"
+    path.mkdir(parents=True)
+    path.chmod(mode)
+
+
+def test_without_live_maps_there_is_nothing_to_look_at(ward: Ward) -> None:
+    for patient in (ward.patient(), ward.patient(with_live())):
+        for check in (live.check_live_maps, live.check_live_disk, live.check_live_memory):
+            assert check(patient).skipped, check
+
+
+@pytest.mark.parametrize(
+    ("row", "restarts", "state", "fact"),
+    [
+        (LIDAR, 0, "ok", "lidar: 4 chunks not saved yet"),
+        (LIDAR, 2, "warn", "the process that keeps them ended 2 times"),
+        (LIDAR._replace(damaged=2), 2, "warn", "damaged files, missing chunks: 2"),
+        (
+            LIDAR._replace(damaged=2, problem="chunk 0_0_0 cannot be saved: full"),
+            0,
+            "fail",
+            "lidar: chunk 0_",
+        ),
+    ],
+)
+def test_what_is_wrong_with_live_maps(ward: Ward, row: LiveRow, restarts: int, state: str, fact: str) -> None:
+    found = live.check_live_maps(ward.patient(with_live(row, live_restarts=restarts)))
+    assert (found.state, fact in found.fact) == (state, True), found
+
+
+def test_the_disk_of_live_maps(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "ROOM_BYTES", 0)
+    settings = (LiveSettings("lidar", "/maps/lidar"),)
+    (ward.root / "maps").mkdir(parents=True)
+    mine = os.geteuid()
+
+    def check(*, uid: int = mine, seen: Snapshot | None = None, file: str = "") -> Finding:
+        return live.check_live_disk(ward.patient(seen, uid=uid, file=file, live=settings))
+
+    assert check().state == "ok"  # the daemon makes it
+    assert "/maps/lidar is gone" in check(seen=with_live(LIDAR)).fact
+    (ward.root / "maps/lidar").mkdir(mode=0o700)
+    found = check(seen=with_live(LIDAR._replace(budget_bytes=1)))
+    assert (found.state, "lidar: /maps/lidar, " in found.fact) == ("ok", True)
+    found = check(seen=with_live(LIDAR._replace(budget_bytes=1 << 60)))
+    assert (found.state, "may have to be saved" in found.fact) == ("warn", True)
+    found = check(uid=USER)
+    assert (found.state, f"{USER} may not write to /maps/lidar" in found.fact) == ("fail", True)
+    (ward.root / "maps/lidar").chmod(0o703)
+    assert check(uid=USER).state == "ok"
+
+    # what the service sees
+    ward.file("/etc/systemd/system/shmmapd.service", "")
+    monkeypatch.setattr(Patient, "runs_as", mine)
+    installed = "/etc/shmmap/shmmap.toml"
+    assert "ProtectSystem=" in check(file=installed).fact
+    drop_in = "/etc/systemd/system/shmmapd.service.d/x.conf"
+    ward.file(drop_in, "[Service]\nReadWritePaths=-/maps/lidar2\n")
+    assert check(file=installed).state == "fail"
+    ward.file(drop_in, "[Service]\nReadWritePaths=/else -/maps\n")
+    assert check(file=installed).state == "ok"
+    settings = (LiveSettings("lidar"),)
+    (ward.root / "var/lib/shmmap").mkdir(parents=True)
+    assert "/var/lib/shmmap/state/default/live/lidar" in check(file=installed).fact
+
+
+def test_chunks_are_not_on_huge_pages(ward: Ward) -> None:
+    marks(ward)
+    settings = (LiveSettings("lidar"),)
+    plain, huge = "tmpfs /dev/shm tmpfs rw 0 0\n", "tmpfs /run/huge tmpfs rw,huge=within_size 0 0\n"
+    ward.file("/proc/self/mounts", plain + huge)
+
+    def check(**more: Any) -> Finding:
+        return live.check_live_memory(ward.patient(live=settings, **more))
+
+    assert check().state == "ok"
+    assert check(shm_dir="/run/huge").fact == "/dev/shm"
+    found = check(live_shm_dir="/run/huge/x")
+    assert (found.state, "huge=within_size" in found.fact) == ("fail", True)
+
+
+def test_where_mappers_put_their_scans(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    def check(**settings: Any) -> Finding:
+        return live.check_live_memory(ward.patient(with_live(LIDAR), **settings))
+
+    assert "marks is gone" in check().fact
+    marks(ward)
+    assert check().state == "ok"
+    assert "has mode 700, not 1770" in check(live_group="61999").fact
+    path = ward.root / "dev/shm/shmmap-live.default.marks"
+    path.chmod(0o1770)
+    assert check(live_group=str(os.getegid())).state == "ok"
+    assert "not 61999" in check(live_group="61999").fact
+    path.chmod(0o777)
+    found = check()
+    assert (found.state, "has mode 777" in found.fact) == ("warn", True)
+
+
+def test_readers_that_hold_what_was_given_up_are_named(ward: Ward) -> None:
+    """By their locks: a lock of the open file description is held for as long as the file is mapped."""
+    marks(ward)
+    shm = "/dev/shm/shmmap-live.default"
+    for name in ("lidar.0_0_0.7.gone", "lidar.-1_0_0.8.gone", "lidar.1_0_0.9", "radar.0_0_0.7.gone"):
+        ward.file(f"{shm}.{name}", "x" * 5000)
+    clients = [ClientRow(3, 4242, 0, 0, 0, 0, 0, "perception", "python3")]
+    held = LIDAR._replace(evicting=2, evicting_bytes=5 << 20)
+    patient = ward.patient(with_live(held, clients=clients))
+    assert "nobody who says who it is" in live.check_live_memory(patient).fact
+    with contextlib.ExitStack() as stack:
+        for name, slot in (
+            ("lidar.0_0_0.7.gone", 3), ("lidar.-1_0_0.8.gone", 3), ("lidar.-1_0_0.8.gone", 9),
+            ("lidar.1_0_0.9", 11), ("radar.0_0_0.7.gone", 12),
+        ):  # fmt: skip
+            lock_slot(stack.enter_context(open(f"{ward.root}{shm}.{name}", "rb")).fileno(), slot)
+        found = live.check_live_memory(patient)
+        assert found.state == "warn"
+        assert found.fact.startswith(
+            "lidar: readers hold 5.0 MiB of chunks that were given up: perception, pid"
+        )
+        assert "perception, pid 4242: 16.0 KiB; session 9: 8.0 KiB" in found.fact
+        few = ward.patient(with_live(held._replace(evicting_bytes=4 << 20), clients=clients))
+        assert live.check_live_memory(few).state == "ok"
+
+
+def test_chunks_of_a_daemon_that_does_not_run_are_no_rubbish(ward: Ward) -> None:
+    ward.file("/dev/shm/shmmap-live.default.lidar.-1_0_0.8", "x")
+    ward.file("/dev/shm/shmmap-live.default.lidar.undo", "x")
+    found = lifetime.check_leftovers(ward.patient())
+    assert (found.state, "default: 1 segment" in found.fact, " rm " in found.advice) == ("warn", True, False)
+    assert lifetime.check_leftovers(ward.patient(told())).state == "ok"
+
+
+def test_a_daemon_that_keeps_live_maps_alone_needs_no_map(ward: Ward) -> None:
+    assert access.check_map_access(ward.patient(live=(LiveSettings("lidar"),))).state == "ok"
+
+
 # --- kernel ---
 
 
@@ -226,7 +381,7 @@ def test_groups(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     assert access.check_group(someone).state == "fail"
     assert "usermod -aG 61999" in access.check_group(someone).advice
     assert access.check_group(dataclasses.replace(someone, config=DaemonConfig(group=mine))).state == "ok"
-    monkeypatch.setattr(access, "_groups", lambda _: {61999})
+    monkeypatch.setattr(access, "groups_of", lambda _: {61999})
     found = access.check_group(someone)
     assert (found.state, "log in again" in found.advice) == ("warn", True)
 

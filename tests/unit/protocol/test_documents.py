@@ -17,6 +17,7 @@ from shmmap.segment import header, layout, publish_block
 from shmmap.statistics import layout as statistics_layout
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
+from shmmap.statistics.live_rows import LIVE_ROW_BYTES
 
 PROTOCOL = files("shmmap.protocol").joinpath("PROTOCOL.md").read_text(encoding="utf-8")
 REQUESTS = PROTOCOL[: PROTOCOL.index("\n## Replies\n")]
@@ -159,6 +160,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
                 statistics_layout.CHANGES.size,
                 CELL_ROW_BYTES,
                 CLIENT_ROW_BYTES,
+                LIVE_ROW_BYTES,
             ],
         ),
     ],

@@ -13,6 +13,7 @@ from shmmap.statistics.cell_rows import CellRow, pack_cell, unpack_cell
 from shmmap.statistics.client_rows import ClientRow, Window, pack_client, unpack_client
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, Counter
 from shmmap.statistics.layout import State
+from shmmap.statistics.live_rows import LiveRow, pack_live, unpack_live
 
 TWO = (
     Counter("requests", "counter", "", "Requests received"),
@@ -20,14 +21,16 @@ TWO = (
 )
 LOAD = (Counter("load", "histogram", "ns", "How long"),)
 GOLDEN_START = (
-    "53484d5354415401 0100 0200 04030201"  # magic, 1.2, byte order
+    "53484d5354415401 0100 0300 04030201"  # magic, 1.3, byte order
     "80000000 02000000 a0000000"  # descriptions at 128: 2 of 160 bytes
     "80020000 00400000"  # identity at 640, 16384 bytes each
     "80820000 80040000"  # state at 33408, 1152 bytes each
-    "808b0000 00900100 00010000 00000200"  # table 35712, rows at 102400 of 256, at most 131072
-    "83f415ef"
+    "808b0000 00100200 00010000 00000200"  # table 35712, rows at 135168 of 256, at most 131072
+    "5bfbe278"
     "01000000 82000000 00900000 00010000 00010000"  # 1 histogram of 130; clients at 36864, 256 of 256
-    "c08b0000" + "00" * 36 + "2fc80a3d"  # changes at 35776
+    "c08b0000 00900100 00020000 40000000"
+    + "00" * 24
+    + "ed8068a8"  # changes at 35776; live at 102400, 64 of 512
 )
 GOLDEN_FIRST = "7265717565737473" + "00" * 40 + "00" + "5265717565737473207265636569766564" + "00" * 94
 GOLDEN_SECOND = (
@@ -50,6 +53,12 @@ CLIENT = ClientRow(
     0x0102030405060708, 77, -1, 3, 4096, 9, 6, "vé", "python3",
     (1.5, -2.5), 0.5, Window("square", 1.0, 2.0, 40.0, 41.0),
 )  # fmt: skip
+GOLDEN_LIVE = (
+    "6c6964c3a472" + "00" * 58 + "6469736b2066756c6c" + "00" * 247  # name, problem
+    + "".join(f"{number:02x}" + "00" * 7 for number in range(1, 17))
+    + "00" * 7 + "40" + "00" * 52 + "498faf27"
+)  # fmt: skip
+LIVE = LiveRow._make(("lidär", "disk full", *range(1, 17), 2**62))
 GOLDEN_IDENTITY = "02000000000000000600000092abc882706964003100"
 GOLDEN_ROW = (
     "0807060504030201 0020000000000000 6400000000000000"  # version, bytes, points
@@ -104,6 +113,19 @@ def test_client() -> None:
         torn[at] ^= 1
         with pytest.raises(SegmentCorrupt):
             unpack_client(bytes(torn))
+
+
+def test_live_map() -> None:
+    assert pack_live(LIVE) == bytes.fromhex(GOLDEN_LIVE)
+    assert unpack_live(bytes.fromhex(GOLDEN_LIVE)) == LIVE
+    assert unpack_live(bytes(512)) is None
+    assert unpack_live(pack_live(LIVE._replace(problem="ä" * 200))) == LIVE._replace(problem="ä" * 128)
+    assert LIVE.states == {"loading": 4, "clean": 0, "dirty": 5, "saving": 6, "evicting": 7}
+    for at in range(512):
+        torn = bytearray.fromhex(GOLDEN_LIVE)
+        torn[at] ^= 1
+        with pytest.raises(SegmentCorrupt):
+            unpack_live(bytes(torn))
 
 
 def test_identity() -> None:

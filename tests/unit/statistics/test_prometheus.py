@@ -12,8 +12,10 @@ import pytest
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
+from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.prometheus import exposition
-from shmmap.statistics.reader import Snapshot, read_statistics
+from shmmap.statistics.reader import read_statistics
+from shmmap.statistics.snapshot import Snapshot
 from shmmap.statistics.writer import StatisticsWriter
 
 SAMPLE = re.compile(r'([a-zA-Z_:][a-zA-Z0-9_:]*)\{((?:[a-zA-Z_]\w*="(?:[^"\\\n]|\\["\\n])*",?)*)\} (\S+)')
@@ -21,7 +23,7 @@ LABEL = re.compile(r'(\w+)="((?:[^"\\]|\\.)*)"')
 
 
 def parse(text: str) -> tuple[dict[str, str], dict[tuple[str, str], float]]:
-    """Types by family, samples by (name, le); each family is described before its samples, once."""
+    """Types by family, samples by (name, le or map and state); each family is described before, once."""
     assert text.endswith("\n")
     types: dict[str, str] = {}
     helped: list[str] = []
@@ -41,7 +43,7 @@ def parse(text: str) -> tuple[dict[str, str], dict[tuple[str, str], float]]:
             assert found[1] in ({family} | {f"{family}_{s}" for s in ("bucket", "sum", "count")}), line
             labels = dict(LABEL.findall(found[2]))
             assert labels["daemon"] == "unit"
-            key = (found[1], labels.get("le", ""))
+            key = (found[1], " ".join(labels[k] for k in ("le", "map", "state") if k in labels))
             assert key not in samples
             samples[key] = float(found[3])
     assert set(types) == set(helped)
@@ -93,6 +95,30 @@ def test_histograms_are_cumulative(found: Snapshot) -> None:
     assert min(count for bound, count in buckets if bound > 3.5e-3) == 3
     assert samples["shmmap_load_seconds_count", ""] == 4
     assert samples["shmmap_load_seconds_sum", ""] == pytest.approx(10_000.0065005)
+
+
+def test_live_maps(found: Snapshot) -> None:
+    lidar = LiveRow("lidar", "", 5, 100, 4096, 1, 2, 1, 3, 512, 9, 3, 777, 11, 7, 1 << 20, 0, 2, 40)
+    types, before = parse(exposition(found, "unit"))
+    assert not [name for name in types if "_live_" in name and name != "shmmap_live_restarts_total"]
+    found.__dict__["live"] = [lidar, lidar._replace(name="radar", problem="full", damaged=2)]
+    types, samples = parse(exposition(found, "unit"))
+    assert {key: samples[key] for key in before} == before
+    told = {key[0].removeprefix("shmmap_live_"): n for key, n in samples.items() if key[1] == "lidar"}
+    assert told == {
+        "bytes": 4096, "evicting_bytes": 512, "waiting_bytes": 9, "budget_bytes": 1 << 20,
+        "active_voxels": 100, "files": 3, "file_bytes": 777, "scans_applied_total": 11,
+        "scans_durable_total": 7, "damaged_files": 0, "failing": 0,
+    }  # fmt: skip
+    assert {key[1]: n for key, n in samples.items() if key[0] == "shmmap_live_chunks"} == {
+        f"{name} {state}": count
+        for name in ("lidar", "radar")
+        for state, count in {"loading": 1, "clean": 2, "dirty": 2, "saving": 1, "evicting": 3}.items()
+    }
+    assert samples["shmmap_live_failing", "radar"] == 1
+    assert samples["shmmap_live_damaged_files", "radar"] == 2
+    assert (types["shmmap_live_scans_applied_total"], types["shmmap_live_chunks"]) == ("counter", "gauge")
+    assert samples["shmmap_live_restarts_total", ""] == 0
 
 
 def test_a_daemon_that_is_not_there_is_not_up() -> None:

@@ -13,6 +13,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import bucket_of
 from shmmap.statistics.identity import DaemonIdentity
+from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 from tests.unit.statistics.conftest import client, row
@@ -111,6 +112,29 @@ def test_a_beat_writes_a_bounded_number_of_rows(shm: ShmDirectory, writer: Stati
         writer.beat(max_rows=4)
         seen.append(len(read_statistics("unit", shm.path).cells))
     assert seen == [4, 8, 10, 10]
+
+
+def test_live_maps_take_memory_only_where_there_are_any(shm: ShmDirectory, writer: StatisticsWriter) -> None:
+    assert read_statistics("unit", shm.path).live == []
+    before = writer.size_bytes
+    rows = [LiveRow(f"map{number}", "", *range(number, number + 17)) for number in range(9)]
+    for _ in range(2):
+        writer.show_live_maps(rows)
+        assert read_statistics("unit", shm.path).live == rows
+        assert writer.size_bytes == before + 2 * 4096
+        rows[3] = rows[3]._replace(problem="disk full", chunks=77)
+    writer.show_live_maps([rows[0]._replace(name=f"map{number}") for number in range(65)])
+    assert len(read_statistics("unit", shm.path).live) == 64
+
+
+def test_live_maps_that_find_no_memory_are_shown_later(shm: ShmDirectory, writer: StatisticsWriter) -> None:
+    row = LiveRow("lidar", "", *range(17))
+    writer.reserve = lambda _nbytes: False
+    writer.show_live_maps([row])
+    assert read_statistics("unit", shm.path).live == []
+    writer.reserve = lambda _nbytes: True
+    writer.show_live_maps([row])
+    assert read_statistics("unit", shm.path).live == [row]
 
 
 def test_a_new_identity(shm: ShmDirectory, writer: StatisticsWriter, identity: DaemonIdentity) -> None:

@@ -5,14 +5,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import Final
 
 from shmmap.errors import ConfigError
 
 __all__ = ["add_directory", "directory_from"]
-
-SERVICE_STATE: Final = "/var/lib/shmmap"
-"""State directory of the installed service."""
 
 
 def add_directory(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +30,7 @@ def _places(name: str) -> list[str]:
     """Where a live map of a name may have its files, as settings and custom say."""
     from shmmap.daemon.config import load_config
     from shmmap.daemon.config_file import installed_config_file
-    from shmmap.daemon.config_live import live_directory
+    from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 
     config = load_config({}, file=installed_config_file())
     places = [one.path for one in config.live if one.name == name and one.path]
@@ -42,4 +38,4 @@ def _places(name: str) -> list[str]:
         places.append(live_directory(config.instance, name))
     except ConfigError:
         pass  # no home, no state of its own
-    return [*places, f"{SERVICE_STATE}/live/{name}"]
+    return [*places, f"{SERVICE_STATE}/{config.instance}/live/{name}"]

@@ -19,7 +19,8 @@ _JSON = """\
              in them, "bytes": their memory, "budget_bytes", "loading", "dirty": changed and not saved,
              "saving", "evicting": given up, and still mapped by readers, "evicting_bytes",
              "waiting_bytes": of scans that wait, "files", "file_bytes", "scans": applied since the start,
-             "durable": of these on the disk, "mappers": [uid/name], "damaged": [what], "problem"}]}
+             "durable": of these on the disk, "mappers": [uid/name], "damaged": [what], "problem",
+             "change": number of the last change}]}
 Exit code: 0, or 69 when no daemon answers."""
 
 _COLUMNS = (

@@ -2,7 +2,7 @@
 """Where mappers put the marks of their scans, as files: what is in them is nobody's word but theirs.
 
 The directory belongs to the daemon; members of the mappers' group may make files in it and remove their own
-(mode 3770).  A file is named after the session that made it, and goes when that has ended.
+(mode 1770).  A file is named after the session that made it, and goes when that has ended.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class MarksDirectory:
                 raise PermissionError(1, "it belongs to somebody else", path)
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
-            os.fchmod(self._fd, 0o3770 if gid >= 0 else 0o700)
+            os.fchmod(self._fd, 0o1770 if gid >= 0 else 0o700)
             self._remove_all()
         except BaseException:
             os.close(self._fd)

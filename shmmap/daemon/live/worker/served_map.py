@@ -285,7 +285,7 @@ class ServedMap:
             durable=self._durable, budget_bytes=live.limits.budget_bytes,
             damaged=tuple([*missing, *damaged][:64]),
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
-            problem=live.problem,
+            problem=next(iter(live.problems.values()), ""), change=self.changes.number,
         )  # fmt: skip
 
     # --- the end --------------------------------------------------------------------------------

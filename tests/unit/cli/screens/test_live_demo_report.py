@@ -33,7 +33,9 @@ def test_what_was_mapped_killed_and_compared(capsys: pytest.CaptureFixture[str])
     lines = told(capsys, RESULT)
     assert list(lines) == ["drive", "map", "memory", "kill -9", "compared", "duration"]
     assert lines["drive"].startswith("181 LiDAR scans, 2.1 million points, on 450 m; mapped in 9")
-    assert lines["map"].startswith("300 chunks, 4 000 000 known voxels; each takes 3.1 bytes in memory, 0.8 on")
+    assert lines["map"].startswith(
+        "300 chunks, 4 000 000 known voxels; each takes 3.1 bytes in memory, 0.8 on"
+    )
     assert "400 times a chunk was saved and given up, 90 times one came back" in lines["memory"]
     assert "the daemon after scan 60: back in 1.2" in lines["kill -9"]
     assert lines["kill -9"].endswith("after scan 120: its next run went on with scan 119")

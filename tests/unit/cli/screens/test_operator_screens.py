@@ -8,15 +8,20 @@ from html.parser import HTMLParser
 
 import pytest
 
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.cli.screens.live_maps import status_lines
+from shmmap.cli.screens.live_scene import chunk_squares
 from shmmap.cli.screens.map_scene import GLYPHS, Scene, html_page, svg, terminal_rows
 from shmmap.cli.screens.top_screen import budget_parts, screen
+from shmmap.client.live.chunk_reader import ChunkInfo
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.client_rows import ClientRow, Window
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import BUCKETS
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import State, plan
-from shmmap.statistics.reader import Snapshot
+from shmmap.statistics.live_rows import LiveRow
+from shmmap.statistics.snapshot import Snapshot
 
 MIB = 1 << 20
 IDENTITY = DaemonIdentity(
@@ -107,6 +112,52 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
         assert piece in " ".join(shown.split()), piece
 
 
+LIVE = LiveRow(
+    "lidar", "", 12, 1_234_567, 4 * MIB, 0, 3, 1, 0, 0, 0, 40, 9 * MIB, 100, 93, 16 * MIB, 0, 1, 7
+)  # fmt: skip
+TROUBLED = LIVE._replace(
+    name="radar", problem="chunk 1_-2_0 cannot be saved: No space left on device", evicting=9,
+    evicting_bytes=5 * MIB, damaged=2, waiting_bytes=MIB,
+)  # fmt: skip
+
+
+def test_status_has_a_line_for_each_live_map_and_one_for_each_problem() -> None:
+    assert status_lines([], 0) == []
+    assert status_lines([LIVE], 0) == [
+        ("live lidar", "12 chunks, 4.0 MiB of 16.0 MiB, 1,234,567 known voxels, 4 not saved")
+    ]
+    assert status_lines([LIVE._replace(dirty=0, saving=0)], 0)[0][1].endswith(", all saved")
+    (_, memory), *problems = status_lines([TROUBLED], 3)
+    assert memory.startswith("12 chunks, 9.0 MiB of 16.0 MiB")
+    assert [text.partition(":")[0] for _, text in problems] == [
+        "chunk 1_-2_0 cannot be saved",
+        "readers hold 5.0 MiB of chunks that were given up",
+        "damaged files, missing chunks",
+        "the process that keeps live maps ended 3 times",
+    ]
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_live_maps_on_the_screen(width: int) -> None:
+    found = snapshot(FULL, [CLIENT])
+    assert "live" not in text(found).split()
+    found.__dict__["live"] = [LIVE, TROUBLED]
+    shown = text(found, width=width)
+    live = shown[shown.index("\nlive ") : shown.index("\nCLIENT")]
+    assert max(map(len, live.splitlines())) <= width
+    told = " ".join(live.split())
+    for piece in (
+        "live lidar: 12 chunks 8 clean 3 dirty 1 saving 4.0 MiB of 16.0 MiB 1,234,567 known voxels",
+        "scans 100, on disk 93", "radar: 12 chunks", "9 evicting", "waiting 1.0 MiB",
+        "chunk 1_-2_0 cannot be saved: No space left on device", "readers hold 5.0 MiB",
+        "damaged files, missing chunks: 2;",
+    ):  # fmt: skip
+        assert piece in told, piece
+    lines = screen(found, IDENTITY, width=width, max_clients=1)
+    styles = {piece.split()[-1]: style for line in lines for piece, style in line if piece.strip()}
+    assert (styles["clean"], styles["dirty"], styles["saving"]) == ("green", "blue", "cyan")
+
+
 def test_a_name_cannot_draw_on_the_screen() -> None:
     hostile = CLIENT._replace(client="\x1b[2J\x1b]0;owned\x07")
     for width in (80, 120):
@@ -180,6 +231,36 @@ def test_names_of_clients_on_one_another_stand_side_by_side() -> None:
     texts = root.iter("{http://www.w3.org/2000/svg}text")
     labels = [node.text for node in texts if node.get("class") == "label"]
     assert labels == ["localization, perception", "planning"]
+
+
+def chunk(x: int, y: int, z: int, state: str) -> ChunkInfo:
+    return ChunkInfo(ChunkKey(x, y, z), state, 7, 5, 2, 4096, 1, 1)
+
+
+def test_chunks_of_a_live_map_from_above() -> None:
+    """Of those above one another the one that has most to do is seen, the tooltip has all."""
+    squares = chunk_squares(
+        [
+            chunk(0, 0, 1, "clean"), chunk(0, 0, -1, "dirty"), chunk(0, 0, 0, "saved"),
+            chunk(-1, 0, 0, "saved"), chunk(1, 0, 0, "loading"), chunk(1, 0, 1, "clean"),
+        ],
+        0.5,
+    )  # fmt: skip
+    assert [(square.box, square.state) for square in squares] == [
+        ((-32.0, 0.0, 0.0, 32.0), "saved"), ((0.0, 0.0, 32.0, 32.0), "dirty"),
+        ((32.0, 0.0, 64.0, 32.0), "loading"),
+    ]  # fmt: skip
+    lines = squares[1].title.splitlines()
+    assert [line.split(",")[0] for line in lines] == ["0_0_-1", "0_0_0", "0_0_1"]
+    assert "z -32 to 0 m: not saved yet, 4.0 KiB, 7 known voxels" in lines[0]
+    scene = Scene((-32.0, 0.0, 64.0, 32.0), [], [], [], 0, "live map lidar", "", chunks=squares)
+    assert terminal_rows(scene, 6, 1) == [["saved", "saved", "dirty", "dirty", "loading", "loading"]]
+    picture = svg(scene)
+    ElementTree.fromstring(picture)
+    assert [f'class="cell {state}"' in picture for state in ("saved", "dirty", "loading", "clean")] == [
+        True, True, True, False,
+    ]  # fmt: skip
+    assert "not saved yet</text>" in picture
 
 
 class Tags(HTMLParser):

@@ -322,6 +322,22 @@ class _FullAtFirst(CutDisk):
         super().write(name, data)
 
 
+def test_what_cannot_be_saved_is_told_until_it_is(shm: Path) -> None:
+    marks, at = crossing()[0]
+    world = World(shm, _FullAtFirst())
+    world.send(marks, at)
+    told: set[str] = set()
+
+    def saved() -> bool:
+        told.update(world.map.problems.values())
+        return world.map.all_durable
+
+    world.until(saved, save_all=True)
+    assert told
+    assert all(text.endswith("cannot be saved: No space left on device") for text in told)
+    assert not world.map.problems
+
+
 class _StopsAtOnce(LiveMap):
     @property
     def all_durable(self) -> bool:

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live maps: what is wrong with them, have they room on the disk, who holds their memory."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+from collections.abc import Mapping
+from typing import Final
+
+from shmmap.daemon.config_live import SERVICE_STATE, live_directory
+from shmmap.doctor.access import account_name, drop_ins, group_name, groups_of
+from shmmap.doctor.finding import Finding, fail, ok, skip, warn
+from shmmap.doctor.memory import mount_of
+from shmmap.doctor.patient import Patient
+from shmmap.errors import ConfigError, ShmmapError
+from shmmap.protocol.live import LiveMapRow
+from shmmap.quantities import counted, format_bytes
+from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.pins import holders
+from shmmap.statistics.live_rows import LiveRow
+
+__all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
+
+ANSWER_S: Final = 2.0
+NAMED: Final = 3
+"""Things and holders that are named."""
+ROOM_BYTES: Final = 64 << 20
+"""Less free disk space than this is little, whatever the budget."""
+_MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # with a group of mappers, and without
+
+
+def _rows(patient: Patient) -> list[LiveRow]:
+    return patient.seen.live if patient.alive and patient.seen is not None else []
+
+
+def _told(patient: Patient) -> tuple[LiveMapRow, ...]:
+    """All that the daemon says of its live maps, paths and damaged files; empty where it does not answer."""
+    from shmmap.client.client import connect
+
+    if patient.seen is None or patient.seen.state != "healthy" or not _rows(patient):
+        return ()
+    try:
+        with connect(
+            patient.socket, timeout=ANSWER_S, connect_timeout=ANSWER_S, name="shmmap doctor"
+        ) as client:
+            return client.live_maps()
+    except ShmmapError:
+        return ()
+
+
+# --- what is wrong ------------------------------------------------------------------------------------
+
+
+def check_live_maps(patient: Patient) -> Finding:
+    """Can every chunk be loaded and saved, and is none lost?"""
+    name, rows = "live maps", _rows(patient)
+    if not rows:
+        running = "this daemon keeps none" if patient.alive else "no daemon runs"
+        return skip(name, running if patient.alive or patient.config.live else "none are set up")
+    unsaved = sum(row.unsaved for row in rows)
+    fact = f"{', '.join(row.name for row in rows)}: {counted(unsaved, 'chunk')} not saved yet"
+    if failing := [row for row in rows if row.problem]:
+        what = "; ".join(f"{row.name}: {row.problem}" for row in failing)
+        return fail(name, what, "what is in memory stays there until it is saved: see to the disk")
+    if damaged := sum(row.damaged for row in rows):
+        texts = [f"{row.name}: {text}" for row in _told(patient) for text in row.damaged][:NAMED]
+        named = f" ({'; '.join(texts)}{'; …' if damaged > NAMED else ''})" if texts else ""
+        return warn(
+            name,
+            f"damaged files, missing chunks: {damaged:,}{named}",
+            "damaged files were put aside; stop the daemon, then `shmmap live fsck` says what is left",
+        )
+    if restarts := patient.seen.counters.get("live_restarts", 0) if patient.seen is not None else 0:
+        return warn(
+            name,
+            f"{fact}; the process that keeps them ended {counted(restarts, 'time')}",
+            "please report what its log says: journalctl -u shmmapd -g live",
+        )
+    return ok(name, fact)
+
+
+# --- the disk -----------------------------------------------------------------------------------------
+
+
+def check_live_disk(patient: Patient) -> Finding:
+    """Can the daemon write where live maps are kept, and is there room?"""
+    name = "live disk"
+    places = _places(patient)
+    if not places:
+        return skip(name, "no live map is set up")
+    facts, kept = [], {row.name for row in _rows(patient)}
+    for which, path in places.items():
+        if not path:
+            return warn(name, f"{which}: there is no state directory", f"set path in [live.{which}]")
+        try:
+            place = _existing(patient, path)
+            space = os.statvfs(patient.machine.path(place))
+            closed = _not_writable(patient, path, place, read_only=bool(space.f_flag & os.ST_RDONLY))
+        except PermissionError:
+            return warn(name, f"{which}: {path}: this user may not look there", "run it with sudo")
+        if place != path and which in kept:
+            return fail(
+                name,
+                f"{which}: {path} is gone",
+                "put it back where it was; what is not saved is in memory alone, so do not stop the daemon",
+            )
+        if closed:
+            return fail(name, f"{which}: {closed}", f"allow it, or set path in [live.{which}]")
+        free = space.f_bavail * space.f_frsize
+        budget = max((row.budget_bytes for row in _rows(patient) if row.name == which), default=0)
+        facts.append(f"{which}: {path}, {format_bytes(free)} free")
+        if free < max(budget, ROOM_BYTES):
+            return warn(
+                name,
+                f"{facts[-1]}; up to {format_bytes(max(budget, ROOM_BYTES))} may have to be saved",
+                "free some space: chunks that cannot be saved stay in memory, then mappers have to wait",
+            )
+    return ok(name, "; ".join(facts))
+
+
+def _places(patient: Patient) -> dict[str, str]:
+    """Directory by map: as the daemon says, else as it is set up; empty where there can be none."""
+    if told := _told(patient):
+        return {row.name: row.path for row in told}
+    instance = patient.config.instance
+    environ: Mapping[str, str] = os.environ
+    if patient.is_service:
+        environ = {"STATE_DIRECTORY": f"{SERVICE_STATE}/{instance}"}
+    found = {}
+    for one in patient.config.live:
+        found[one.name] = one.path
+        with contextlib.suppress(ConfigError):
+            found[one.name] = one.path or live_directory(instance, one.name, environ)
+    return found
+
+
+def _existing(patient: Patient, path: str) -> str:
+    """The path, or the nearest directory above that is there: the daemon makes the rest."""
+    while path != "/":
+        try:
+            os.stat(patient.machine.path(path))
+            break
+        except (FileNotFoundError, NotADirectoryError):
+            path = os.path.dirname(path)
+    return path
+
+
+def _not_writable(patient: Patient, path: str, place: str, *, read_only: bool) -> str:
+    """Why the daemon cannot write to ``path``, of which there is ``place``; empty if it can."""
+    uid = patient.runs_as
+    if read_only:
+        return f"the file system of {place} is read-only"
+    if patient.is_service and not patient.alive:
+        own = f"{SERVICE_STATE}/{patient.config.instance}"
+        if _is_in(path, own) and not _is_in(place, own):
+            return ""  # systemd makes it
+        shown = re.findall(r"^(?:ReadWritePaths|BindPaths)=(.*)$", drop_ins(patient), re.MULTILINE)
+        writable = [own, *(word.strip('"-+').split(":")[0] for word in " ".join(shown).split())]
+        if not any(_is_in(place, one) for one in writable):
+            return f"the service may not write to {place}: ProtectSystem=, no ReadWritePaths="
+    if uid == 0:
+        return ""
+    status = os.stat(patient.machine.path(place))
+    shift = 6 if status.st_uid == uid else 3 if status.st_gid in groups_of(uid) else 0
+    return "" if (status.st_mode >> shift) & 3 == 3 else f"{account_name(uid)} may not write to {place}"
+
+
+def _is_in(path: str, directory: str) -> bool:
+    return f"{path}/".startswith(f"{directory.rstrip('/')}/")
+
+
+# --- memory -------------------------------------------------------------------------------------------
+
+
+def check_live_memory(patient: Patient) -> Finding:
+    """Is the place of chunks in order, and do readers let go of what was given up?"""
+    name, rows = "live memory", _rows(patient)
+    if not rows and not patient.config.live:
+        return skip(name, "no live map is set up")
+    path = _live_shm_dir(patient)
+    if huge := _huge_pages(patient, path):
+        return fail(
+            name,
+            f"{path} has huge pages ({huge}): a chunk of a few KiB takes 2 MiB there",
+            "name a tmpfs without them with live_shm_dir, such as /dev/shm",
+        )
+    if wrong := _wrong_marks(patient, path):
+        return warn(name, wrong, "restart the daemon: it puts the directory right, or says why it cannot")
+    for row in rows:
+        if row.evicting_bytes > row.budget_bytes // 4:
+            return warn(
+                name,
+                f"{row.name}: readers hold {format_bytes(row.evicting_bytes)} of chunks that were given up:"
+                f" {_holders_text(patient, path, row)}",
+                "end them, or have them let go: mapping goes on with what is left of"
+                f" {format_bytes(row.budget_bytes)}",
+            )
+    taken, budget = sum(row.bytes + row.evicting_bytes for row in rows), sum(row.budget_bytes for row in rows)
+    return ok(name, f"{path}: {format_bytes(taken)} of {format_bytes(budget)} taken" if rows else path)
+
+
+def _live_shm_dir(patient: Patient) -> str:
+    """Where the chunks are: as set, else with the cells, unless those are on huge pages."""
+    if patient.config.live_shm_dir:
+        return patient.config.live_shm_dir
+    return DEFAULT_SHM_DIR if _huge_pages(patient, patient.shm_dir) else patient.shm_dir
+
+
+def _huge_pages(patient: Patient, path: str) -> str:
+    options = mount_of(patient.machine, path).options
+    huge = next((option for option in options if option.startswith("huge=")), "")
+    return "" if huge in ("huge=never", "huge=advise") else huge
+
+
+def _wrong_marks(patient: Patient, path: str) -> str:
+    """What is wrong with the directory where mappers put their scans."""
+    marks = f"{path}/shmmap-live.{patient.config.instance}.marks"
+    if not _rows(patient):
+        return ""
+    try:
+        status = os.stat(patient.machine.path(marks), follow_symlinks=False)
+    except FileNotFoundError:
+        return f"{marks} is gone: nobody can map"
+    except OSError as error:
+        return f"{marks}: {error.strerror}"
+    group = patient.config.live_group
+    mode = stat.S_IMODE(status.st_mode)
+    if mode not in _MARKS_MODE.values() or (group and mode != _MARKS_MODE[True]):
+        return f"{marks} has mode {mode:o}, not {_MARKS_MODE[bool(group)]:o}"
+    if patient.pid and status.st_uid != patient.runs_as:
+        return f"{marks} belongs to {account_name(status.st_uid)}, not to the daemon's user"
+    if group and group not in (group_name(status.st_gid), str(status.st_gid)):
+        return f"{marks} belongs to group {group_name(status.st_gid)}, not {group}"
+    return ""
+
+
+def _holders_text(patient: Patient, path: str, row: LiveRow) -> str:
+    """Who maps the chunks that were given up, most bytes first: by the locks of readers."""
+    by_slot: dict[int, int] = {}
+    start = f"shmmap-live.{patient.config.instance}.{row.name}."
+    names: list[str] = []
+    with contextlib.suppress(OSError):
+        names = os.listdir(patient.machine.path(path))
+    for name in names:
+        if not (name.startswith(start) and name.endswith(".gone")):
+            continue
+        with contextlib.suppress(OSError):  # freed meanwhile, or not for this user
+            fd = os.open(patient.machine.path(f"{path}/{name}"), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                nbytes = os.fstat(fd).st_blocks * 512
+                for slot in holders(fd):
+                    by_slot[slot] = by_slot.get(slot, 0) + nbytes
+            finally:
+                os.close(fd)
+    if not by_slot:
+        return "nobody who says who it is"
+    clients = {
+        client.session: client for client in (patient.seen.clients if patient.seen is not None else [])
+    }
+    texts = []
+    for slot, nbytes in sorted(by_slot.items(), key=lambda item: -item[1])[:NAMED]:
+        client = clients.get(slot)
+        who = f"{client.client or client.command}, pid {client.pid or '?'}" if client else f"session {slot:x}"
+        texts.append(f"{who}: {format_bytes(nbytes)}")
+    more = f"; and {len(by_slot) - NAMED:,} more" if len(by_slot) > NAMED else ""
+    return "; ".join(texts) + more

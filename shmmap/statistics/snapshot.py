@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the statistics segment said at one moment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Literal, TypeVar
+
+from shmmap.errors import SegmentCorrupt
+from shmmap.statistics.cell_rows import CellRow, unpack_cell
+from shmmap.statistics.client_rows import ClientRow, unpack_client
+from shmmap.statistics.counters import Counter
+from shmmap.statistics.histogram import Histogram
+from shmmap.statistics.identity import DaemonIdentity, DaemonState
+from shmmap.statistics.layout import Header, State
+from shmmap.statistics.live_rows import LiveRow, unpack_live
+
+__all__ = ["Snapshot"]
+
+_Row = TypeVar("_Row")
+
+
+class Snapshot:
+    """The statistics at one moment.
+
+    Attributes
+    ----------
+    state : str
+        ``healthy``; ``stopped`` (SIGSTOP, a debugger); ``hung`` (runs, but has not beaten for 5 s);
+        ``dead`` (the process is gone and left its segment); ``absent`` (no segment: never started,
+        or stopped cleanly).  All but ``absent`` come with an identity.
+    identity : DaemonIdentity or None
+        Who wrote the statistics; None when absent.
+    beat_age_s : float
+        Seconds since the daemon last wrote; infinite when absent.
+    beat_monotonic_ns : int
+        When that was, CLOCK_MONOTONIC.
+    rows_missing : int
+        Cells the table had no room for.
+    size_bytes : int
+        Memory of the segment.
+    """
+
+    def __init__(
+        self,
+        state: DaemonState | Literal["absent"],
+        identity: DaemonIdentity | None,
+        header: Header | None = None,
+        values: State | None = None,
+        *,
+        beat_age_s: float = float("inf"),
+        size_bytes: int = 0,
+        rows: bytes = b"",
+        clients: bytes = b"",
+        live: bytes = b"",
+    ) -> None:
+        self.state: DaemonState | Literal["absent"] = state
+        self.identity = identity
+        self.beat_age_s = beat_age_s
+        self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
+        self.rows_missing = values.rows_missing if values is not None else 0
+        self.size_bytes = size_bytes
+        self._header = header
+        self._values = values
+        self._rows = rows
+        self._clients = clients
+        self._live = live
+
+    @cached_property
+    def counters(self) -> dict[str, int]:
+        """Values by name."""
+        if self._header is None or self._values is None:
+            return {}
+        names = (counter.name for counter in self._header.counters)
+        return dict(zip(names, self._values.values, strict=False))
+
+    @property
+    def descriptions(self) -> tuple[Counter, ...]:
+        """What the counters mean, in the daemon's order."""
+        return self._header.counters if self._header is not None else ()
+
+    @property
+    def histogram_descriptions(self) -> tuple[Counter, ...]:
+        """What the histograms mean, in the daemon's order."""
+        return self._header.histograms if self._header is not None else ()
+
+    @cached_property
+    def histograms(self) -> dict[str, Histogram]:
+        """Durations by name."""
+        if self._header is None or self._values is None:
+            return {}
+        step = 1 + self._header.bucket_count
+        values = self._values.histograms
+        return {
+            description.name: Histogram.of(values[index * step : (index + 1) * step])
+            for index, description in enumerate(self._header.histograms)
+            if (index + 1) * step <= len(values)
+        }
+
+    @cached_property
+    def cells(self) -> list[CellRow]:
+        """The segments the daemon keeps, in id order, then layer and version.
+
+        A row the daemon was changing at that very moment (it was stopped in mid-write) is left out.
+        """
+        step = self._header.row_bytes if self._header is not None else 0
+        return sorted(
+            _in_use(self._rows, step, unpack_cell), key=lambda row: (row.id, row.layer, row.version)
+        )
+
+    @cached_property
+    def clients(self) -> list[ClientRow]:
+        """The clients there is room for in the table, in the order they came."""
+        step = self._header.client_row_bytes if self._header is not None else 0
+        return _in_use(self._clients, step, unpack_client)
+
+    @cached_property
+    def live(self) -> list[LiveRow]:
+        """The live maps that the daemon keeps."""
+        step = self._header.live_row_bytes if self._header is not None else 0
+        return _in_use(self._live, step, unpack_live)
+
+
+def _in_use(data: bytes, step: int, unpack: Callable[[memoryview], _Row | None]) -> list[_Row]:
+    """The rows of a table that are in use, but for those that were being changed."""
+    found = []
+    view = memoryview(data)
+    for at in range(0, len(view) - step + 1, step) if step else ():
+        try:
+            row = unpack(view[at : at + step])
+        except SegmentCorrupt:
+            continue
+        if row is not None:
+            found.append(row)
+    return found

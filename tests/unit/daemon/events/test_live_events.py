@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events about live maps: each change once, and none before the daemon's own first one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import msgspec
+
+from shmmap.daemon.events.live_events import LiveEvents
+from shmmap.daemon.events.log import EventLog
+from shmmap.protocol import events as e
+from shmmap.protocol.live import LiveMapRow
+from shmmap.statistics.live_rows import LiveRow
+from shmmap.statistics.writer import StatisticsWriter
+
+ROW = LiveMapRow(
+    "lidar", "/maps/lidar", 0.1, "map", chunks=5, active=100, bytes=4096, loading=1, dirty=2, saving=1,
+    evicting=1, evicting_bytes=512, waiting_bytes=9, files=3, file_bytes=777, scans=11, durable=7,
+    budget_bytes=1 << 20, mappers=("0/front", "0/rear"), change=40,
+)  # fmt: skip
+
+
+class Shown:
+    """Keeps what would stand in the statistics."""
+
+    def __init__(self) -> None:
+        self.rows: Sequence[LiveRow] = ()
+        self.values: dict[str, int] = {}
+
+    def show_live_maps(self, rows: Sequence[LiveRow]) -> None:
+        self.rows = rows
+
+    def set(self, name: str, value: int) -> None:
+        self.values[name] = value
+
+
+class Heard:
+    """A log, and what it told since the last look."""
+
+    def __init__(self) -> None:
+        self.shown = Shown()
+        log = EventLog(epoch=5, clock_ns=lambda: 0)
+        log.send = lambda data: self._heard.append(cast("e.Event", e.decode_event(data)))
+        self._heard: list[e.Event] = []
+        self.events = LiveEvents(log, cast("StatisticsWriter", self.shown))
+
+    def take(self) -> list[tuple[Any, ...]]:
+        told = [(type(one), *msgspec.structs.astuple(one)[3:]) for one in self._heard]
+        self._heard.clear()
+        return told
+
+
+def changed(**what: Any) -> LiveMapRow:
+    return msgspec.structs.replace(ROW, **what)
+
+
+def test_each_change_is_told_once() -> None:
+    one = Heard()
+    one.events.begin(1)
+    assert one.take() == [(e.LiveStarted, 1, 0)]
+    one.events.told((ROW,))
+    one.events.told((changed(scans=12),))
+    assert one.take() == []  # how it was at first, and what no event tells
+    one.events.told((changed(change=41),))
+    one.events.told((changed(change=41),))
+    assert one.take() == [(e.LiveChanged, "lidar", 41)]
+    full = changed(change=41, problem="chunk 0_0_0 cannot be saved: disk full")
+    one.events.told((full,))
+    one.events.told((changed(change=41, problem="chunk 1_0_0 cannot be saved: disk full"),))
+    one.events.told((changed(change=41),))
+    assert one.take() == [(e.LiveProblem, "lidar", full.problem), (e.LiveProblem, "lidar", "")]
+    one.events.told((changed(change=41, damaged=("a",)),))
+    one.events.told((changed(change=41, damaged=("a", "b")),))
+    assert one.take() == [(e.LiveDamaged, "lidar", "a"), (e.LiveDamaged, "lidar", "b")]
+
+
+def test_a_worker_that_ends_and_the_next_one() -> None:
+    one = Heard()
+    one.events.begin(1)
+    one.events.told((changed(damaged=("a",)),))
+    one.take()
+    one.events.ended(1)
+    one.events.started(1, 5)
+    one.events.told((changed(damaged=("a",), change=99),))
+    assert one.take() == [(e.LiveEnded, 1), (e.LiveStarted, 1, 5), (e.LiveChanged, "lidar", 99)]
+    assert one.shown.values == {"live_restarts": 1}
+
+
+def test_nothing_is_told_before_the_daemon_tells_that_it_started() -> None:
+    """What was found by then is told after it."""
+    one = Heard()
+    one.events.started(1, 3)
+    one.events.told((changed(problem="chunk 0_0_0 cannot be loaded: torn", damaged=("a",)),))
+    assert one.take() == []
+    one.events.begin(1)
+    assert one.take() == [
+        (e.LiveStarted, 1, 3), (e.LiveDamaged, "lidar", "a"),
+        (e.LiveProblem, "lidar", "chunk 0_0_0 cannot be loaded: torn"),
+    ]  # fmt: skip
+
+
+def test_changes_take_no_number() -> None:
+    """They would push what happened to cells out of the daemon's memory."""
+    one = Heard()
+    one.events.begin(1)
+    last = one.events.event_log.last
+    one.events.told((ROW,))
+    one.events.told((changed(change=41),))
+    assert one.events.event_log.last == last
+    assert [row[0] for row in one.take()] == [e.LiveStarted, e.LiveChanged]
+
+
+def test_the_statistics_show_them() -> None:
+    one = Heard()
+    one.events.told(
+        (ROW, changed(name="radar", damaged=("a", "b"), problem="chunk 0_0_0 cannot be loaded: torn"))
+    )
+    lidar, radar = one.shown.rows
+    assert lidar == LiveRow("lidar", "", 5, 100, 4096, 1, 2, 1, 1, 512, 9, 3, 777, 11, 7, 1 << 20, 0, 2, 40)
+    assert (radar.name, radar.problem, radar.damaged) == ("radar", "chunk 0_0_0 cannot be loaded: torn", 2)
