@@ -18,15 +18,6 @@ from tests.support.live_drive import RESOLUTION
 from tests.support.raw_client import RawClient
 
 DaemonFactory = Callable[..., DaemonProcess]
-LiveDaemon = Callable[..., DaemonProcess]
-
-LIVE_SETTINGS = """\
-[live.lidar]
-resolution = {resolution}
-linger_s = 0.05
-checkpoint_s = {checkpoint}
-path = "{path}"
-"""
 
 
 @pytest.fixture
@@ -59,22 +50,6 @@ def daemon(private_tmpfs: Callable[[str], str]) -> Iterator[DaemonFactory]:
     What they may leave behind: `shmmap.testing.isolation`.
     """
     yield from judged_daemons(DaemonProcess)
-
-
-@pytest.fixture
-def live_daemon(daemon: DaemonFactory, tmp_path: Path) -> LiveDaemon:
-    """Start a daemon that keeps the live map ``lidar`` alone."""
-
-    def make(
-        *flags: str, resolution: float = RESOLUTION, checkpoint: float = 0.2, start: bool = True
-    ) -> DaemonProcess:
-        file = tmp_path / "shmmap.toml"
-        file.write_text(
-            LIVE_SETTINGS.format(resolution=resolution, checkpoint=checkpoint, path=tmp_path / "lidar")
-        )
-        return daemon("", "--config", str(file), "--live-budget", "16M", *flags, start=start)
-
-    return make
 
 
 @pytest.fixture

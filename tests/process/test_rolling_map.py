@@ -19,8 +19,8 @@ from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
 import shmmap
-from tests.process.conftest import LiveDaemon
 from tests.support.daemon_process import DaemonProcess
+from tests.support.live_daemon import LiveDaemon
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, reference
 from tests.support.slow_occupancy import Voxel

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 
 from shmmap.errors import ConfigError
@@ -34,8 +35,6 @@ def _places(name: str) -> list[str]:
 
     config = load_config({}, file=installed_config_file())
     places = [one.path for one in config.live if one.name == name and one.path]
-    try:
+    with contextlib.suppress(ConfigError):  # no home, no state of its own
         places.append(live_directory(config.instance, name))
-    except ConfigError:
-        pass  # no home, no state of its own
     return [*places, f"{SERVICE_STATE}/{config.instance}/live/{name}"]
