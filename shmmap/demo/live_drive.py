@@ -62,11 +62,11 @@ class LiveDriveSettings:
     blocks: tuple[int, int] = (3, 3)
     seed: int = 4
     length: float = 450.0
-    step: float = 2.5
-    lidar: Lidar = Lidar(rings=32, highest_deg=12.0, azimuth_deg=0.6, farthest=40.0)
+    step: float = 3.0
+    lidar: Lidar = Lidar(rings=32, highest_deg=12.0, azimuth_deg=0.6, farthest=25.0)
     density: float = 15.0
     resolution: float = 0.2
-    budget_bytes: int = 4 << 20
+    budget_bytes: int = 8 << 20
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from shmmap.errors import InternalError
 
 __all__ = ["FILTER", "main"]
 
-FILTER: Final = ScanFilter(min_range=1.0, max_range=30.0, min_z=-8.0, max_z=12.0)
+FILTER: Final = ScanFilter(min_range=1.0, max_range=20.0, min_z=-8.0, max_z=12.0)
 """Which points of the demonstration's scans count."""
 
 

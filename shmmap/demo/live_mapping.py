@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -111,7 +112,7 @@ class Kills:
     Attributes
     ----------
     daemon_at, down_s, kept
-        Scan after which the daemon was killed, seconds until it was back, and chunks in memory then.
+        Scan after which the daemon was killed, seconds until it was back, and chunks that it found in memory.
     mapper_at, resumed_at
         Scan after which the mapping program was killed, and with which its next run went on.
     """
@@ -135,7 +136,7 @@ def map_all(scans: int, mapping: Mapping, watch: Watch, daemon: DaemonProcess, p
         if not kills.daemon_at and number >= scans // 3:
             kills.daemon_at = number
             sent = range(number + 1, min(number + _WITHOUT_DAEMON, scans) + 1)
-            _kill_daemon(kills, mapping, watch, daemon, progress, sent)
+            _kill_daemon(kills, mapping, daemon, progress, sent)
             number += len(sent)
         elif not kills.mapper_at and number >= 2 * scans // 3:
             kills.mapper_at = number
@@ -149,7 +150,7 @@ def map_all(scans: int, mapping: Mapping, watch: Watch, daemon: DaemonProcess, p
 
 
 def _kill_daemon(
-    kills: Kills, mapping: Mapping, watch: Watch, daemon: DaemonProcess, progress: Progress, sent: range
+    kills: Kills, mapping: Mapping, daemon: DaemonProcess, progress: Progress, sent: range
 ) -> None:
     """Kill the daemon, send scans that nobody hears, start it again."""
     daemon.kill()
@@ -159,8 +160,14 @@ def _kill_daemon(
         mapping.send(number)
     daemon.start(PATIENCE_S)
     kills.down_s = time.perf_counter() - killed_s
-    kills.kept = watch.live.status().chunks
+    kills.kept = _found_in_memory(daemon)
     progress.event(f"It is back; it found {kills.kept} chunks in memory")
     for _ in sent:
         mapping.hear()
         progress.step()
+
+
+def _found_in_memory(daemon: DaemonProcess) -> int:
+    """Chunks that the daemon's present life took over; it may have given some up since."""
+    found = re.findall(r" live map in memory .* chunks=(\d+)", daemon.log)
+    return int(found[-1]) if found else 0

@@ -23,6 +23,7 @@ from tests.support.daemon_process import DaemonProcess
 from tests.support.live_daemon import LiveDaemon
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, reference
+from tests.support.patience import Patience
 from tests.support.slow_occupancy import Voxel
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.rolling_map"]
@@ -247,19 +248,21 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
     scans = read_drive(tmp_path / "drive12")
     source = f"ipc://{tmp_path}/scans.sock"
     command = [*PROGRAM, "run", "--live", "lidar", "--scans", source, *LIMITS, "--json", "--timeout", "3"]
-    with ScanPublisher(source) as publisher:
-        process = subprocess.Popen(
-            [*command, "--endpoint", one.endpoint],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    with (
+        ScanPublisher(source) as publisher,
+        subprocess.Popen(
+            [*command, "--endpoint", one.endpoint], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process,
+    ):
         try:
             assert process.stderr is not None
             assert publisher.wait_for_listener(LONG_S)
             assert process.stderr.readline() == f"waiting for scans from {source}\n"
             for number, scan in enumerate(scans):
                 if number == 5:
+                    waiting = Patience()
+                    while waiting(scans_of(one) < number):  # more on their way, and it would wait for them
+                        pass
                     one.kill()
                 publisher.send(scan)
                 line = process.stderr.readline()
@@ -272,7 +275,6 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
             assert process.returncode == 0, err
         finally:
             process.kill()
-            process.wait()
     document = json.loads(out)
     assert (document["scans"], document["applied"], document["durable"]) == (12, 12, 12)
     assert on_disk(one) == expected(scans)
@@ -310,18 +312,18 @@ def test_nothing_found_exits_1(live_daemon: LiveDaemon, words: Words, tmp_path: 
     assert run(*words(one, *near, "--allow-empty", scans=3)).returncode == 0
     assert on_disk(one) == {}
     source = f"ipc://{tmp_path}/none.sock"
-    with ScanPublisher(source) as publisher:
-        process = subprocess.Popen(
+    with (
+        ScanPublisher(source) as publisher,
+        subprocess.Popen(
             [*PROGRAM, "run", "--live", "lidar", "--scans", source, "--endpoint", one.endpoint, "--quiet"],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+            stderr=subprocess.PIPE, text=True,
+        ) as process,
+    ):  # fmt: skip
         try:
             assert publisher.wait_for_listener(LONG_S)
             publisher.send(None)
             _, err = process.communicate(timeout=LONG_S)
         finally:
             process.kill()
-            process.wait()
     assert process.returncode == 1
     assert f"no scan came from {source}" in err

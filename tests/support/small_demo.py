@@ -28,7 +28,11 @@ SMALL: Final = demo_town.DemoSettings(
 )
 
 SMALL_LIVE: Final = live_drive.LiveDriveSettings(
-    length=420.0, step=7.0, lidar=Lidar(rings=16, azimuth_deg=1.5, farthest=40.0), density=4.0
+    length=420.0,
+    step=7.0,
+    lidar=Lidar(rings=16, azimuth_deg=1.5, farthest=25.0),
+    density=4.0,
+    budget_bytes=4 << 20,
 )
 
 

@@ -34,7 +34,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--path", type=Path, required=True, metavar="FILE", help="JSON: where the sensor was, metres"
     )
-    parser.add_argument("--picture", required=True, metavar="FILE", help="SVG")
+    parser.add_argument("--picture", type=Path, required=True, metavar="FILE", help="SVG")
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -28,18 +29,27 @@ def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.fl
     OverBudget
         The daemon has no memory for a list at all.
     """
-    keys = np.array([row.key for row in live.chunks(saved=scope != "memory")], np.int64).reshape(-1, 3)
+    rows = live.chunks(saved=scope != "memory")
+    keys = np.array([row.key for row in rows], np.int64).reshape(-1, 3) * _SIDE
+    counts = np.array([row.occupied if kind == "occupied" else row.free for row in rows], np.int64)
     found = [np.empty((0, 3))]
     if not len(keys):
         return found[0]
-    waiting = [(keys.min(axis=0) * _SIDE, (keys.max(axis=0) + 1) * _SIDE)]
+    waiting = [(keys.min(axis=0), keys.max(axis=0) + _SIDE)]
+    too_many = math.inf
     while waiting:
         low, high = waiting.pop()
-        try:
-            found.append(live.voxels(kind, _box(low, high, live.resolution), scope=scope).xyz)
-        except OverBudget:
-            if (high - low).max() == 1:
-                raise
+        inside = (keys < high).all(axis=1) & (keys + _SIDE > low).all(axis=1)
+        expected = int(counts[inside].sum())
+        if expected and (expected < too_many or inside.sum() == 1):
+            try:
+                found.append(live.voxels(kind, _box(low, high, live.resolution), scope=scope).xyz)
+            except OverBudget:
+                if (high - low).max() == 1:
+                    raise
+                too_many = min(too_many, expected)
+                waiting += _halves(low, high)
+        elif expected:
             waiting += _halves(low, high)
     return np.concatenate(found)
 

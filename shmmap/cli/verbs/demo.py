@@ -56,7 +56,7 @@ _JSON = """\
   "chunks", "file_bytes": of the map on disk, "budget_bytes", "most_bytes": memory of chunks,
   "given_up", "came_back": how often a chunk left memory, and came into it again,
   "active", "active_bytes": known voxels in memory in the end, and their memory,
-  "daemon": {"killed_at": scan, "down_s", "chunks": in memory when it was back},
+  "daemon": {"killed_at": scan, "down_s", "chunks": that it found in memory},
   "mapper": {"killed_at", "resumed_at"}, "voxels", "differing": compared with a map without
   bounds, "svg", "seconds"}; exit code 1 where a voxel differs"""
 
