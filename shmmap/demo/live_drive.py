@@ -32,6 +32,7 @@ from shmmap.testing.daemon_process import DaemonProcess
 __all__ = ["LiveDriveResult", "LiveDriveSettings", "run_live_drive"]
 
 _MAP: Final = "town"
+_LIDAR: Final = Lidar(rings=32, highest_deg=12.0, azimuth_deg=0.6, farthest=25.0)
 _SETTINGS: Final = """\
 [live.{name}]
 path = {path}
@@ -63,7 +64,7 @@ class LiveDriveSettings:
     seed: int = 4
     length: float = 450.0
     step: float = 3.0
-    lidar: Lidar = Lidar(rings=32, highest_deg=12.0, azimuth_deg=0.6, farthest=25.0)
+    lidar: Lidar = _LIDAR
     density: float = 15.0
     resolution: float = 0.2
     budget_bytes: int = 8 << 20

@@ -30,18 +30,20 @@ def main(argv: list[str]) -> int:
     import shmmap
 
     endpoint, name, scans = argv
-    with shmmap.connect(endpoint, name="demo mapper") as client:
-        with client.live(name).mapper("demo", FILTER) as mapper:
-            _say("next", mapper.applied + 1)
-            for line in sys.stdin:
-                number = int(line)
-                with np.load(Path(scans, f"{number}.npz")) as scan:
-                    sent = mapper.add(scan["xyz"], scan["pose"])
-                if sent != number:
-                    raise InternalError(f"scan {number} was sent as {sent}")
-                _say("applied", mapper.applied)
-            mapper.wait_applied()
+    with (
+        shmmap.connect(endpoint, name="demo mapper") as client,
+        client.live(name).mapper("demo", FILTER) as mapper,
+    ):
+        _say("next", mapper.applied + 1)
+        for line in sys.stdin:
+            number = int(line)
+            with np.load(Path(scans, f"{number}.npz")) as scan:
+                sent = mapper.add(scan["xyz"], scan["pose"])
+            if sent != number:
+                raise InternalError(f"scan {number} was sent as {sent}")
             _say("applied", mapper.applied)
+        mapper.wait_applied()
+        _say("applied", mapper.applied)
     return 0
 
 

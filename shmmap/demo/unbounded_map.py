@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of a drive without any bounds, which knows no chunks' files and no daemon: what a live map must be."""
+"""A map of a drive without any bounds, which knows no daemon: what a live map must be."""
 
 from __future__ import annotations
 

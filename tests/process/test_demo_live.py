@@ -73,6 +73,7 @@ def test_a_voxel_that_differs_is_told(
 
     class Saboteur(demo_progress.QuietProgress):
         def stage(self, text: str, total: int) -> None:
+            assert total > 0
             if text.startswith("Mapping"):
                 (scan,) = tmp_path.glob("shmmap-demo-*/scans/7.npz")
                 with np.load(scan) as found:

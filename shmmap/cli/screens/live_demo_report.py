@@ -55,8 +55,8 @@ def _kills(result: LiveDriveResult) -> str:
     kills = result.kills
     return (
         f"the daemon after scan {kills.daemon_at}: back in {format_duration(kills.down_s)}, and"
-        f" found {kills.kept} chunks in memory; the mapping program after scan {kills.mapper_at}: its next run"
-        f" went on with scan {kills.resumed_at}"
+        f" found {kills.kept} chunks in memory; the mapping program after scan {kills.mapper_at}: its next"
+        f" run went on with scan {kills.resumed_at}"
     )
 
 

@@ -70,15 +70,15 @@ def add_parser(subparsers: Subparsers) -> None:
         help="see it work: no map needed, about a minute",
         description="Build a town and drive through it with one process, then with eight: each with a private"
         " copy of the map, then all on one copy that shmmap shares.  Kill the daemon, and see the processes"
-        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.  With --live: map"
-        " a drive.",
+        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.  With"
+        " --live: map a drive.",
         json=_JSON,
     )
     parser.add_argument(
         "--svg",
         metavar="FILE",
-        help="where the picture goes (default: ./shmmap-demo.svg, with --full or --live ./shmmap-demo-full.svg"
-        " or -live.svg)",
+        help="where the picture goes (default: ./shmmap-demo.svg, with --full or --live"
+        " ./shmmap-demo-full.svg or ./shmmap-demo-live.svg)",
     )
     parser.add_argument("--keep-map", metavar="DIR", help="build the map in DIR, and leave it there")
     parser.add_argument(

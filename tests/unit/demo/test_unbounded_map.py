@@ -29,8 +29,8 @@ def test_it_is_what_the_reference_says() -> None:
     for key in {ChunkKey(x >> 6, y >> 6, z >> 6) for x, y, z in expected}:
         dense = made.chunk(key, Occupancy())
         places = np.flatnonzero(dense)
-        for (x, y, z), value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):
-            found[x, y, z] = value
+        voxels = map(tuple, voxels_of(key, places).tolist())
+        found |= dict(zip(voxels, dense[places].tolist(), strict=True))
     assert found == expected
 
 
