@@ -157,7 +157,7 @@ class Program:
             raise InternalError(
                 f"{self.name} takes longer than {timeout_s:g} s: {self.last_words()}"
             ) from None
-        self._process = None
+        self._forget(self._process)
         return code
 
     def document(self, timeout_s: float) -> tuple[dict[str, Any], int]:
@@ -188,8 +188,12 @@ class Program:
                 with contextlib.suppress(ProcessLookupError):
                     (os.killpg if self._own_session else os.kill)(self._process.pid, signal.SIGKILL)
                 self._process.wait()
-                for pipe in (self._process.stdin, self._process.stdout):
-                    if pipe is not None:
-                        with contextlib.suppress(BrokenPipeError):
-                            pipe.close()
-                self._process = None
+                self._forget(self._process)
+
+    def _forget(self, process: subprocess.Popen[bytes]) -> None:
+        """It has ended: nobody talks with it any more."""
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+        self._process = None
