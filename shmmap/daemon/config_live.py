@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -30,6 +29,8 @@ _RANGES: Final = {
     "checkpoint_s": (0.1, 3600.0, "seconds"),
     "most_active": (0, 1 << 40, "voxels; 0: as many as fit"),
 }
+_LARGEST: Final = 1 << 53
+"""Beyond any limit; a whole number may be too large for a float."""
 
 
 class LiveSettings(msgspec.Struct, frozen=True):
@@ -145,9 +146,12 @@ def _from_table(name: str, table: Mapping[str, Any], origin: str) -> LiveSetting
 def _checked(key: str, value: Any, default: Any, where: str, origin: str) -> Any:
     kind = type(default)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = float(max(-_LARGEST, min(value, _LARGEST)))
     if not isinstance(value, kind) or isinstance(value, bool):
-        raise ConfigError(f"{where} must be of type {kind.__name__}, not {value!r}", key=key, origin=origin)
+        raise ConfigError(
+            f"{where} must be of type {kind.__name__}, not {value!r}", key=key, origin=origin,
+            hint=f"its default is {default!r}" if default != "" else "write it in quotes",
+        )  # fmt: skip
     if key == "frame_id" and not 0 < len(value.encode()) <= MOST_FRAME_BYTES:
         raise ConfigError(
             f"{where} cannot be {value!r}", key=key, origin=origin,
@@ -159,7 +163,7 @@ def _checked(key: str, value: Any, default: Any, where: str, origin: str) -> Any
         )
     if key in _RANGES:
         least, most, what = _RANGES[key]
-        if not (math.isfinite(value) and least <= value <= most):
+        if not least <= value <= most:
             raise ConfigError(
                 f"{where} cannot be {value!r}", key=key, origin=origin, hint=f"{least} to {most} {what}"
             )

@@ -24,8 +24,13 @@ def packet_buffer() -> bytearray:
     return bytearray(MAX_PACKET_BYTES)
 
 
-def receive_packet(channel: socket.socket, buffer: bytearray) -> tuple[memoryview, int]:
+def receive_packet(channel: socket.socket, buffer: bytearray, *, wait: bool = True) -> tuple[memoryview, int]:
     """Receive one packet, and the descriptor that came with it.
+
+    Parameters
+    ----------
+    wait
+        False: `BlockingIOError` where there is none, whatever else the channel waits for.
 
     Returns
     -------
@@ -39,9 +44,8 @@ def receive_packet(channel: socket.socket, buffer: bytearray) -> tuple[memoryvie
     OSError
         As `socket.socket.recvmsg`.
     """
-    count, control, _flags, _address = channel.recvmsg_into(
-        [buffer], _ONE_DESCRIPTOR, socket.MSG_CMSG_CLOEXEC
-    )
+    flags = socket.MSG_CMSG_CLOEXEC if wait else socket.MSG_CMSG_CLOEXEC | socket.MSG_DONTWAIT
+    count, control, _flags, _address = channel.recvmsg_into([buffer], _ONE_DESCRIPTOR, flags)
     fd = -1
     for level, kind, data in control:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS) and len(data) >= 4:

@@ -21,9 +21,10 @@ __all__ = ["ForkedProcess", "channel", "fork_child", "how_ended", "start_child"]
 
 
 def channel() -> tuple[socket.socket, socket.socket]:
-    """Return both ends of a channel, the parent's first, which takes the longest job there is."""
+    """Return both ends of a channel, the parent's first; each takes the longest packet there is."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_PACKET_BYTES)
+    for end in (ours, theirs):
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_PACKET_BYTES)
     return ours, theirs
 
 

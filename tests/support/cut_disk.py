@@ -78,6 +78,8 @@ class CutDisk:
 
     def remove(self, name: str) -> None:
         """Remove a file."""
+        if name not in self._names:
+            raise FileNotFoundError(name)
         self._count()
         self._set(name, None)
 

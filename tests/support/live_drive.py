@@ -24,7 +24,7 @@ from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView, check_consistent
 from shmmap.chunks.marking import Marker, ScanFilter
 from shmmap.chunks.marks import Marks
-from shmmap.chunks.voxels import voxels_of
+from shmmap.chunks.voxels import ChunkKey, voxels_of
 from shmmap.daemon.live.adopting import adopt
 from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
 from shmmap.daemon.live.folder import Folder
@@ -107,7 +107,9 @@ def main() -> None:
     made.on_applied = lambda scan: print(f"applied {scan.number}", flush=True)
     made.on_durable = lambda scan: print(f"durable {scan.number}", flush=True)
     waiting = list(enumerate(marked(), 1))[first - 1 :]
-    evicted = most = 0
+    given_up: list[ChunkKey] = []
+    made.on_gone = given_up.append
+    most = 0
     poses = [pose for _, pose in drive()]
     while waiting or not made.all_durable:
         if waiting and made.residency.has_room(1):
@@ -116,14 +118,11 @@ def main() -> None:
             made.add(1, number, marks, 1)
         made.turn(time.monotonic(), time.time_ns(), save_all=not waiting)
         most = max(most, made.residency.chunk_bytes + made.residency.leased_bytes)
-        for lease in list(made.residency.leases.values()):
-            made.released(lease)
-            evicted += 1
         made.wait(0.05)
     made.files.write_manifest()
     made.close()
     folder.close()
-    print(f"evicted {evicted}\nmost {most}\ndone", flush=True)
+    print(f"evicted {len(given_up)}\nmost {most}\ndone", flush=True)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class AttachedChunk:
     """
 
     def __init__(self, path: str, key: ChunkKey, generation: int, map_id: bytes, slot: int) -> None:
-        self.key = key
+        self.key, self.generation = key, generation
         self._path = path
         try:
             fd = os.open(path, _FLAGS)
@@ -82,11 +82,6 @@ class AttachedChunk:
         """Whether it may still change; if not, another one may have its key."""
         return int(self._header.state["state"]) != OUT_OF_SERVICE
 
-    @property
-    def version(self) -> int:
-        """Rises with each scan that it takes in."""
-        return int(self._header.state["version"])
-
     def copy(self) -> ChunkView:
         """Return it as it was at one moment, just now.
 
@@ -96,7 +91,8 @@ class AttachedChunk:
             Its writer died in the middle of a change: the next one mends it, or has another chunk in its
             place.
         """
-        if self._copy is None or int(self._copy.state["version"]) != self.version:
+        # not its version: what a writer had changed when it died is undone, and may come again otherwise
+        if self._copy is None or self._copy.state["sequence"] != self._header.state["sequence"]:
             copy = consistent_copy(self._header, self._room)
             if copy is None:
                 raise StaleHandle(f"{self._path}: it is being written")

@@ -124,7 +124,7 @@ class ChunkReader:
         mapped = self._chunks.pop(key, None)
         if row is None or row.generation == 0:
             return None
-        if mapped is None or not mapped.in_service:
+        if mapped is None or mapped.generation != row.generation or not mapped.in_service:
             place = self._place()
             path = f"{place.prefix}{key.text}.{row.generation}"
             mapped = AttachedChunk(path, key, row.generation, place.map_id, place.slot)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -218,11 +219,16 @@ class LiveMap:
             There are too many for the daemon's memory: ask for a smaller area.
         """
         message = _area(area)
-        reply = self._ask(
-            lambda n: messages.LiveVoxels(n, self.name, kind, message, scope, since),
-            messages.LiveVoxelsReply,
-            quiet_s=LIST_S,
-        )
+
+        def ask(request: int) -> messages.LiveRequest:
+            return messages.LiveVoxels(request, self.name, kind, message, scope, since)
+
+        with contextlib.suppress(StaleHandle):  # the process that made it ended just then
+            return self._listed(ask)
+        return self._listed(ask)
+
+    def _listed(self, ask: Callable[[int], messages.LiveRequest]) -> Voxels:
+        reply = self._ask(ask, messages.LiveVoxelsReply, quiet_s=LIST_S)
         try:
             return open_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
         finally:

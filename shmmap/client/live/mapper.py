@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
 import threading
 import time
 import weakref
@@ -77,7 +78,6 @@ class _Sender:
         self.error: ShmmapError | None = None
         self._waiting: deque[_Marked] = deque()
         self._ending = False
-        self._files = 0
         self._connection = Connection((path,), name=f"mapper {name}"[:64], timeout_s=connect_s)
         try:
             self.opened = self._open()
@@ -163,8 +163,7 @@ class _Sender:
                         self.opened = self._open()
 
     def _try(self, scan: _Marked, timeout_s: float) -> int:
-        self._files += 1
-        name = f"{self._connection.welcome.session:x}.{self._files}"
+        name = f"{self._connection.welcome.session:x}.{secrets.randbits(63)}"  # nobody can be there before
         path = os.path.join(self.opened.marks_dir, name)
         try:
             _write(path, scan.data)
@@ -176,7 +175,7 @@ class _Sender:
                 messages.LiveApplied, timeout_s=timeout_s, quiet_s=timeout_s,
             )  # fmt: skip
         finally:
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(OSError):  # the daemon removes it when the session has ended
                 os.unlink(path)
         return reply.durable
 
@@ -309,7 +308,7 @@ def _write(path: str, data: bytes) -> None:
     try:
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
         with open(fd, "wb") as file:
-            os.fchmod(fd, 0o644)  # whatever the umask: the daemon is another account
+            os.fchmod(fd, 0o644)  # whatever the umask: the daemon may be another user
             file.write(data)
     except OSError as error:
         if error.errno in (errno.ENOENT, errno.ENOSPC):

@@ -54,6 +54,8 @@ def adopt(live: LiveMap, now_s: float) -> int:
         live.take_over(chunk, now_s)
     if undone is not None:
         live.undo.drop()
+    if memory.foreign:
+        log.warning("somebody else's files left alone", count=len(memory.foreign), first=min(memory.foreign))
     return len(live.chunks)
 
 

@@ -118,12 +118,18 @@ class ChunkMemory:
         What its names start with, see `live_prefix`.
     mode, gid
         Who may read the chunks; a group of -1 is the process's own.
+
+    Attributes
+    ----------
+    foreign : set
+        Names like those of chunks that are somebody else's files: they are left alone.
     """
 
     def __init__(self, path: str, prefix: str, *, mode: int = 0o600, gid: int = -1) -> None:
         self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
         self.prefix = prefix
         self._mode, self._gid = mode, gid
+        self.foreign: set[str] = set()
 
     def close(self) -> None:
         """Leave the directory; what is in it stays."""
@@ -155,14 +161,19 @@ class ChunkMemory:
             if self._gid >= 0:
                 os.fchown(fd, -1, self._gid)
             os.fchmod(fd, self._mode)
+            chunk = self._mapped(name, fd, len(content))
+        except BaseException:
+            os.close(fd)
+            raise
+        try:
             os.link(
                 f"/proc/self/fd/{fd}", name.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd,
                 follow_symlinks=True,
             )  # fmt: skip
-            return self._mapped(name, fd, len(content))
         except BaseException:
-            os.close(fd)
+            chunk.close()
             raise
+        return chunk
 
     def open(self, name: str) -> ChunkFile:
         """Map a chunk that an earlier writer left.
@@ -228,7 +239,17 @@ class ChunkMemory:
                     key = ChunkKey.from_text(found[1])
                 except BadRequest:
                     continue
-                yield "/" + name, key, int(found[2])
+                if self._is_ours(name):
+                    yield "/" + name, key, int(found[2])
+                else:
+                    self.foreign.add(name)
+
+    def _is_ours(self, name: str) -> bool:
+        """Whether a file belongs to this process's user; in a sticky directory nobody else can replace it."""
+        try:
+            return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_uid == os.geteuid()
+        except FileNotFoundError:
+            return False
 
     def remove(self, name: str) -> None:
         """Remove the name of what is of no use."""

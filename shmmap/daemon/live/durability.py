@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from shmmap.daemon.live.records import Chunk, Scan
 
 __all__ = ["Durability"]
@@ -36,6 +38,14 @@ class Durability:
         if chunk.version > chunk.durable:
             scan.to_save[chunk.key] = chunk.version
             chunk.unsaved.append((chunk.version, scan))
+
+    def missing(self, chunks: Iterable[Chunk]) -> list[tuple[Chunk, int]]:
+        """Chunks, of these and of those given up since they were written, that are not durable as they are.
+
+        Each is, when its ``durable`` comes to the version that stands beside it.
+        """
+        there = [(chunk, chunk.version) for chunk in chunks if chunk.version > chunk.durable]
+        return [*there, *self.written, *self.flushing]
 
     def begin(self) -> None:
         """A flush begins: it makes durable what was written until now."""

@@ -28,14 +28,12 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, GivenUp, memory_bytes
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan
-from shmmap.daemon.live.residency import Residency
+from shmmap.daemon.live.residency import RETRY_S, Residency
 from shmmap.errors import MapDataError, PackageMissing
 from shmmap.logfmt import log
 
 __all__ = ["LiveMap"]
 
-MOST_PROBLEMS: Final = 64
-"""Chunks whose problems are remembered."""
 CHUNKS_A_TURN: Final = 64
 """Chunks that take in a scan in one turn: 37 us each."""
 
@@ -74,7 +72,7 @@ class LiveMap:
     kept : dict
         What is out of service and may still be mapped, by number of its lease.
     problems : dict
-        By chunk, why it could not be loaded or saved the last time; at most `MOST_PROBLEMS`.
+        What keeps chunks from being loaded or saved just now.
     """
 
     files: MapFiles
@@ -90,10 +88,11 @@ class LiveMap:
     residency: Residency = field(init=False)
     chunks: dict[ChunkKey, ChunkFile] = field(default_factory=dict)
     kept: dict[int, GivenUp] = field(default_factory=dict)
-    problems: dict[ChunkKey, str] = field(default_factory=dict)
+    problems: dict[str, str] = field(default_factory=dict)
     _parts: dict[Scan, _Part] = field(default_factory=dict)
     _running: dict[Future[Any], Callable[[Future[Any], float], None]] = field(default_factory=dict)
     _generation: int = 0
+    _flush_s: float = 0.0
 
     def __post_init__(self) -> None:
         self.residency = Residency(self.limits, new_bytes=memory_bytes(0))
@@ -167,18 +166,20 @@ class LiveMap:
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_A_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
+        while (lease := residency.next_eviction(now_s)) is not None:  # there is room for others now
+            given_up = self.kept[lease.number] = self.memory.give_up(self.chunks.pop(lease.key))
+            self.on_gone(lease.key)
+            if not given_up.is_mapped:
+                self.released(lease)
         while (cold := residency.next_load(now_s)) is not None:
             self._start(self.files.load, cold.key, then=partial(self._loaded, cold))
         while (dirty := residency.next_save(now_s, everything=save_all)) is not None:
             view = self.chunks[dirty.key].view
             copy = ChunkView(bytes(view.data[: chunk_bytes(int(view.state["bricks"]))]))
             self._start(self._save, dirty.key, copy, then=partial(self._saved, dirty, dirty.version))
-        if residency.flush_is_due:
+        if residency.flush_is_due and now_s >= self._flush_s:
             residency.durability.begin()
             self._start(self.files.flush, then=self._flushed)
-        while (lease := residency.next_eviction(now_s)) is not None:
-            self.kept[lease.number] = self.memory.give_up(self.chunks.pop(lease.key))
-            self.on_gone(lease.key)
 
     def wait(self, seconds: float) -> None:
         """Wait until a file was read or written, at most so long; not at all if there is none."""
@@ -238,11 +239,10 @@ class LiveMap:
                     self.files.put_aside(chunk.key, error.message)
             file = self.memory.create(content)
         except (OSError, PackageMissing) as error:
-            log.warning("chunk not loaded", chunk=chunk.key.text, reason=str(error))
-            self._note_problem(chunk.key, f"chunk {chunk.key.text} cannot be loaded: {error}")
+            self._failed("loaded", chunk.key.text, str(error))
             self.residency.load_failed(chunk, now_s)
             return
-        self.problems.pop(chunk.key, None)
+        self._succeeded("loaded")
         self.chunks[chunk.key] = file
         state = file.view.state
         self.residency.loaded(
@@ -257,17 +257,26 @@ class LiveMap:
         try:
             future.result()
         except OSError as error:
-            log.warning("chunk not saved", chunk=chunk.key.text, reason=error.strerror)
-            self._note_problem(chunk.key, f"chunk {chunk.key.text} cannot be saved: {error.strerror}")
+            self._failed("saved", chunk.key.text, error.strerror)
             self.residency.save_failed(chunk, now_s)
             return
-        self.problems.pop(chunk.key, None)
+        self._succeeded("saved")
         self.residency.saved(chunk, version, now_s)
         self.chunks[chunk.key].view.state["saved_version"] = version
 
-    def _note_problem(self, key: ChunkKey, text: str) -> None:
-        if len(self.problems) < MOST_PROBLEMS or key in self.problems:
-            self.problems[key] = text
+    @property
+    def problem(self) -> str:
+        """What keeps chunks from being loaded or saved just now; empty: nothing."""
+        return "; ".join(self.problems.values())
+
+    def _failed(self, what: str, key: str, reason: str | None) -> None:
+        if what not in self.problems:  # told once: it is tried again each second
+            log.warning(f"chunk not {what}", chunk=key or None, reason=reason)
+        self.problems[what] = f"chunk {key} cannot be {what}: {reason}" if key else f"not {what}: {reason}"
+
+    def _succeeded(self, what: str) -> None:
+        if self.problems.pop(what, ""):
+            log.info(f"chunks are {what} again")
 
     def list_files(self) -> None:
         """Have the manifest written, beside the rest."""
@@ -279,13 +288,14 @@ class LiveMap:
             log.warning("manifest not written", reason=str(error))
 
     def _flushed(self, future: Future[None], now_s: float) -> None:
-        del now_s
         try:
             future.result()
         except OSError as error:
-            log.warning("chunks not flushed", reason=error.strerror)
+            self._failed("flushed", "", error.strerror)
+            self._flush_s = now_s + RETRY_S
             self.residency.durability.failed()
             return
+        self._succeeded("flushed")
         for scan in self.residency.durability.flushed():
             self.on_durable(scan)
 

@@ -42,8 +42,8 @@ from shmmap.logfmt import log
 
 __all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
 
-SCANS_AHEAD: Final = 256
-"""Numbers of scans that ``map.json`` leaves to a mapper before it is written again."""
+SCANS_AHEAD: Final = 1 << 20
+"""Numbers of scans that ``map.json`` leaves to a mapper before it is written again: a day's, at 10 Hz."""
 
 
 class MapFiles:
@@ -124,19 +124,32 @@ class MapFiles:
         mapper = Mapper(self._map.next_mapper, uid, name)
         self._map.next_mapper += 1
         self._map.mappers.append(mapper)
-        self._write_map()
+        try:
+            self._write_map()
+        except OSError:
+            self._map.mappers.remove(mapper)
+            raise
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
         """A mapper gives way; nobody gets its number."""
-        self._map.mappers.remove(mapper)
-        self._write_map()
+        at = self._map.mappers.index(mapper)
+        del self._map.mappers[at]
+        try:
+            self._write_map()
+        except OSError:
+            self._map.mappers.insert(at, mapper)
+            raise
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
         """Make sure that the disk knows that a mapper's scans may have come to this number."""
-        if scan >= mapper.scans:
+        if scan >= (before := mapper.scans):
             mapper.scans = scan + SCANS_AHEAD
-            self._write_map()
+            try:
+                self._write_map()
+            except OSError:
+                mapper.scans = before
+                raise
 
     def _read_map(self, settings: MapSettings) -> MapRecord:
         found = read_map(self.files)

@@ -20,6 +20,8 @@ __all__ = ["place_live_maps"]
 CEILING_BYTES: Final = 1 << 30
 PART: Final = 8
 """Of the memory that is free, by default."""
+LEAST_BYTES: Final = 4 << 20
+"""Of each map: some of the largest chunks, half a mebibyte each."""
 
 
 def place_live_maps(
@@ -58,7 +60,13 @@ def place_live_maps(
         )  # fmt: skip
     same = os.stat(directory.path).st_dev == os.stat(cells.path).st_dev
     beside = cells_budget_bytes if same else 0
-    budget = budget_bytes or max(4 << 20, min((free + used - beside) // PART, CEILING_BYTES))
+    least = LEAST_BYTES * len(live)
+    budget = budget_bytes or max(least, min((free + used - beside) // PART, CEILING_BYTES))
+    if budget < least:
+        raise ConfigError(
+            f"{len(live)} live maps share {budget >> 20:,} MiB; each needs {LEAST_BYTES >> 20} MiB",
+            key="live_budget", hint=f"raise --live-budget to {least >> 20}M at least",
+        )  # fmt: skip
     if budget + beside > size:
         raise ConfigError(
             f"live maps of {budget >> 20:,} MiB and cells of {beside >> 20:,} MiB do not fit in"

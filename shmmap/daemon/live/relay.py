@@ -40,8 +40,12 @@ STARTS: Final = 2
 """Workers that may be killed before the maps are in memory."""
 MOST_OF_A_SESSION: Final = 64
 """Requests that may wait for their answers."""
-MOST_BYTES: Final = 1 << 16
-"""Of a request about live maps."""
+MOST_BYTES: Final = 1 << 12
+"""Of a request about live maps: names and numbers."""
+MOST_UNSENT: Final = 4096
+"""Messages for a worker that hears nothing just now: sessions that come and go could send without end."""
+IN_ORDER_S: Final = 1.0
+"""A worker that ends sooner after its maps were in memory is not started again at once a second time."""
 
 
 class NoLiveMaps:
@@ -113,7 +117,7 @@ class LiveRelay:
         self._last_ticket = 0
         self._serving = False
         self._failures = 0
-        self._start_s = 0.0
+        self._start_s = self._served_s = 0.0
         self._why: ShmmapError | None = None
         self._unsaved = -1
 
@@ -142,8 +146,7 @@ class LiveRelay:
                 if self._failures > STARTS:
                     break
                 self.start()
-            if self._channel is not None:
-                select.select([self._channel], [], [], left_s)
+            self._wait(left_s)
             self.hear()
         if not self._serving:
             raise self._why or CannotStart(
@@ -153,6 +156,13 @@ class LiveRelay:
     def tell(self) -> None:
         """Tell events from now on: clients are heard."""
         self._events.begin(len(self._begin.maps))
+
+    def _wait(self, seconds: float) -> None:
+        """Wait until the worker says something, or takes what is to be sent."""
+        if self._channel is not None:
+            poller = select.poll()  # `select.select` takes no descriptor above 1023
+            poller.register(self._channel, select.POLLIN | (select.POLLOUT if self._unsent else 0))
+            poller.poll(seconds * 1000)
 
     def beat(self, now_s: float) -> None:
         """Start another worker when it is time to."""
@@ -187,7 +197,7 @@ class LiveRelay:
         elif isinstance(message, messages.Status):
             self._events.told(message.maps)
         elif isinstance(message, messages.Begun):
-            self._serving, self._failures = True, 0
+            self._serving, self._served_s = True, time.monotonic()
             log.info("live maps are served", maps=len(self._begin.maps), chunks=message.adopted)
             self._events.started(len(self._begin.maps), message.adopted)
         elif isinstance(message, messages.Failed):
@@ -205,11 +215,14 @@ class LiveRelay:
 
     def _lost(self) -> None:
         """The worker has ended: tell who waits, and start another one soon."""
+        now_s = time.monotonic()
+        if self._serving and now_s >= self._served_s + IN_ORDER_S:
+            self._failures = 0
         self._forget()
         if self._unsaved >= 0:
             return  # as it was told to
         self.restarts += 1
-        self._start_s = time.monotonic() + PAUSES_S[min(self._failures, len(PAUSES_S) - 1)]
+        self._start_s = now_s + PAUSES_S[min(self._failures, len(PAUSES_S) - 1)]
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
@@ -239,7 +252,7 @@ class LiveRelay:
         Raises
         ------
         Busy
-            Too many of this session's wait.
+            Too many of this session's wait, or of all sessions'.
         BadRequest
             It is too long.
         LiveInterrupted
@@ -252,11 +265,13 @@ class LiveRelay:
             raise Busy(f"{waiting} requests of this session about live maps wait", hint="wait for some")
         if self._channel is None:
             raise LiveInterrupted("the process that keeps live maps is being started anew")
+        if len(self._unsent) >= MOST_UNSENT:
+            raise Busy("the process that keeps live maps hears nothing just now", hint="ask again")
+        maps = self._may_map(session.peer, now_s)
         self._askers.add(session.slot)
         self._last_ticket += 1
         self._tickets[self._last_ticket] = session, message.request
         self._waiting[session.slot] = waiting + 1
-        maps = self._may_map(session.peer, now_s)
         self._send(messages.Ask(self._last_ticket, session.slot, session.peer.uid, maps, bytes(body)))
 
     def left(self, session: Session) -> None:
@@ -299,10 +314,8 @@ class LiveRelay:
         self._unsent.append(messages.encode(messages.End(keep)))
         while self._channel is not None and (left_s := end_s - time.monotonic()) > 0:
             self._flush()
-            if self._channel is not None:
-                writing = [self._channel] if self._unsent else []
-                select.select([self._channel], writing, [], left_s)
-                self.hear()
+            self._wait(left_s)
+            self.hear()
         if self._unsaved > 0 and not keep:
             log.error("chunks not saved stay in memory", chunks=self._unsaved)
         elif self._unsaved < 0:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from itertools import islice, takewhile
+from itertools import takewhile
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
@@ -69,7 +69,7 @@ class Residency:
         self._needing: dict[ChunkKey, Chunk] = {}
         self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
         self._victims: list[Chunk] = []  # the first to give up last
-        self._review_s = -math.inf
+        self._review_s = self._save_s = -math.inf  # neither before
         self._leases_given = 0
         self.durability = Durability()
 
@@ -81,8 +81,6 @@ class Residency:
         self.chunk_bytes += nbytes - chunk.nbytes
         self.active += active - chunk.active
         chunk.nbytes, chunk.active = nbytes, active
-
-    # --- clients --------------------------------------------------------------------------------
 
     def move(self, client: object, position: tuple[float, float, float]) -> None:
         """A client is somewhere, in chunks; see `Windows.move`."""
@@ -121,9 +119,21 @@ class Residency:
             self._needing[key] = chunk
 
     def ready(self) -> list[tuple[Chunk, Scan]]:
-        """What can be applied now: of each chunk in memory the scan that comes next."""
-        there = (chunk for chunk in self._needing.values() if chunk.state is not State.LOADING)
-        return [(chunk, chunk.waiting[0]) for chunk in there]
+        """What can be applied now: of each chunk in memory the scan that comes next.
+
+        Those that had not the memory for it, and have not now, come last.
+        """
+        there = [chunk for chunk in self._needing.values() if chunk.state is not State.LOADING]
+        return [(chunk, chunk.waiting[0]) for chunk in sorted(there, key=self._lacks_memory)]
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether something can be applied now for which there may be memory."""
+        needing = self._needing.values()
+        return any(one.state is not State.LOADING and not self._lacks_memory(one) for one in needing)
+
+    def _lacks_memory(self, chunk: Chunk) -> bool:
+        return bool(chunk.missing_bytes) and not self._fits(chunk.missing_bytes)
 
     def may_grow(self, chunk: Chunk, more_bytes: int) -> bool:
         """Whether a chunk may take so much more memory now; if not, others are given up for it."""
@@ -134,13 +144,7 @@ class Residency:
     def applied(
         self, chunk: Chunk, scan: Scan, *, version: int, nbytes: int, active: int, now_s: float
     ) -> None:
-        """A chunk has taken in the scan that it waited for first.
-
-        Raises
-        ------
-        ValueError
-            Another one comes first.
-        """
+        """A chunk has taken in the scan that it waited for first; ValueError if another one comes first."""
         if chunk.waiting[0] is not scan:
             raise ValueError("scans of a chunk are applied in the order in which they came")
         chunk.waiting.popleft()
@@ -161,8 +165,6 @@ class Residency:
         chunk.state, chunk.dirty_since_s = State.DIRTY, now_s
         self._dirty[chunk.key] = chunk
 
-    # --- loading --------------------------------------------------------------------------------
-
     def adopt(
         self, key: ChunkKey, *, version: int, saved: int, nbytes: int, active: int, now_s: float
     ) -> Chunk:
@@ -177,15 +179,16 @@ class Residency:
         """A chunk on disk takes so much memory."""
         self._sizes[key] = nbytes
 
+    def _size(self, key: ChunkKey) -> int:
+        return self._sizes.get(key, self._new_bytes)
+
     def next_load(self, now_s: float) -> Chunk | None:
         """The chunk to load now: those that scans wait for first, then what is nearest to a client."""
         if self.loading >= self.limits.loads:
             return None
         kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # room was made for these
         for chunk in self._needing.values():
-            if self._can_load(chunk, now_s) and self._fits(
-                self._sizes.get(chunk.key, self._new_bytes) + kept_bytes
-            ):
+            if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes):
                 return self._begin_load(chunk)
         if self._is_short(now_s):
             return None
@@ -193,7 +196,7 @@ class Residency:
             key = self._missing[-1]
             if key in self.chunks:
                 self._missing.pop()
-            elif self._fits(self._sizes.get(key, self._new_bytes) + kept_bytes):
+            elif self._fits(self._size(key) + kept_bytes):
                 self._missing.pop()
                 return self._begin_load(self.chunks.setdefault(key, Chunk(key)))
             else:
@@ -205,7 +208,7 @@ class Residency:
 
     def _begin_load(self, chunk: Chunk) -> Chunk:
         chunk.under_way = True
-        self._resize(chunk, self._sizes.get(chunk.key, self._new_bytes), 0)
+        self._resize(chunk, self._size(chunk.key), 0)
         self.loading += 1
         return chunk
 
@@ -233,13 +236,11 @@ class Residency:
         """Whether a scan waits for memory, or there are more known voxels than there may be."""
         if self.limits.most_active and self.active > self.limits.most_active:
             return True
-        for chunk in self._needing.values():
-            if chunk.missing_bytes:
-                if not self._fits(chunk.missing_bytes):
-                    return True
-            elif self._can_load(chunk, now_s) and not self._fits(self._sizes.get(chunk.key, self._new_bytes)):
-                return True
-        return False
+        return any(
+            self._lacks_memory(chunk)
+            or (self._can_load(chunk, now_s) and not self._fits(self._size(chunk.key)))
+            for chunk in self._needing.values()
+        )
 
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
         """What to give up next: unwanted ones, and where memory is short others, the furthest first."""
@@ -269,7 +270,7 @@ class Residency:
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
         """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
-        if self.saving >= self.limits.saves:
+        if self.saving >= self.limits.saves or now_s < self._save_s:
             return None
         due_s = math.inf if everything else now_s - self.limits.checkpoint_s
         old = takewhile(lambda one: one.dirty_since_s <= due_s, self._dirty.values())
@@ -294,7 +295,7 @@ class Residency:
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
         """A file could not be written: the chunk stays in memory, and is tried again."""
         self.saving -= 1
-        chunk.retry_s = now_s + RETRY_S
+        chunk.retry_s = self._save_s = now_s + RETRY_S  # others would fail as well
         self._soil(chunk, now_s)
 
     @property
@@ -319,11 +320,9 @@ class Residency:
         self._resize(chunk, 0, 0)
         del self.chunks[chunk.key]
         if chunk.waiting:  # for another that comes first it gave way: later it is loaded again
-            again = self.chunks[chunk.key] = self._needing[chunk.key] = Chunk(
-                chunk.key, waiting=chunk.waiting
-            )
+            again = Chunk(chunk.key, changed_s=chunk.changed_s, waiting=chunk.waiting)
+            self.chunks[chunk.key] = self._needing[chunk.key] = again
             chunk.waiting = deque()
-            again.changed_s = chunk.changed_s
         elif chunk.key in self.windows.near:
             self._missing.insert(0, chunk.key)
         return lease
@@ -342,8 +341,10 @@ class Residency:
 
     def next_event_s(self, now_s: float) -> float:
         """When there is something to do although nothing happens; infinity for never."""
-        times = [chunk.dirty_since_s + self.limits.checkpoint_s for chunk in islice(self._dirty.values(), 1)]
-        times += [chunk.retry_s for chunk in self._needing.values() if chunk.state is State.LOADING]
+        times = [chunk.retry_s for chunk in self._needing.values() if chunk.retry_s > now_s]
+        if self._dirty and self.saving < self.limits.saves:  # else there is when one has been saved
+            first = next(iter(self._dirty.values()))
+            times.append(max(first.dirty_since_s + self.limits.checkpoint_s, first.retry_s, self._save_s))
         if self._needing or len(self.chunks) > sum(key in self.chunks for key in self.windows.near):
             times.append(now_s + REVIEW_S)
         return max(now_s, min(times, default=math.inf))

@@ -62,3 +62,22 @@ def test_the_longest_packet_arrives_and_short_ones_take_no_memory() -> None:
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
     assert peak < 1 << 16
+
+
+def test_who_does_not_wait_gets_what_is_there_and_the_channel_still_waits() -> None:
+    ours, theirs = channel()
+    buffer = packet_buffer()
+    with ours, theirs:
+        with pytest.raises(BlockingIOError):
+            receive_packet(theirs, buffer, wait=False)
+        assert theirs.getblocking()
+        ours.send(b"one")
+        assert bytes(receive_packet(theirs, buffer, wait=False)[0]) == b"one"
+
+
+def test_the_longest_packet_goes_both_ways() -> None:
+    ours, theirs = channel()
+    longest = bytes(MAX_PACKET_BYTES - 1024)
+    with ours, theirs:
+        theirs.send(longest)
+        assert receive_packet(ours, packet_buffer())[0] == longest

@@ -10,8 +10,8 @@ from shmmap.chunks.voxels import ChunkKey
 
 __all__ = ["Changes"]
 
-MOST_GONE: Final = 10_000
-"""Chunks that left memory and are remembered."""
+MOST_GONE: Final = 4000
+"""Chunks that left memory and are remembered: all of them go into one answer."""
 
 
 class Changes:

@@ -13,6 +13,7 @@ import os
 import select
 import signal
 import socket
+import stat
 import sys
 import time
 from typing import Any, Final
@@ -136,10 +137,10 @@ class _Worker:
 
     def _hear(self) -> bool:
         """Hear what the daemon says; False when it is gone."""
-        self._channel.setblocking(False)
         try:
             for _ in range(HEARD_AT_ONCE):
-                data, _fd = receive_packet(self._channel, self._buffer)
+                # answers wait until the daemon takes them: the channel itself is not made non-blocking
+                data, _fd = receive_packet(self._channel, self._buffer, wait=False)
                 if not data:
                     return False
                 message = messages.decode_to_live(data)
@@ -155,8 +156,6 @@ class _Worker:
             pass
         except ConnectionResetError:
             return False
-        finally:
-            self._channel.setblocking(True)
         return True
 
     def _ask(self, ask: messages.Ask) -> None:
@@ -241,9 +240,15 @@ def _forget_undo(prefix: str, memory: ChunkMemory) -> None:
 
 def _undo_record(path: str) -> UndoRecord:
     """The undo record in shared memory, made if there is none."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     fd = os.open(path, flags, 0o600)
     try:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+            raise CannotStart(
+                f"{path} is not a file of this user, but of user {status.st_uid}",
+                hint="remove it, or choose another name for the instance",
+            )
         os.posix_fallocate(fd, 0, UNDO_BYTES)
         return UndoRecord(mmap.mmap(fd, UNDO_BYTES))
     finally:

@@ -23,6 +23,8 @@ class ActiveMapper:
 
     Attributes
     ----------
+    first
+        The least number that no scan had before this life.
     session
         Who maps under it now; 0: nobody.
     last
@@ -34,6 +36,7 @@ class ActiveMapper:
     """
 
     mapper: Mapper
+    first: int = 1
     session: int = 0
     last: int = 0
     used: int = 0
@@ -51,7 +54,7 @@ class Mappers:
     def __init__(self, files: MapFiles) -> None:
         self._files = files
         self._uses = 0
-        self.by_number = {mapper.number: ActiveMapper(mapper) for mapper in files.mappers}
+        self.by_number = {one.number: ActiveMapper(one, one.scans + 1) for one in files.mappers}
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
         """Let a session map under a name; one that did before does not any more.
@@ -71,6 +74,8 @@ class Mappers:
                 self._forget_one()
             mapper = self._files.add_mapper(uid, name)
             active = self.by_number[mapper.number] = ActiveMapper(mapper)
+        # now, and not with the first scan: once it may map, it does, also on a disk that is full
+        self._files.expect_scan(active.mapper, self.next_scan(active))
         active.session = session
         self._uses += 1
         active.used = self._uses
@@ -89,7 +94,7 @@ class Mappers:
 
     def next_scan(self, active: ActiveMapper) -> int:
         """The least number that a new scan may have: no earlier one, of any life, had it."""
-        return (active.last or active.mapper.scans) + 1
+        return max(active.last + 1, active.first)
 
     def expect(self, number: int, scan: int, session: int) -> ActiveMapper:
         """Return whose scan this is, which is about to be taken in.

@@ -71,7 +71,7 @@ class MarksDirectory:
             It is not what a file of marks of this session can be: the message says why.
         """
         found = _NAME.fullmatch(name)
-        if found is None or int(found[1], 16) != session:
+        if found is None or found[1] != f"{session:x}":
             raise BadRequest(f"marks: {name!r} is not a name that this session may use")
         if not 0 < nbytes <= MOST_MARKS_BYTES:
             raise BadRequest(f"marks: {nbytes} bytes; {MOST_MARKS_BYTES} are the most")

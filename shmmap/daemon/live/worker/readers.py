@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from shmmap.chunks.reading import KINDS
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import Ask
@@ -60,7 +61,7 @@ class Readers:
         wanted: list[ChunkKey] = [key for key in keys if touches(message.area, key, resolution)]
         if message.saved:
             wanted += [
-                key for key in live.files.rows
+                key for key in list(live.files.rows)  # other threads save
                 if key not in live.chunks and touches(message.area, key, resolution)
             ]  # fmt: skip
         if message.after is not None:
@@ -96,6 +97,8 @@ class Readers:
             raise BadRequest(f"scope {message.scope!r}", hint="ask for memory, disk or all")
         if message.area is not None:
             check_area(message.area)
+        if message.kind not in KINDS:
+            raise BadRequest(f"voxels are not {message.kind!r}", hint=f"ask for one of {', '.join(KINDS)}")
         resolution, since = self.live.files.settings.resolution, message.since
         since = since if self.changes.known(since) else 0
         keys = set() if message.scope == "disk" else {

@@ -23,7 +23,7 @@ from shmmap.daemon.live.worker.mappers import Mappers
 from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
 from shmmap.daemon.live.worker.readers import Readers
 from shmmap.daemon.live.worker.voxel_lists import VoxelLists
-from shmmap.errors import BadRequest, CannotWrite, NotPermitted, ShmmapError
+from shmmap.errors import BadRequest, CannotWrite, InternalError, NotPermitted, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
@@ -36,6 +36,8 @@ AHEAD_S: Final = 2.0
 """Chunks are loaded for where a mapper will be then, if it goes on as it does."""
 MOST_AHEAD_CHUNKS: Final = 4.0
 MANIFEST_S: Final = 60.0
+MOST_OF_A_SESSION: Final = 64
+"""Requests of one that the daemon passes on before they are answered."""
 LEASES_S: Final = 0.25
 """How often the kernel is asked whether what was given up is still mapped."""
 
@@ -82,6 +84,8 @@ class ServedMap:
         self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
         self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
         self._places: dict[int, _Place] = {}
+        durability, chunks = live.residency.durability, live.residency.chunks
+        self._earlier = durability.missing(chunks.values())  # what an earlier life applied, and did not save
         self._scans = self._durable = 0
         self._leases_s = self._manifest_s = 0.0
         self._listed = -1
@@ -106,12 +110,8 @@ class ServedMap:
             self._move(ask.session, message.position, now_s)
             self._answer(ask.ticket, messages.LiveMoved(message.request, self.changes.number))
         elif isinstance(message, messages.LiveSave):
-            unsaved = [
-                (chunk, chunk.version)
-                for chunk in self.live.residency.chunks.values()
-                if chunk.version > chunk.durable
-            ]
-            self._saves.append((ask, message, unsaved))
+            residency = self.live.residency
+            self._saves.append((ask, message, residency.durability.missing(residency.chunks.values())))
         elif isinstance(message, messages.LiveChunks):
             self._answer(ask.ticket, self.readers.page(message))
         elif isinstance(message, messages.LiveVoxels):
@@ -158,9 +158,14 @@ class ServedMap:
         self._move(ask.session, message.sensor, now_s)
         on_its_way = self._tickets.get((active.mapper.number, message.scan))
         if on_its_way is not None:
-            on_its_way.append((ask.ticket, message.request))
+            self._answer_too(on_its_way, ask, message)
         else:
             self._waiting.append((ask, message))
+
+    @staticmethod
+    def _answer_too(tickets: list[tuple[int, int]], ask: Ask, message: messages.LiveScan) -> None:
+        tickets.append((ask.ticket, message.request))
+        del tickets[:-MOST_OF_A_SESSION]  # earlier ones are of sessions that have ended
 
     def _take_scans(self) -> None:
         """Take in what waits, as long as there is room for it; the rest waits where the mappers put it."""
@@ -170,6 +175,9 @@ class ServedMap:
                 self._take(ask, message)
             except ShmmapError as error:
                 self._refuse(ask, message.request, error)
+            except Exception:  # noqa: BLE001  whatever is in a file must not end everybody's maps
+                log.exception("marks cannot be read")
+                self._refuse(ask, message.request, InternalError("the daemon failed on these marks"))
 
     def _take(self, ask: Ask, message: messages.LiveScan) -> None:
         active = self.mappers.by_number.get(message.mapper)
@@ -177,7 +185,7 @@ class ServedMap:
             raise BadRequest(f"the session does not map as mapper {message.mapper} any more")
         on_its_way = self._tickets.get((message.mapper, message.scan))
         if on_its_way is not None:
-            on_its_way.append((ask.ticket, message.request))
+            self._answer_too(on_its_way, ask, message)
             return
         data = self._marks.take(message.marks, message.bytes, ask.session, ask.uid)
         marks = decode_marks(data, self.live.files.map_id, message.mapper, message.scan)
@@ -215,9 +223,14 @@ class ServedMap:
     def _on_applied(self, scan: Scan) -> None:
         self._scans += 1
         active = self.mappers.by_number.get(scan.mapper)
-        durable = active.durable if active is not None else 0
+        durable = active.durable if active is not None and self._earlier_is_durable() else 0
         for ticket, request in self._tickets.pop((scan.mapper, scan.number), ()):
             self._answer(ticket, messages.LiveApplied(request, scan.number, durable))
+
+    def _earlier_is_durable(self) -> bool:
+        """Whether all that was found in memory is on the disk: nobody knows which scans made it."""
+        self._earlier = [(chunk, version) for chunk, version in self._earlier if chunk.durable < version]
+        return not self._earlier
 
     def _on_durable(self, scan: Scan) -> None:
         self._durable += 1
@@ -259,13 +272,12 @@ class ServedMap:
     def next_turn_s(self, now_s: float) -> float:
         """When the next turn is due, if nothing happens before."""
         residency = self.live.residency
-        if self.readers.are_waiting or any(not chunk.missing_bytes for chunk, _ in residency.ready()):
+        first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][1].bytes)
+        if self.readers.are_waiting or first_fits or residency.is_ready:
             return now_s
         times = [residency.next_event_s(now_s)]
         if self.live.kept:
             times.append(self._leases_s)
-        if self._waiting:
-            times.append(now_s + LEASES_S)
         return min(times)
 
     def status(self) -> messages.LiveMapRow:
@@ -285,7 +297,7 @@ class ServedMap:
             durable=self._durable, budget_bytes=live.limits.budget_bytes,
             damaged=tuple([*missing, *damaged][:64]),
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
-            problem=next(iter(live.problems.values()), ""), change=self.changes.number,
+            problem=live.problem, change=self.changes.number,
         )  # fmt: skip
 
     # --- the end --------------------------------------------------------------------------------

@@ -103,11 +103,12 @@ class VoxelLists:
     mode: int
     gid: int
     _names: dict[int, deque[tuple[str, int]]] = field(default_factory=dict)
+    _making: int = 0
 
     @property
     def nbytes(self) -> int:
-        """Memory of all lists that have names."""
-        return sum(nbytes for names in self._names.values() for _, nbytes in names)
+        """Memory of all lists that have names, and of those that are being made."""
+        return self._making + sum(nbytes for names in self._names.values() for _, nbytes in names)
 
     def collect(
         self, message: LiveVoxels, keys: Iterable[ChunkKey], session: int, change: int
@@ -122,25 +123,31 @@ class VoxelLists:
             The request makes no sense.
         """
         parts: list[tuple[NDArray[np.int32], NDArray[np.int16]]] = []
-        most = self.live.limits.budget_bytes // PART_OF_BUDGET - self.nbytes
+        most = self.live.limits.budget_bytes // PART_OF_BUDGET
         count = 0
-        for number, key in enumerate(keys):
-            if number % CHUNKS_A_STEP == CHUNKS_A_STEP - 1:
-                yield None
-            view = self._view(key, message.scope)
-            if view is None:
-                continue
-            indices, log_odds = select_voxels(view, message.kind)
-            wanted = inside(message.area, voxel_centers(indices, self.live.files.settings.resolution))
-            parts.append((indices[wanted], log_odds[wanted]))
-            count += len(parts[-1][1])
-            if count * VOXEL_BYTES > most:
-                raise OverBudget(
-                    f"more than {count} voxels are {message.kind} there: lists may take"
-                    f" {self.live.limits.budget_bytes // PART_OF_BUDGET} bytes",
-                    hint="ask for a smaller area, or raise --live-budget",
-                )
-        name = self._write(parts, session)
+        try:
+            for number, key in enumerate(keys):
+                there = self.live.chunks.get(key) if message.scope != "disk" else None
+                if number % CHUNKS_A_STEP == CHUNKS_A_STEP - 1 or there is None:
+                    yield None
+                view = self._view(key, message.scope)
+                if view is None:
+                    continue
+                indices, log_odds = select_voxels(view, message.kind)
+                wanted = inside(message.area, voxel_centers(indices, self.live.files.settings.resolution))
+                parts.append((indices[wanted], log_odds[wanted]))
+                more = len(parts[-1][1])
+                count += more
+                self._making += more * VOXEL_BYTES
+                if self.nbytes > most:
+                    raise OverBudget(
+                        f"{count} voxels and more are {message.kind} there: all lists together may take"
+                        f" {most} bytes",
+                        hint="ask for a smaller area, or raise --live-budget",
+                    )
+            name = self._write(parts, session)
+        finally:
+            self._making -= count * VOXEL_BYTES
         yield LiveVoxelsReply(message.request, change, name, count, count * VOXEL_BYTES)
 
     def _view(self, key: ChunkKey, scope: str) -> ChunkView | None:
@@ -161,15 +168,19 @@ class VoxelLists:
         fd = os.open(
             self.path + name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
         )
-        with open(fd, "wb") as file:
-            for column in (0, 1):
-                for part in parts:
-                    file.write(np.ascontiguousarray(part[column]).data)
-            file.flush()
-            if self.gid >= 0:
-                os.fchown(fd, -1, self.gid)
-            os.fchmod(fd, self.mode)
-            nbytes = os.fstat(fd).st_blocks * 512
+        try:
+            with open(fd, "wb") as file:
+                for column in (0, 1):
+                    for part in parts:
+                        file.write(np.ascontiguousarray(part[column]).data)
+                file.flush()
+                if self.gid >= 0:
+                    os.fchown(fd, -1, self.gid)
+                os.fchmod(fd, self.mode)
+                nbytes = os.fstat(fd).st_blocks * 512
+        except OSError:
+            self._remove(name)
+            raise
         names = self._names.setdefault(session, deque())
         names.append((name, nbytes))
         if len(names) > LISTS_OF_A_SESSION:
@@ -198,5 +209,5 @@ class VoxelLists:
                 self._remove("/" + name)
 
     def _remove(self, name: str) -> None:
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(FileNotFoundError, PermissionError):  # somebody else's is not one of ours
             os.unlink(self.path + name)

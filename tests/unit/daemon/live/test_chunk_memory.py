@@ -28,8 +28,10 @@ from shmmap.chunks.layout import (
     new_header,
 )
 from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.daemon.live import chunk_memory
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from shmmap.errors import SegmentCorrupt
+from tests.support.accounts import MEMBER
 
 PREFIX = live_prefix("test", "lidar")
 IDENTITY = ChunkIdentity(bytes(16), ChunkKey(3, -1, 0), 0.1, -1992, 3476, 0, 0, 7, "map")
@@ -138,6 +140,33 @@ except OSError as error:
     assert done.stdout.split() == [str(errno.EFBIG), "8", "8"], done.stderr
     chunk.close()
     assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
+
+
+def test_where_nothing_more_can_be_mapped_no_name_stays(
+    monkeypatch: pytest.MonkeyPatch, memory: ChunkMemory, directory: Path
+) -> None:
+    def no_room(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(chunk_memory, "map_chunk", no_room)
+        with pytest.raises(OSError, match="Cannot allocate memory"):
+            memory.create(new_header(IDENTITY))
+    assert list(directory.iterdir()) == []
+
+
+@pytest.mark.root
+def test_what_is_somebody_else_s_is_not_ours_to_take_over(memory: ChunkMemory, directory: Path) -> None:
+    memory.create(new_header(IDENTITY)).close()
+    theirs = [directory / f"{PREFIX[1:]}0_0_0.3", directory / f"{PREFIX[1:]}0_0_0.3.gone"]
+    for path in theirs:
+        path.write_bytes(new_header(replace(IDENTITY, key=ChunkKey(0, 0, 0), generation=3)))
+        os.chown(path, MEMBER, -1)
+    assert [name for name, _, _ in memory.names()] == [NAME]
+    assert list(memory.given_up()) == []
+    assert memory.foreign == {path.name for path in theirs}
+    for path in theirs:
+        path.unlink()
 
 
 @pytest.mark.parametrize(

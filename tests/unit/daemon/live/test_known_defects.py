@@ -300,6 +300,7 @@ def test_reload_before_save(
         world.map.move("mapper", FAR_AWAY)
         world.turn()
         assert world.map.residency.saving == len(marks.keys), "all of it is on its way to the disk"
+        world.turn()
         world.send(marks, at)
         assert world.map.residency.saving == len(marks.keys), "and still is"
     finally:

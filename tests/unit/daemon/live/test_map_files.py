@@ -16,7 +16,7 @@ from shmmap.chunks.layout import ChunkIdentity, ChunkView, new_header
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.map_files import MapFiles, MapSettings, Row
+from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings, Row
 from shmmap.errors import ConfigError, InstanceBusy, MapDataError
 from tests.support.cut_disk import CutDisk, PowerCut
 
@@ -56,7 +56,7 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     again = MapFiles(folder := Folder(tmp_path / "state" / "lidar"), SETTINGS)
     assert again.map_id == made.map_id
     assert again.begin_life() == 2
-    assert [(m.number, m.uid, m.name, m.scans) for m in again.mappers] == [(1, 1000, "front", 256)]
+    assert [(m.number, m.uid, m.name, m.scans) for m in again.mappers] == [(1, 1000, "front", SCANS_AHEAD)]
     assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0, 0)}
     assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
     assert not again.missing
@@ -76,7 +76,7 @@ def test_scans_are_expected_ahead() -> None:
     disk = CutDisk()
     made = MapFiles(disk, SETTINGS)
     mapper = made.add_mapper(0, "a")
-    for scan in range(1, 600):
+    for scan in (1, 2, SCANS_AHEAD, SCANS_AHEAD + 1, 2 * SCANS_AHEAD + 1, 2 * SCANS_AHEAD + 2, 1 << 40):
         made.expect_scan(mapper, scan)
         assert MapFiles(disk, SETTINGS).mappers[0].scans > scan
 

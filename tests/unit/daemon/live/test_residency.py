@@ -333,3 +333,82 @@ def test_where_all_chunks_wait_for_room_some_give_way() -> None:
     stays = next(chunk for chunk in chunks if chunk.key not in gone)
     assert one.may_grow(stays, 20)
     assert all(one.chunks[key].state is State.LOADING and one.chunks[key].waiting for key in gone)
+
+
+# --- sleeping -----------------------------------------------------------------------------------
+
+
+def test_nothing_is_due_while_a_chunk_is_loaded_or_has_no_room() -> None:
+    one = Residency(Limits(20, radius=0), new_bytes=10)
+    one.add(scan_of(HERE))
+    assert one.next_load(5.0) is not None
+    assert one.next_event_s(5.0) == 5.0 + REVIEW_S
+    full = Residency(Limits(20, radius=0), new_bytes=10)
+    full.lease(ChunkKey(9, 9, 9), 20)
+    full.add(scan_of(HERE))
+    assert full.next_load(5.0) is None
+    assert full.next_event_s(5.0) == 5.0 + REVIEW_S
+
+
+def test_nothing_is_due_while_as_many_files_are_written_as_may_be() -> None:
+    one = Residency(Limits(10**9, radius=0, loads=9, saves=1))
+    chunks = []
+    for x in range(2):
+        one.move(x, (x + 0.5, 0.5, 0.5))
+        chunks.append(written(one, ChunkKey(x, 0, 0)))
+    assert one.next_event_s(20.0) == 20.0
+    assert one.next_save(20.0) is chunks[0]
+    assert one.next_event_s(20.0) == math.inf
+    one.saved(chunks[0], 1, 21.0)
+    assert one.next_event_s(21.0) == 21.0
+    assert one.next_save(21.0) is chunks[1]
+
+
+def test_where_one_file_cannot_be_written_no_other_is_tried_at_once() -> None:
+    one = Residency(PLENTY)
+    chunks = []
+    for x in range(3):
+        one.move(x, (x + 0.5, 0.5, 0.5))
+        chunks.append(written(one, ChunkKey(x, 0, 0)))
+    assert one.next_save(50.0) is chunks[0]
+    one.save_failed(chunks[0], 50.0)
+    assert one.next_save(50.0 + RETRY_S / 2) is None
+    assert one.next_event_s(50.0) == 50.0 + RETRY_S
+    assert one.next_save(50.0 + RETRY_S) is chunks[1]
+
+
+def test_what_has_no_memory_keeps_nobody_from_what_has() -> None:
+    one = Residency(Limits(40, radius=0, loads=9), new_bytes=10)
+    chunks = []
+    for x in range(3):
+        one.add(scan_of(ChunkKey(x, 0, 0), number=x + 1))
+        chunks.append(load(one))
+    assert one.is_ready
+    for chunk in chunks[:2]:
+        assert not one.may_grow(chunk, 20)
+    assert [chunk for chunk, _ in one.ready()] == [chunks[2], chunks[0], chunks[1]]
+    seen = [one.is_ready]
+    apply(one, chunks[2])
+    seen.append(one.is_ready)
+    gone = one.next_eviction(9.0)
+    assert gone is not None
+    one.released(gone)
+    seen.append(one.is_ready)
+    assert seen == [True, False, True], "there is room now"
+
+
+def test_what_was_given_up_is_missing_until_it_is_flushed() -> None:
+    one = Residency(PLENTY)
+    chunk = written(one, HERE)
+    durability = one.durability
+    assert durability.missing(one.chunks.values()) == [(chunk, 1)]
+    assert one.next_save(50.0) is chunk
+    one.saved(chunk, 1, 50.0)
+    assert one.next_eviction(50.0) is not None
+    assert not one.chunks
+    assert durability.missing(one.chunks.values()) == [(chunk, 1)]
+    durability.begin()
+    assert durability.missing(one.chunks.values()) == [(chunk, 1)]
+    durability.flushed()
+    assert durability.missing(one.chunks.values()) == []
+    assert chunk.durable == 1

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live maps and other accounts: who may map, who may read, and that only the daemon changes anything."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.client.live.live_map import ChunkInfo, LiveMap
+from tests.process.conftest import DaemonFactory
+from tests.support.accounts import ADMINS, DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
+from tests.support.attempts import ATTEMPTS
+from tests.support.daemon_process import DaemonProcess, stop
+from tests.support.live_drive import FILTER, RESOLUTION, drive
+from tests.support.live_reference import held, reference
+from tests.support.mapping_process import MappingProcess
+from tests.support.other_account import SCANS, as_client
+from tests.support.patience import Patience
+
+pytestmark = pytest.mark.root
+MAPPERS = ADMINS
+"""The group that may map."""
+
+LiveService = Callable[..., DaemonProcess]
+
+
+@pytest.fixture
+def open_directory() -> Iterator[Path]:
+    """Return a directory that every account may read (pytest's own are closed)."""
+    with tempfile.TemporaryDirectory(prefix="shmmap-open-", dir="/tmp") as path:
+        os.chmod(path, 0o755)
+        yield Path(path)
+
+
+@pytest.fixture
+def service(open_directory: Path, daemon: DaemonFactory) -> LiveService:  # it ends before its directory
+    """Start a daemon with a group of readers and one of mappers; its directories are open to all."""
+
+    def make(budget: str = "16M", uid: int = 0) -> DaemonProcess:
+        file, state = open_directory / "shmmap.toml", open_directory / "state"
+        file.write_text(f'[live.lidar]\nresolution = 0.2\nlinger_s = 0.05\npath = "{state}/lidar"\n')
+        state.mkdir(exist_ok=True)
+        command = (
+            ["setpriv", f"--reuid={uid}", f"--regid={uid}", f"--groups={GROUP},{MAPPERS}"] if uid else []
+        )
+        one: DaemonProcess = daemon(
+            "", "--config", str(file), "--live-budget", budget, "--group", str(GROUP), "--live-group",
+            str(MAPPERS), start=False, command=command,
+        )  # fmt: skip
+        if uid:
+            os.chown(state, uid, -1)
+            one.give_to(uid)
+            kernels = open_directory / "kernels"
+            kernels.mkdir()
+            os.chown(kernels, uid, -1)
+            one.environment["NUMBA_CACHE_DIR"] = str(kernels)
+        os.chmod(one.runtime_dir, 0o755)
+        os.chmod(one.shm_dir, 0o1777)
+        return one.start()
+
+    return make
+
+
+def chunks_of(one: DaemonProcess) -> list[str]:
+    """Paths of the chunks in memory."""
+    start = f"shmmap-live.{one.instance}.lidar."
+    names = sorted(os.listdir(one.shm_dir))
+    return [
+        f"{one.shm_dir}/{name}" for name in names
+        if name.startswith(start) and name[-1].isdigit() and "voxels" not in name
+    ]  # fmt: skip
+
+
+@contextlib.contextmanager
+def opened(paths: Iterable[str]) -> Iterator[list[str]]:
+    """Other paths of files, whatever becomes of their names meanwhile; those that are gone are left out."""
+    files: list[int] = []
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            files.append(os.open(path, os.O_RDONLY))
+    try:
+        yield [f"/proc/{os.getpid()}/fd/{fd}" for fd in files]
+    finally:
+        for fd in files:
+            os.close(fd)
+
+
+def marks_of(one: DaemonProcess) -> str:
+    return f"{one.shm_dir}/shmmap-live.{one.instance}.marks"
+
+
+def attempts(path: str, uid: int, gid: int) -> dict[str, object]:
+    """What an account can do to a file: 0 worked, else the errno."""
+    program = ATTEMPTS.replace('assert mapped[:6] == b"SHMMAP"', "mapped[:6]")
+    done = as_user(uid, gid, python_for_others(), "-I", "-c", program, path)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, object] = json.loads(done.stdout)
+    return found
+
+
+def settled(live: LiveMap, scan: int) -> ChunkInfo:
+    """Have in memory only what is near the place of a scan, and nothing else come or go; the chunk there."""
+    place = drive(scan + 1)[scan][1][:3, 3]
+    here = ChunkKey(*np.floor(place / (64 * RESOLUTION)).astype(int).tolist())
+    live.move_to(*place)
+    waiting = Patience()
+    while waiting(len(live.chunks()) != 27 or any(one.key.distance(here) > 1 for one in live.chunks())):
+        pass
+    return next(one for one in live.chunks() if one.key == here)
+
+
+def test_members_of_the_mappers_group_map_and_readers_read(service: LiveService) -> None:
+    """Whatever a mapper's umask is, and with nobody being root but the daemon."""
+    one = service()
+    assert as_client(MEMBER, [MAPPERS, GROUP], one.endpoint, "map") == SCANS
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        assert held(live) == reference(drive(SCANS))
+        assert f"{MEMBER}/front" in live.status().mappers
+        assert as_client(STRANGER, [GROUP], one.endpoint, "map") == "not_permitted"
+        settled(live, 0)
+        near = held(live, "memory")
+        assert near
+        assert as_client(STRANGER, [GROUP], one.endpoint, "read") == [len(near), *[sum(near.values())] * 2]
+        assert isinstance(as_client(STRANGER, [STRANGER], one.endpoint, "read"), str), "an error"
+        assert held(live) == reference(drive(SCANS)), "nobody has changed anything"
+
+
+def test_nobody_else_changes_what_is_in_memory(service: LiveService) -> None:
+    one = service()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        with live.mapper("root", FILTER) as mapper:
+            for points, pose in drive(2):
+                mapper.add(points, pose)
+            mapper.wait_applied()
+        here = settled(live, 1)
+        before = held(live)
+        path = f"{one.shm_dir}/shmmap-live.{one.instance}.lidar.{here.key.text}.{here.generation}"
+        undo = f"{one.shm_dir}/shmmap-live.{one.instance}.lidar.undo"
+        found = attempts(path, MEMBER, GROUP)
+        assert found.pop("read") == 0
+        assert 0 not in found.values(), found
+        for target, uid, gid in (
+            (path, STRANGER, STRANGER), (path, MEMBER, MAPPERS), (undo, MEMBER, GROUP),
+            (undo, MEMBER, MAPPERS), (undo, STRANGER, STRANGER),
+        ):  # fmt: skip
+            found = attempts(target, uid, gid)
+            assert 0 not in found.values(), (target, found)
+        assert held(live) == before
+
+
+def test_mappers_cannot_touch_each_other_s_marks(service: LiveService) -> None:
+    one = service()
+    marks = marks_of(one)
+    assert os.stat(marks).st_mode & 0o7777 == 0o3770
+    make = as_user(MEMBER, MAPPERS, "sh", "-c", f"echo mine > {marks}/1a.5")
+    assert make.returncode == 0, make.stderr
+    path = f"{marks}/1a.5"
+    assert os.stat(path).st_uid == MEMBER
+    found = attempts(path, STRANGER, MAPPERS)
+    assert found.pop("read") == 0, "what they saw is no secret among mappers"
+    assert 0 not in found.values(), found
+    assert 0 not in attempts(path, STRANGER, GROUP).values()
+    assert as_user(STRANGER, GROUP, "ls", marks).returncode != 0
+    assert as_user(STRANGER, GROUP, "touch", f"{marks}/1b.1").returncode != 0
+    assert as_user(MEMBER, MAPPERS, "rmdir", marks).returncode != 0
+    assert Path(path).read_text() == "mine\n"
+
+
+def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) -> None:
+    """Where all may make files they may make any, before the daemon comes: those are left alone."""
+    one = service()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            for points, pose in drive(2):
+                mapper.add(points, pose)
+            mapper.wait_applied()
+        before = held(live)
+    start = f"{one.shm_dir}/shmmap-live.{one.instance}.lidar"
+    content = Path(chunks_of(one)[0]).read_bytes() if chunks_of(one) else b"x"
+    one.kill()
+    theirs = [f"{start}.0_0_0.99999999999", f"{start}.1_1_1.5.gone", f"{start}.voxels.0123456789abcdef"]
+    for path in theirs:
+        Path(path).write_bytes(content)
+        os.chown(path, STRANGER, -1)
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        assert held(client.live("lidar")) == before
+    assert "somebody else's files left alone count=2" in one.log
+    one.stop()
+    for path in theirs[:2]:
+        assert Path(path).read_bytes() == content
+    for path in theirs:
+        Path(path).unlink(missing_ok=True)
+    undo = Path(f"{start}.undo")
+    undo.write_bytes(bytes(1000))
+    os.chown(undo, STRANGER, -1)
+    process = one.spawn()
+    assert process.wait(60) not in (0, None), "what it would be put back from is somebody else's"
+    assert f"{undo} is not a file of this user" in one.log or "Permission denied" in one.log
+    undo.unlink(missing_ok=True)
+
+
+def test_readers_that_keep_chunks_never_stop_mapping(service: LiveService) -> None:
+    """They stand still with everything mapped that there ever was: that counts, and there is a reserve."""
+    one = service("8M")
+    scans = drive()
+    readers: list[MappingProcess] = []
+    seen: set[str] = set()
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        try:
+            with live.mapper("front", FILTER) as mapper:
+                for number, (points, pose) in enumerate(scans):
+                    mapper.add(points, pose)
+                    mapper.wait_applied()
+                    if number % 4 == 0:
+                        new = set(chunks_of(one)) - seen
+                        seen |= new
+                        with opened(new) as there:
+                            readers.append(MappingProcess(there))
+                        stop(readers[-1].pid)
+                mapper.wait_durable()
+            live.move_to(1e4, 1e4, 1e4)
+            waiting = Patience()
+            while waiting(not (status := live.status()).evicting):
+                pass
+            assert status.evicting_bytes > 0
+            assert status.scans == len(scans)
+            assert held(live) == reference(scans)
+        finally:
+            for reader in readers:
+                reader.end()
+        waiting = Patience()
+        while waiting(live.status().evicting > 0):
+            pass
+        assert live.status().evicting_bytes == 0
+
+
+def test_a_daemon_without_privileges_keeps_live_maps(service: LiveService) -> None:
+    """As the service runs: marks of other accounts, leases and files need no capability."""
+    check = (
+        "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import shmmap, numba'], check=True)"
+    )
+    if as_user(DAEMON_UID, DAEMON_UID, sys.executable, "-c", check).returncode:
+        pytest.skip("this Python and its packages cannot be read by other accounts")
+    one = service(uid=DAEMON_UID)
+    assert as_client(MEMBER, [MAPPERS, GROUP], one.endpoint, "map") == SCANS
+    assert as_client(STRANGER, [GROUP], one.endpoint, "map") == "not_permitted"
+    with shmmap.connect(one.endpoint) as client:
+        assert held(client.live("lidar")) == reference(drive(SCANS))

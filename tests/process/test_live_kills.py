@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mapper, worker and daemon are killed at random times, again and again: every scan is there, once.
+
+``SHMMAP_TEST_KILLS=150`` has them killed as often as that.  The same without the undo record:
+``tests/unit/chunks/test_applying.py``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import shmmap
+from tests.process.conftest import DaemonFactory
+from tests.support.chunk_memory import ChunkMemory as Unbounded
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.live_drive import RESOLUTION, marked
+from tests.support.live_mapper import marks_of
+from tests.support.live_reference import held
+from tests.support.patience import Patience
+
+KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "6"))
+SCANS_A_KILL = 12
+LONGEST_S = 0.4
+
+
+class Mapper:
+    """The mapper's process, and what it said in all its lives."""
+
+    def __init__(self, endpoint: str, last: int) -> None:
+        self.endpoint, self.last = endpoint, last
+        self.applied = 0
+        self.lives = 0
+        self.done = False
+        self.start()
+
+    def start(self) -> None:
+        """Begin with what has no answer."""
+        self.lives += 1
+        self._process = subprocess.Popen(
+            [
+                sys.executable, "-m", "tests.support.live_mapper", self.endpoint, str(self.applied + 1),
+                str(self.last),
+            ],
+            stdout=subprocess.PIPE, text=True, cwd=ROOT,
+        )  # fmt: skip
+
+    def _take(self, line: str) -> None:
+        if line.startswith("applied "):
+            number = int(line.split()[1])
+            assert number == self.applied + 1
+            self.applied = number
+        elif line:
+            self.done = line == "done\n"
+
+    def hear(self, seconds: float) -> bool:
+        """Hear what it says for some time; whether it said anything."""
+        assert self._process.stdout is not None
+        heard, end_s = False, time.monotonic() + seconds
+        while (left_s := end_s - time.monotonic()) > 0 and not self.done:
+            if select.select([self._process.stdout], [], [], left_s)[0]:
+                line = self._process.stdout.readline()
+                assert line, f"the mapper ended with {self._process.wait()}"
+                self._take(line)
+                heard = True
+        return heard
+
+    def until(self, number: int) -> None:
+        """Hear until that many scans are applied."""
+        waiting = Patience()
+        while waiting(self.applied < number and not self.done):
+            self.hear(0.05)
+
+    def kill(self) -> None:
+        """SIGKILL it; what it said before counts."""
+        self._process.kill()
+        rest, _ = self._process.communicate()
+        for line in rest.splitlines(keepends=True):
+            self._take(line)
+
+    def end(self) -> None:
+        """It has ended, or is made to."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def worker_of(one: DaemonProcess) -> int | None:
+    """Id of the live worker, if there is one just now."""
+    for pid in one.children():
+        with contextlib.suppress(OSError):
+            if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                return pid
+    return None
+
+
+@pytest.fixture
+def keep(daemon: DaemonFactory, tmp_path: Path) -> Callable[[], DaemonProcess]:
+    """Start a daemon with a live map that is paged all the time."""
+
+    def make() -> DaemonProcess:
+        file = tmp_path / "shmmap.toml"
+        file.write_text(
+            f"[live.lidar]\nresolution = {RESOLUTION}\nlinger_s = 0.05\ncheckpoint_s = 0.3\n"
+            f'path = "{tmp_path}/map"\n'
+        )
+        one: DaemonProcess = daemon("", "--config", str(file), "--live-budget", "4M")
+        return one
+
+    return make
+
+
+def test_whoever_is_killed_whenever(keep: Callable[[], DaemonProcess]) -> None:
+    rng = random.Random(KILLS)
+    one = keep()
+    mapper = Mapper(one.endpoint, KILLS * SCANS_A_KILL)
+    killed = dict.fromkeys(("mapper", "worker", "daemon"), 0)
+    order = [name for name in killed for _ in range(-(-KILLS // 3))]
+    rng.shuffle(order)
+    try:
+        for who in order[:KILLS]:
+            mapper.until(mapper.applied + 1)
+            mapper.hear(rng.uniform(0.0, LONGEST_S))
+            if mapper.done:
+                break
+            if who == "mapper":
+                mapper.kill()
+                if not mapper.done:
+                    mapper.start()
+            elif who == "daemon":
+                one.kill()
+                one.start()
+            elif (pid := worker_of(one)) is not None:
+                os.kill(pid, signal.SIGKILL)
+            killed[who] += 1
+        waiting = Patience()
+        while waiting(not mapper.done):
+            if mapper.hear(1.0):
+                waiting = Patience()
+    finally:
+        mapper.end()
+    assert mapper.applied == mapper.last
+    assert sum(killed.values()) >= KILLS // 2, killed
+    all_marks = marked()
+    reference = Unbounded(RESOLUTION)
+    for number in range(1, mapper.last + 1):
+        reference.apply(marks_of(number, all_marks), scan=number)
+    with shmmap.connect(one.endpoint) as client:
+        live = client.live("lidar")
+        expected = reference.voxels()
+        whole = shmmap.Box(-1e4, -1e4, 1e4, 1e4)
+        assert held(live, "disk", whole) == expected
+        assert held(live) == expected
+        assert live.status().damaged == ()
+    assert one.stop() == 0
+    left = os.listdir(Path(one.arguments[1]).parent / "map")
+    assert not [name for name in left if not re.fullmatch(r"map\.json|manifest\.json|[-\d_]+\.chunk", name)]

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live map as its worker serves it, without processes: requests are handed in, answers are kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from shmmap.chunks.marks import Marks, encode_marks
+from shmmap.chunks.voxels import voxels_of
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.live.adopting import adopt
+from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
+from shmmap.daemon.live.folder import Folder
+from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.map_files import MapFiles
+from shmmap.daemon.live.messages import Ask
+from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.worker.marks_directory import MarksDirectory
+from shmmap.daemon.live.worker.served_map import ServedMap
+from shmmap.daemon.live.worker.voxel_lists import VoxelLists
+from shmmap.protocol import live as messages
+from tests.support.live_drive import RESOLUTION, SETTINGS, undo_in
+from tests.support.patience import Patience
+from tests.support.slow_occupancy import Voxel
+
+__all__ = ["Served"]
+
+
+class Served:
+    """One life of a map's worker.
+
+    Attributes
+    ----------
+    answers : dict
+        By ticket; each asks under a number of its own, and the ticket is the same.
+    """
+
+    def __init__(self, shm: Path, disk: Path, budget_bytes: int = 10**9, **limits: Any) -> None:
+        self.now_s = 0.0
+        self.answers: dict[int, Any] = {}
+        self._files = 0
+        self._folder = Folder(disk)
+        self.live = LiveMap(
+            MapFiles(self._folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")),
+            undo_in(shm), Limits(budget_bytes, **limits),
+        )  # fmt: skip
+        lists = VoxelLists(self.live, str(shm), 0o600, -1)
+        lists.remove_all()
+        adopt(self.live, 0.0)
+        self.marks = MarksDirectory(str(shm / "marks"))
+        settings = LiveSettings("lidar", str(disk), resolution=RESOLUTION)
+        self.map = ServedMap(settings, self.live, lists, self.marks, self._answer)
+
+    def _answer(self, ticket: int, reply: Any) -> None:
+        assert ticket not in self.answers, "nothing is answered twice"
+        self.answers[ticket] = reply
+
+    def ask(self, make: Callable[[int], messages.LiveRequest], session: int = 1, *, maps: bool = True) -> int:
+        """Hand a request in; returns its ticket."""
+        self._files += 1
+        ticket = self._files
+        self.map.handle(Ask(ticket, session, os.geteuid(), maps, b""), make(ticket), self.now_s)
+        return ticket
+
+    def open(self, name: str = "front", session: int = 1) -> messages.LiveOpened:
+        """Map under a name."""
+        ticket = self.ask(lambda n: messages.LiveOpen(n, "lidar", name), session)
+        reply: messages.LiveOpened = self.answers[ticket]
+        return reply
+
+    def send(self, marks: Marks, mapper: int, scan: int, session: int = 1, at: float = 0.0) -> int:
+        """Send a scan; returns its ticket."""
+        data = encode_marks(marks, self.live.files.map_id, mapper, scan)
+        name = f"{session:x}.{self._files}"
+        Path(self.marks.path, name).write_bytes(data)
+        return self.ask(
+            lambda n: messages.LiveScan(n, "lidar", mapper, scan, name, len(data), (at, at, at)), session
+        )
+
+    def turn(self, *, save_all: bool = False) -> None:
+        """A turn, some time after the last one."""
+        self.now_s += 0.2
+        self.map.turn(self.now_s, save_all=save_all)
+
+    def until(self, done: Callable[[], object], *, save_all: bool = False) -> None:
+        """Turn until something is so."""
+        waiting = Patience()
+        while waiting(not done()):
+            self.turn(save_all=save_all)
+            self.live.wait(0.01)
+
+    def answer(self, ticket: int, *, save_all: bool = False) -> Any:
+        """Turn until a request is answered."""
+        self.until(lambda: ticket in self.answers, save_all=save_all)
+        return self.answers[ticket]
+
+    def end(self, *, keep: bool = False) -> None:
+        """End this life; with ``keep`` what is in memory is left to the next one."""
+        if not keep:
+            self.until(lambda: self.map.is_saved, save_all=True)
+        self.map.end(keep=keep)
+        self.marks.close()
+        self.live.memory.close()
+        self._folder.close()
+
+    def voxels(self) -> dict[Voxel, int]:
+        """All known voxels in memory."""
+        found: dict[Voxel, int] = {}
+        for key, chunk in self.live.chunks.items():
+            dense = chunk.view.dense()
+            places = dense.nonzero()[0]
+            for voxel, value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):
+                found[voxel[0], voxel[1], voxel[2]] = value
+        return found

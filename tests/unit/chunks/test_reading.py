@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Copies of a chunk that somebody writes are whole, and voxels are found where they are."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shmmap.chunks.layout import ChunkIdentity, ChunkView, chunk_bytes, new_header
+from shmmap.chunks.reading import TRIES, consistent_copy, select_voxels
+from shmmap.chunks.voxels import BRICKS, ChunkKey
+from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
+from shmmap.errors import BadRequest, SegmentCorrupt
+from tests.support.chunk_memory import ChunkMemory as Unbounded
+from tests.support.daemon_process import ROOT
+from tests.support.live_drive import RESOLUTION, marked
+from tests.support.patience import Patience
+
+IDENTITY = ChunkIdentity(bytes(16), ChunkKey(3, -1, 0), 0.1, -1992, 3476, 0, 0, 7, "map")
+FILLED = 64
+"""Bricks: the writer takes some tens of microseconds for them, a copy five."""
+
+
+@pytest.fixture
+def chunk() -> Iterator[tuple[ChunkFile, Path]]:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        memory = ChunkMemory(path, live_prefix("test", "lidar"))
+        one = memory.create(new_header(IDENTITY))
+        view = one.grow(FILLED)
+        view.index[:FILLED] = np.arange(1, FILLED + 1)
+        view.state["bricks"] = FILLED
+        yield one, Path(path, one.name[1:])
+        one.close()
+        memory.close()
+
+
+@pytest.fixture
+def written(chunk: tuple[ChunkFile, Path]) -> Iterator[ChunkView]:
+    """A chunk that another process fills with one number after the other, without end."""
+    one, path = chunk
+    command = [sys.executable, "-m", "tests.support.constant_writer", str(path), str(FILLED)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as writer:
+        try:
+            assert writer.stdout is not None
+            assert writer.stdout.readline() == b"ready\n"
+            yield one.view
+        finally:
+            writer.kill()
+
+
+def test_copies_of_what_is_written_are_whole(written: ChunkView) -> None:
+    seen: set[int] = set()
+    waiting, copies = Patience(), 0
+    while waiting(copies < 3000 or len(seen) < 50):
+        copy = consistent_copy(written, lambda _bricks: written)
+        if copy is None:
+            continue
+        copies += 1
+        low, high = int(copy.bricks.min()), int(copy.bricks.max())
+        assert low == high, f"copy {copies} is torn"
+        seen.add(low)
+
+
+def test_without_the_sequence_some_are_torn(written: ChunkView) -> None:
+    """Else the test above would find nothing."""
+    waiting, torn = Patience(), 0
+    while waiting(torn < 3):
+        copy = ChunkView(bytes(written.data))
+        torn += int(copy.bricks.min()) != int(copy.bricks.max())
+
+
+def test_a_writer_that_died_in_the_middle_is_not_waited_for(chunk: tuple[ChunkFile, Path]) -> None:
+    view = chunk[0].view
+    view.state["sequence"] = 7
+    assert consistent_copy(view, lambda _bricks: view) is None
+    view.state["sequence"] = 8
+    copy = consistent_copy(view, lambda _bricks: view)
+    assert copy is not None
+    assert len(copy.data) == chunk_bytes(FILLED)
+
+
+def test_one_that_changes_all_the_time_is_given_up(chunk: tuple[ChunkFile, Path]) -> None:
+    view, tries = chunk[0].view, 0
+
+    def room(_bricks: int) -> ChunkView:
+        nonlocal tries
+        tries += 1
+        view.state["sequence"] += 2
+        return view
+
+    assert consistent_copy(view, room) is None
+    assert tries == TRIES
+
+
+def test_more_bricks_than_there_can_be() -> None:
+    """What is read in the middle of a change may say anything, and then counts for nothing."""
+    view = ChunkView(new_header(IDENTITY))
+    view.state["bricks"] = BRICKS + 1
+    with pytest.raises(SegmentCorrupt, match="1025 bricks"):
+        consistent_copy(view, lambda _bricks: pytest.fail("nothing is to be read there"))
+
+
+@pytest.mark.parametrize("kind", ["occupied", "free"])
+def test_voxels_are_found_where_they_are(kind: str) -> None:
+    unbounded = Unbounded(RESOLUTION)
+    for number, marks in enumerate(marked(6), 1):
+        unbounded.apply(marks, scan=number)
+    found = {}
+    for view in unbounded.chunks.values():
+        indices, log_odds = select_voxels(view, kind)
+        assert [indices.dtype.str, log_odds.dtype.str] == ["<i4", "<i2"]
+        for voxel, value in zip(indices.tolist(), log_odds.tolist(), strict=True):
+            found[tuple(voxel)] = value
+    expected = {
+        voxel: value for voxel, value in unbounded.voxels().items() if (value > 0) == (kind == "occupied")
+    }
+    assert found == expected
+    assert found
+
+
+def test_a_kind_that_there_is_not() -> None:
+    with pytest.raises(BadRequest, match="voxels are not 'unknown'") as told:
+        select_voxels(ChunkView(new_header(IDENTITY)), "unknown")
+    assert "occupied, free" in told.value.hint

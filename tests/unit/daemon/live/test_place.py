@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where live maps go, and what they may take: never on huge pages, never more than there is."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.host.mounts import Mount
+from shmmap.daemon.live import place
+from shmmap.daemon.live.messages import Begin
+from shmmap.daemon.live.place import CEILING_BYTES, place_live_maps
+from shmmap.errors import CannotStart, ConfigError
+from shmmap.segment.directory import ShmDirectory
+
+MIB = 1 << 20
+SIZE, FREE = 8192 * MIB, 4096 * MIB
+
+
+@pytest.fixture
+def cells(monkeypatch: pytest.MonkeyPatch) -> Iterator[ShmDirectory]:
+    """A directory on a tmpfs of 8 GiB, of which half is free."""
+    monkeypatch.setattr(ShmDirectory, "size_bytes", lambda _self: SIZE)
+    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: FREE)
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        one = ShmDirectory(path)
+        yield one
+        one.close()
+
+
+def placed(
+    cells: ShmDirectory, *maps: str, cells_budget: int = 0, shm_dir: str = "", budget: int = 0
+) -> Begin:
+    return place_live_maps(
+        [LiveSettings(name, f"/srv/{name}") for name in maps or ("lidar",)], instance="city", cells=cells,
+        cells_budget_bytes=cells_budget, shm_dir=shm_dir, budget_bytes=budget, gid=5, marks_gid=6,
+    )  # fmt: skip
+
+
+def mounted(monkeypatch: pytest.MonkeyPatch, *rows: tuple[str, str]) -> None:
+    """Have the machine's mounts be these: where, and the options of the file system."""
+    found = [Mount("tmpfs", "/", point, options.split(",")) for point, options in rows]
+    monkeypatch.setattr(place, "mounts", lambda: iter(found))
+
+
+def test_beside_the_cells(cells: ShmDirectory) -> None:
+    begin = placed(cells)
+    assert begin.shm_dir == cells.path
+    assert begin.marks_dir == f"{cells.path}/shmmap-live.city.marks"
+    assert begin.budget_bytes == FREE // 8
+    assert (begin.gid, begin.marks_gid, begin.maps[0].path) == (5, 6, "/srv/lidar")
+
+
+def test_a_map_without_a_directory_gets_one(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(place, "live_directory", lambda instance, name: f"/state/{instance}/{name}")
+    begin = place_live_maps(
+        [LiveSettings("lidar")], instance="city", cells=cells, cells_budget_bytes=0, shm_dir="",
+        budget_bytes=0, gid=-1, marks_gid=-1,
+    )  # fmt: skip
+    assert begin.maps[0].path == "/state/city/lidar"
+
+
+@pytest.mark.parametrize(
+    ("free", "cells_budget", "budget"),
+    [
+        (FREE, 1024 * MIB, 384 * MIB), (FREE, FREE, 4 * MIB), (FREE, 8000 * MIB, 4 * MIB),
+        (8192 * MIB, 0, CEILING_BYTES), (100 * MIB, 0, 100 * MIB // 8), (0, 0, 4 * MIB),
+    ],
+)  # fmt: skip
+def test_an_eighth_of_what_the_cells_leave(
+    cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch, free: int, cells_budget: int, budget: int
+) -> None:
+    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: free)
+    assert placed(cells, cells_budget=cells_budget).budget_bytes == budget
+
+
+def test_what_an_earlier_life_left_counts_as_free(
+    cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 0)
+    (Path(cells.path) / "shmmap-live.city.lidar.0_0_0.5").write_bytes(bytes(64 * MIB))
+    (Path(cells.path) / "shmmap-live.town.lidar.0_0_0.5").write_bytes(bytes(64 * MIB))
+    assert placed(cells).budget_bytes == 8 * MIB
+    assert placed(cells, budget=60 * MIB).budget_bytes == 60 * MIB
+    with pytest.raises(CannotStart, match=r"of 65 MiB do not fit .* 64 MiB free"):
+        placed(cells, budget=65 * MIB)
+
+
+def test_both_budgets_fit_in_the_file_system(cells: ShmDirectory) -> None:
+    assert placed(cells, budget=FREE, cells_budget=SIZE - FREE).budget_bytes == FREE
+    with pytest.raises(ConfigError, match="of 4,096 MiB and cells of 4,097 MiB do not fit") as told:
+        placed(cells, budget=FREE, cells_budget=SIZE - FREE + MIB)
+    assert told.value.key == "live_budget"
+    assert "lower --live-budget or --budget" in told.value.hint
+    with pytest.raises(CannotStart, match="4,096 MiB free") as told_of_room:
+        placed(cells, budget=FREE + MIB)
+    assert "free some" in told_of_room.value.hint
+
+
+def test_each_map_gets_a_few_chunks(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"m{number}" for number in range(5)]
+    assert placed(cells, *names, budget=20 * MIB).budget_bytes == 20 * MIB
+    with pytest.raises(ConfigError, match="5 live maps share 19 MiB; each needs 4") as told:
+        placed(cells, *names, budget=19 * MIB)
+    assert "20M at least" in told.value.hint
+    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 0)
+    assert placed(cells, *names).budget_bytes == 20 * MIB
+
+
+@pytest.mark.parametrize(
+    ("options", "huge"),
+    [
+        ("rw", False), ("rw,huge=never", False), ("rw,huge=advise", False), ("rw,huge=always", True),
+        ("rw,huge=within_size,size=4G", True),
+    ],
+)  # fmt: skip
+def test_a_directory_with_huge_pages_is_not_used(
+    cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch, options: str, huge: bool
+) -> None:
+    mounted(monkeypatch, ("/", "rw"), ("/dev/shm", "rw"), (cells.path, options))
+    assert placed(cells).shm_dir == ("/dev/shm" if huge else cells.path)
+    if huge:
+        with pytest.raises(ConfigError, match="has huge pages") as told:
+            placed(cells, shm_dir=cells.path)
+        assert told.value.key == "live_shm_dir"
+        assert "without them" in told.value.hint
+
+
+def test_the_innermost_and_last_mount_counts(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
+    below = os.path.join(cells.path, "below")
+    os.mkdir(below)
+    mounted(monkeypatch, (cells.path, "huge=always"), ("/dev/shm", "rw"), (below, "rw"))
+    assert placed(cells, shm_dir=below).shm_dir == below
+    mounted(monkeypatch, (cells.path, "huge=always"), (cells.path, "rw"))
+    assert placed(cells).shm_dir == cells.path
+    mounted(monkeypatch, (cells.path[:-1], "huge=always"), ("/", "rw"))
+    assert placed(cells).shm_dir == cells.path, "a name that begins like it is another directory"
+    mounted(monkeypatch)
+    assert placed(cells).shm_dir == cells.path
+    os.rmdir(below)
+
+
+def test_a_directory_of_its_own(cells: ShmDirectory) -> None:
+    with pytest.raises(CannotStart, match="shared-memory directory /nothing/here"):
+        placed(cells, shm_dir="/nothing/here")

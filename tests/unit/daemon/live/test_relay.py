@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests go to the worker and answers come back, whatever becomes of the worker and of who asked."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.events.live_events import LiveEvents
+from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.live import messages, relay
+from shmmap.daemon.live.relay import (
+    IN_ORDER_S,
+    MOST_BYTES,
+    MOST_OF_A_SESSION,
+    MOST_UNSENT,
+    PAUSES_S,
+    LiveRelay,
+)
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.errors import BadRequest, Busy, CannotStart, ConfigError, LiveInterrupted
+from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import channel
+from shmmap.protocol.codec import encode
+from shmmap.protocol.live import LiveList, LiveListed, LiveMove
+
+if TYPE_CHECKING:
+    from shmmap.statistics.writer import StatisticsWriter
+
+BEGIN = messages.Begin("test", (LiveSettings("lidar"),), "/dev/shm", "/dev/shm/marks", 1 << 22, -1, -1)
+
+
+class Asker:
+    """A session, with what it was answered and refused."""
+
+    def __init__(self, slot: int) -> None:
+        self.slot = slot
+        self.peer = SimpleNamespace(uid=1000, gid=1000, pid=slot)
+        self.answered: list[bytes] = []
+        self.refused: list[tuple[int, type[Exception]]] = []
+        self.connection = self
+
+    def reply(self, body: bytes) -> None:
+        self.answered.append(body)
+
+    def refuse(self, request: int, error: Exception) -> None:
+        self.refused.append((request, type(error)))
+
+
+class World:
+    """A relay whose workers are sockets in this process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 1000.0
+        self.workers: list[socket.socket] = []
+        self.watched = WatchedDescriptors()
+        self.buffer = packet_buffer()
+        monkeypatch.setattr(relay, "start_child", self._start)
+        monkeypatch.setattr(relay, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+        self.statistics: list[tuple[str, int]] = []
+        shown = SimpleNamespace(
+            set=lambda name, value: self.statistics.append((name, value)), show_live_maps=lambda _rows: None
+        )
+        events = LiveEvents(EventLog(1), cast("StatisticsWriter", shown))
+        self.relay = LiveRelay(BEGIN, self.watched, lambda peer, _now_s: peer.pid != 2, events)
+
+    def _start(self, *_: object, **__: object) -> tuple[Any, socket.socket]:
+        ours, theirs = channel()
+        theirs.setblocking(False)
+        self.workers.append(theirs)
+        return SimpleNamespace(kill=lambda: None, wait=lambda: 0), ours
+
+    def started(self) -> None:
+        """Another worker that has all maps in memory."""
+        self.relay.start()
+        assert isinstance(self.heard()[0], messages.Begin)
+        self.say(messages.Begun(0))
+
+    def heard(self) -> list[Any]:
+        """What the worker is told."""
+        found: list[Any] = []
+        while True:
+            try:
+                data, _ = receive_packet(self.workers[-1], self.buffer)
+            except BlockingIOError:
+                return found
+            if not data:
+                return found
+            found.append(messages.decode_to_live(data))
+
+    def say(self, message: messages.FromLive) -> None:
+        self.workers[-1].send(messages.encode(message))
+        self.relay.hear()
+
+    def die(self) -> None:
+        self.workers[-1].close()
+        self.relay.hear()
+
+    def ask(self, asker: Asker, request: int = 1) -> None:
+        message = LiveMove(request, "lidar", (0.0, 0.0, 0.0))
+        self.relay.ask(asker, message, b"%d" % request, self.now_s)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    one = World(monkeypatch)
+    one.started()
+    yield one
+    one.relay._forget()
+    for worker in one.workers:
+        worker.close()
+    one.watched.close()
+
+
+def test_each_gets_its_own_answer(world: World) -> None:
+    a, b = Asker(1), Asker(2)
+    world.ask(a, 11)
+    world.ask(b, 22)
+    first, second = world.heard()
+    assert (first.session, first.uid, first.maps, first.body) == (1, 1000, True, b"11")
+    assert (second.session, second.maps) == (2, False), "that one may not map"
+    world.say(messages.Answer(second.ticket, b"for b"))
+    world.say(messages.Answer(first.ticket, b"for a"))
+    world.say(messages.Answer(first.ticket, b"again"))
+    world.say(messages.Answer(999, b"for nobody"))
+    assert (a.answered, b.answered) == ([b"for a"], [b"for b"])
+    assert (world.relay._tickets, world.relay._waiting) == ({}, {})
+
+
+def test_a_session_waits_for_so_many_and_no_more(world: World) -> None:
+    a, b = Asker(1), Asker(2)
+    for number in range(MOST_OF_A_SESSION):
+        world.ask(a, number)
+    with pytest.raises(Busy, match="64 requests"):
+        world.ask(a)
+    world.ask(b)
+    first = world.heard()[0]
+    world.say(messages.Answer(first.ticket, b"x"))
+    world.ask(a)
+    with pytest.raises(Busy, match="64 requests"):
+        world.ask(a)
+
+
+def test_a_session_that_has_ended_is_answered_nothing(world: World) -> None:
+    a, silent = Asker(1), Asker(3)
+    world.ask(a)
+    (asked,) = world.heard()
+    world.relay.left(a)  # type: ignore[arg-type]
+    world.relay.left(silent)  # type: ignore[arg-type]
+    assert world.heard() == [messages.Left(1)], "of one that asked for nothing the worker knows nothing"
+    world.say(messages.Answer(asked.ticket, b"x"))
+    assert a.answered == []
+    assert (world.relay._tickets, world.relay._waiting, world.relay._askers) == ({}, {}, set())
+
+
+def test_a_request_that_is_too_long(world: World) -> None:
+    message, asker = LiveMove(1, "lidar", (0.0, 0.0, 0.0)), Asker(1)
+    with pytest.raises(BadRequest, match="at most"):
+        world.relay.ask(asker, message, bytes(MOST_BYTES + 1), 0.0)  # type: ignore[arg-type]
+    assert world.heard() == []
+
+
+def test_a_worker_that_hears_nothing_costs_little(world: World) -> None:
+    """Sessions come, ask as much as they may, and go: what is kept for the worker is bounded."""
+
+    def come_ask_and_go() -> None:
+        for slot in range(1, 10_000):
+            asker = Asker(slot)
+            for number in range(8):
+                world.ask(asker, number)
+            world.relay.left(asker)  # type: ignore[arg-type]
+
+    with pytest.raises(Busy, match="hears nothing"):
+        come_ask_and_go()
+    assert len(world.relay._unsent) <= MOST_UNSENT + 1
+    asked = 0
+    while world.relay._unsent:
+        asked += len(world.heard())
+        world.relay.hear()
+    asked += len(world.heard())
+    assert asked > MOST_UNSENT, "what was taken is passed on when it hears again"
+    world.ask(Asker(5))
+
+
+def test_who_waits_when_the_worker_dies_is_told(world: World) -> None:
+    a, b = Asker(1), Asker(2)
+    world.ask(a, 11)
+    world.ask(b, 22)
+    world.die()
+    assert a.refused == [(11, LiveInterrupted)]
+    assert b.refused == [(22, LiveInterrupted)]
+    assert world.relay.restarts == 1
+    with pytest.raises(LiveInterrupted):
+        world.ask(a)
+    world.relay.left(a)  # type: ignore[arg-type]
+    world.started()
+    world.ask(b, 23)
+    assert [message.body for message in world.heard()] == [b"23"]
+
+
+def test_one_that_dies_again_and_again_is_not_started_all_the_time(world: World) -> None:
+    """The first time at once; then there are pauses, also where it dies just after it began."""
+    world.now_s += IN_ORDER_S
+    for number, pause_s in enumerate([*PAUSES_S, PAUSES_S[-1]]):
+        world.die()
+        if pause_s:
+            world.relay.beat(world.now_s + pause_s - 0.01)
+            assert len(world.workers) == number + 1
+        world.now_s += pause_s
+        world.relay.beat(world.now_s)
+        assert len(world.workers) == number + 2
+        if number % 2:
+            world.say(messages.Begun(0))
+    world.say(messages.Begun(0))
+    world.now_s += IN_ORDER_S
+    world.die()
+    world.relay.beat(world.now_s)
+    assert len(world.workers) == len(PAUSES_S) + 3, "it had been in order"
+
+
+def test_what_keeps_maps_from_memory_is_what_keeps_the_daemon_from_starting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(monkeypatch)
+    world.relay.start()
+    world.workers[-1].send(messages.encode(messages.Failed("bad_config", "resolution = 0.5", "leave it")))
+    with pytest.raises(ConfigError, match=r"resolution = 0\.5"):
+        world.relay.wait_until_serving()
+    world.relay._forget()
+    world.workers[-1].close()
+    world.watched.close()
+
+
+def test_workers_that_die_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(monkeypatch)
+    start = world._start
+
+    def dead(*_: object, **__: object) -> tuple[Any, socket.socket]:
+        found = start()
+        world.workers[-1].close()
+        return found
+
+    monkeypatch.setattr(relay, "start_child", dead)
+    world.relay.start()
+    with pytest.raises(CannotStart, match="did not begin"):
+        world.relay.wait_until_serving()
+    assert len(world.workers) == relay.STARTS + 1
+    world.watched.close()
+
+
+@pytest.mark.parametrize("unsaved", [0, 3])
+def test_the_end(world: World, caplog: pytest.LogCaptureFixture, unsaved: int) -> None:
+    world.workers[-1].send(messages.encode(messages.Ended(unsaved)))
+    world.workers[-1].shutdown(socket.SHUT_WR)
+    world.relay.close(keep=False)
+    assert world.heard() == [messages.End(False)]
+    assert ("chunks not saved stay in memory chunks=3" in caplog.text) == (unsaved > 0)
+    world.relay.close(keep=False)
+
+
+def test_where_there_are_no_live_maps() -> None:
+    asker: Any = Asker(1)
+    none = relay.NoLiveMaps()
+    none.ask(asker, LiveList(7), b"", 0.0)
+    assert asker.answered == [encode(LiveListed(7, ()))]
+    with pytest.raises(BadRequest, match="no live maps") as told:
+        none.ask(asker, LiveMove(1, "lidar", (0.0, 0.0, 0.0)), b"", 0.0)
+    assert "--live NAME" in told.value.hint

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who maps: one number a name for ever, 32 at a time, and numbers of scans that nobody had."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from shmmap.chunks.layout import MAPPERS
+from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings
+from shmmap.daemon.live.worker.mappers import Mappers
+from shmmap.errors import BadRequest, Busy, LiveInterrupted
+from tests.support.cut_disk import CutDisk
+
+SETTINGS = MapSettings(resolution=0.1)
+
+
+@pytest.fixture
+def disk() -> CutDisk:
+    return CutDisk()
+
+
+@pytest.fixture
+def mappers(disk: CutDisk) -> Mappers:
+    return Mappers(MapFiles(disk, SETTINGS))
+
+
+def test_a_user_and_a_name_are_one_mapper(mappers: Mappers) -> None:
+    first = mappers.open(1000, "front", 1)
+    assert mappers.next_scan(first) == 1
+    assert mappers.open(1000, "front", 2) is first
+    others = [mappers.open(1000, "rear", 1), mappers.open(1001, "front", 3)]
+    assert len({one.mapper.number for one in (first, *others)}) == 3
+
+
+def test_only_who_opened_it_last_maps_under_a_name(mappers: Mappers) -> None:
+    number = mappers.open(1000, "front", 1).mapper.number
+    assert mappers.expect(number, 1, 1).session == 1
+    mappers.open(1000, "front", 2)
+    with pytest.raises(BadRequest, match="another program maps as 'front'"):
+        mappers.expect(number, 2, 1)
+    mappers.left(1)
+    assert mappers.expect(number, 2, 2).session == 2, "the first one's end is not the second one's"
+    mappers.left(2)
+    with pytest.raises(LiveInterrupted, match="nobody maps as 'front'"):
+        mappers.expect(number, 2, 2)
+
+
+@pytest.mark.parametrize("scan", [0, -1, 1 << 63])
+def test_numbers_that_no_scan_has(mappers: Mappers, scan: int) -> None:
+    number = mappers.open(1000, "front", 1).mapper.number
+    with pytest.raises(BadRequest, match="numbers begin at 1"):
+        mappers.expect(number, scan, 1)
+
+
+def test_the_least_recent_gives_way_and_its_late_scans_are_refused(mappers: Mappers) -> None:
+    opened = [mappers.open(1000, f"m{number}", number + 1) for number in range(MAPPERS)]
+    for session in (3, 1, 2):
+        mappers.left(session)
+    mappers.open(1000, "m2", 40)  # used again
+    mappers.left(40)
+    new = mappers.open(1000, "new", 50)
+    numbers = {one.mapper.number for one in opened}
+    assert new.mapper.number not in numbers, "no number is given twice"
+    assert opened[0].mapper.number not in mappers.by_number, "of 0, 1 and 2 it was used first"
+    with pytest.raises(BadRequest, match="does not know mapper"):
+        mappers.expect(opened[0].mapper.number, 7, 1)
+    mappers.open(1000, "newer", 51)
+    assert opened[1].mapper.number not in mappers.by_number
+    again = mappers.open(1000, "m0", 52)
+    assert again.mapper.number not in numbers
+    assert len(mappers.by_number) == MAPPERS
+
+
+def test_where_all_are_in_use_another_is_refused(mappers: Mappers) -> None:
+    opened = [mappers.open(1000, f"m{number}", 1) for number in range(MAPPERS)]
+    with pytest.raises(Busy, match="32 mappers"):
+        mappers.open(1000, "new", 2)
+    opened[5].unsaved.add(3)
+    opened[5].session = 0
+    with pytest.raises(Busy, match="32 mappers"):
+        mappers.open(1000, "new", 2)
+    opened[5].unsaved.clear()
+    assert mappers.open(1000, "new", 2).mapper.name == "new"
+    assert opened[5].mapper.number not in mappers.by_number
+
+
+def test_what_is_durable(mappers: Mappers) -> None:
+    active = mappers.open(1000, "front", 1)
+    active.last = 7
+    assert active.durable == 7
+    active.unsaved |= {5, 6}
+    assert active.durable == 4
+
+
+def test_a_later_life_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Mappers) -> None:
+    """Also when one of an earlier life comes again first: of those after it nothing is known."""
+    front = mappers.open(1000, "front", 1)
+    for scan in range(1, 8):
+        mappers.expect(front.mapper.number, scan, 1).last = scan
+    later = Mappers(MapFiles(disk, SETTINGS))
+    active = later.open(1000, "front", 1)
+    assert active.mapper.number == front.mapper.number
+    first = later.next_scan(active)
+    assert first > 7
+    later.expect(active.mapper.number, 5, 1).last = 5
+    assert later.next_scan(active) == first
+    later.expect(active.mapper.number, first, 1).last = first
+    assert later.next_scan(active) == first + 1
+
+
+def test_who_may_map_does_so_on_a_disk_that_is_full(
+    monkeypatch: pytest.MonkeyPatch, disk: CutDisk, mappers: Mappers
+) -> None:
+    active = mappers.open(1000, "front", 1)
+    number = active.mapper.number
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CutDisk, "write", full)
+        for scan in range(1, 3000):
+            mappers.expect(number, scan, 1)
+        for _ in range(2):
+            with pytest.raises(OSError, match="No space"):
+                mappers.open(1000, "rear", 2)
+            with pytest.raises(OSError, match="No space"):
+                mappers.expect(number, 2 * SCANS_AHEAD, 1)
+        assert [one.mapper.name for one in mappers.by_number.values()] == ["front"]
+    mappers.expect(number, 2 * SCANS_AHEAD, 1)
+    rear = mappers.open(1000, "rear", 2)
+    found = MapFiles(disk, SETTINGS).mappers
+    assert [(one.number, one.name) for one in found] == [(number, "front"), (rear.mapper.number, "rear")]
+    assert found[0].scans > 2 * SCANS_AHEAD
+
+
+def test_a_mapper_that_cannot_be_forgotten_stays(
+    monkeypatch: pytest.MonkeyPatch, disk: CutDisk, mappers: Mappers
+) -> None:
+    for number in range(MAPPERS):
+        mappers.open(1000, f"m{number}", 0)
+
+    def broken(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CutDisk, "write", broken)
+        for _ in range(2):
+            with pytest.raises(OSError, match="Input/output"):
+                mappers.open(1000, "new", 1)
+        assert len(mappers.by_number) == MAPPERS
+    mappers.open(1000, "new", 1)
+    assert [one.name for one in MapFiles(disk, SETTINGS).mappers] == [
+        *(f"m{number}" for number in range(1, MAPPERS)), "new",
+    ]  # fmt: skip

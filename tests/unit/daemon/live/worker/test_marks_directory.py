@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of marks are whatever a mapper makes them: what is not one is refused, and nothing waits for it."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
+from shmmap.errors import BadRequest
+from tests.support.accounts import MEMBER
+
+SESSION = 0x1A
+MINE = "1a.7"
+CONTENT = b"marks of a scan"
+
+
+@pytest.fixture
+def path() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as directory:
+        yield Path(directory) / "marks"
+
+
+@pytest.fixture
+def marks(path: Path) -> Iterator[MarksDirectory]:
+    before = len(os.listdir("/proc/self/fd"))
+    one = MarksDirectory(str(path))
+    yield one
+    one.close()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def take(marks: MarksDirectory, name: str = MINE, nbytes: int = len(CONTENT)) -> bytes:
+    return marks.take(name, nbytes, SESSION, os.geteuid())
+
+
+def test_a_file_is_copied(marks: MarksDirectory, path: Path) -> None:
+    (path / MINE).write_bytes(CONTENT)
+    assert take(marks) == CONTENT
+    assert (path / MINE).exists(), "it is its mapper's to remove: the same scan may be sent again"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["1b.7", "a.7", "01a.7x", "1a.", "1a", "1A.7", "01a.7", "../1a.7", "1a.7/x", "1a.-1", "1a.7\n", "", "."],
+)
+def test_names_that_are_not_the_session_s(marks: MarksDirectory, path: Path, name: str) -> None:
+    (path / "1b.7").write_bytes(CONTENT)
+    with pytest.raises(BadRequest, match="not a name that this session may use"):
+        take(marks, name)
+
+
+@pytest.mark.parametrize("nbytes", [0, -1, MOST_MARKS_BYTES + 1, 1 << 60])
+def test_sizes_that_cannot_be(marks: MarksDirectory, path: Path, nbytes: int) -> None:
+    (path / MINE).write_bytes(CONTENT)
+    with pytest.raises(BadRequest, match="bytes"):
+        take(marks, nbytes=nbytes)
+
+
+def fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def link(path: Path) -> None:
+    other = path.with_name("1b.1")
+    other.write_bytes(CONTENT)
+    path.symlink_to(other)
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+def nothing(path: Path) -> None:
+    """No file of that name."""
+
+
+def shorter(path: Path) -> None:
+    path.write_bytes(CONTENT[:-1])
+
+
+def longer(path: Path) -> None:
+    path.write_bytes(CONTENT + b"x")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (fifo, "no regular file"), (link, "cannot be opened"), (folder, "no regular file"),
+        (nothing, "cannot be opened: No such file"), (shorter, "has 14 bytes, not 15"),
+        (longer, "has 16 bytes, not 15"),
+    ],
+)  # fmt: skip
+def test_what_is_no_file_of_marks(
+    marks: MarksDirectory, path: Path, make: Callable[[Path], None], said: str
+) -> None:
+    make(path / MINE)
+    with pytest.raises(BadRequest, match=said):
+        take(marks)
+
+
+def test_one_that_is_cut_while_it_is_read(
+    monkeypatch: pytest.MonkeyPatch, marks: MarksDirectory, path: Path
+) -> None:
+    (path / MINE).write_bytes(CONTENT)
+    read = os.pread
+
+    def cut_and_read(fd: int, size: int, at: int) -> bytes:
+        os.truncate(path / MINE, 4)
+        return read(fd, size, at)
+
+    monkeypatch.setattr(os, "pread", cut_and_read)
+    with pytest.raises(BadRequest, match="was cut to 4 bytes"):
+        take(marks)
+
+
+def test_one_that_grows_while_it_is_read(
+    monkeypatch: pytest.MonkeyPatch, marks: MarksDirectory, path: Path
+) -> None:
+    (path / MINE).write_bytes(CONTENT)
+    read = os.pread
+
+    def grow_and_read(fd: int, size: int, at: int) -> bytes:
+        os.truncate(path / MINE, 1 << 30)
+        return read(fd, size, at)
+
+    monkeypatch.setattr(os, "pread", grow_and_read)
+    assert take(marks) == CONTENT
+
+
+@pytest.mark.root
+def test_one_of_another_user(marks: MarksDirectory, path: Path) -> None:
+    (path / MINE).write_bytes(CONTENT)
+    os.chown(path / MINE, MEMBER, -1)
+    with pytest.raises(BadRequest, match="no regular file of this user"):
+        take(marks)
+    assert marks.take(MINE, len(CONTENT), SESSION, MEMBER) == CONTENT
+
+
+def test_who_may_put_files_there(path: Path) -> None:
+    with_group = MarksDirectory(str(path), os.getegid())
+    assert stat.S_IMODE(path.stat().st_mode) == 0o1770
+    with_group.close()
+    without = MarksDirectory(str(path))
+    assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    without.close()
+    assert not path.exists()
+
+
+def test_what_an_earlier_life_left_is_removed(path: Path) -> None:
+    (path / "1a.9").mkdir(parents=True)
+    (path / "2.2").write_bytes(CONTENT)
+    one = MarksDirectory(str(path))
+    assert list(path.iterdir()) == []
+    one.close()
+
+
+def test_the_files_of_a_session_go_with_it(marks: MarksDirectory, path: Path) -> None:
+    for name in ("1a.1", "1a.2", "1.1", "1a1.1", "11a.1"):
+        (path / name).write_bytes(CONTENT)
+    (path / "1a.3").mkdir()
+    fifo(path / "1a.4")
+    (path / "1a.5").symlink_to("/etc/passwd")
+    (path / "1a.6").mkdir()
+    (path / "1a.6" / "x").touch()
+    marks.forget(SESSION)
+    left = sorted(name.name for name in path.iterdir())
+    assert left == ["1.1", "11a.1", "1a.6", "1a1.1"], "what somebody fills is theirs to empty"
+    (path / "1a.6" / "x").unlink()
+
+
+@pytest.mark.root
+def test_a_directory_of_somebody_else_is_not_used(path: Path) -> None:
+    path.mkdir()
+    os.chown(path, MEMBER, -1)
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(PermissionError, match="somebody else"):
+        MarksDirectory(str(path))
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_link_in_its_place_is_not_followed(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "keep").touch()
+    path.symlink_to(tmp_path)
+    with pytest.raises(OSError, match=r"Not a directory|symbolic links"):
+        MarksDirectory(str(path))
+    assert (tmp_path / "keep").exists()
+    path.unlink()

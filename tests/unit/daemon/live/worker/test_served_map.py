@@ -1,0 +1,327 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests and their answers: each scan once, *durable* not too early, and no turn when there is nothing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shmmap.chunks.marks import Marks
+from shmmap.daemon.live.worker import served_map
+from shmmap.errors import BadRequest, CannotWrite, NotPermitted
+from shmmap.protocol import live as messages
+from shmmap.protocol.messages import ErrorReply
+from tests.support.chunk_memory import ChunkMemory as Unbounded
+from tests.support.live_drive import RESOLUTION, marked
+from tests.support.served_map import Served
+from tests.support.slow_occupancy import Voxel
+
+Serve = Callable[..., Served]
+NOTHING = Marks(
+    np.zeros((0, 3), np.int32), np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros(0, np.uint64),
+    np.zeros(0, np.uint16),
+)  # fmt: skip
+LATER = {"linger_s": 1e9, "checkpoint_s": 1e9}
+"""What is in memory stays there, and nowhere else."""
+
+
+def reference(*scans: Marks) -> dict[Voxel, int]:
+    unbounded = Unbounded(RESOLUTION)
+    for number, marks in enumerate(scans, 1):
+        unbounded.apply(marks, scan=number)
+    return unbounded.voxels()
+
+
+class Blocked:
+    """A step that waits until it may go on; it ends by itself at the end of the test."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> None:
+        self.may = threading.Event()
+        self.calls = 0
+        inner = getattr(owner, name)
+
+        def wait(*arguments: Any) -> Any:
+            self.calls += 1
+            assert self.may.wait(60.0)
+            return inner(*arguments)
+
+        monkeypatch.setattr(owner, name, wait)
+
+
+def fail(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, number: int) -> list[None]:
+    """Have a step fail; returns a list that gets an entry each time."""
+    calls: list[None] = []
+
+    def raising(*_: object) -> None:
+        calls.append(None)
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(owner, name, raising)
+    return calls
+
+
+# --- each scan once -----------------------------------------------------------------------------
+
+
+def test_a_scan_that_is_sent_again_counts_once(serve: Serve) -> None:
+    one = serve(**LATER)
+    opened = one.open()
+    (marks,) = marked(1)
+    tickets = [one.send(marks, opened.mapper, 1) for _ in range(3)]
+    for ticket in tickets:
+        assert one.answer(ticket).scan == 1
+    late = one.send(marks, opened.mapper, 1)
+    assert one.answer(late).scan == 1
+    assert one.voxels() == reference(marks)
+    one.end()
+
+
+def test_a_scan_on_its_way_is_answered_to_who_sends_it_again(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its mapper lost the connection, and came back as another session."""
+    one = serve(**LATER)
+    blocked = Blocked(monkeypatch, one.live.files, "load")
+    (marks,) = marked(1)
+    opened = one.open(session=1)
+    first = one.send(marks, opened.mapper, 1, session=1)
+    one.turn()
+    one.map.left(1)
+    again = one.open(session=2)
+    assert (again.mapper, again.next_scan) == (opened.mapper, 2)
+    second = one.send(marks, opened.mapper, 1, session=2)
+    one.turn()
+    assert not {first, second} & set(one.answers)
+    blocked.may.set()
+    assert one.answer(second).scan == 1
+    assert one.map.status().scans == 1
+    assert one.voxels() == reference(marks)
+    one.end()
+
+
+def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = serve(waiting_bytes=1, **LATER)
+    blocked = Blocked(monkeypatch, one.live.files, "load")
+    first, second = marked(2)
+    opened = one.open()
+    one.send(first, opened.mapper, 1)
+    one.turn()
+    waits = one.send(second, opened.mapper, 2)
+    one.turn()
+    one.map.left(1)
+    blocked.may.set()
+    one.until(lambda: one.map.status().scans == 1)
+    one.turn()
+    assert waits not in one.answers
+    assert one.voxels() == reference(first)
+    one.end()
+
+
+def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sessions come, send a scan that waits for its chunks again and again, and go."""
+    one = serve(**LATER)
+    blocked = Blocked(monkeypatch, one.live.files, "load")
+    (marks,) = marked(1)
+    mapper = one.open().mapper
+    for session in range(1, 6):
+        one.open(session=session)
+        for _ in range(served_map.MOST_OF_A_SESSION):
+            one.send(marks, mapper, 1, session=session)
+            one.turn()
+        one.map.left(session)
+    assert len(one.map._tickets[mapper, 1]) == served_map.MOST_OF_A_SESSION
+    blocked.may.set()
+    one.until(lambda: one.map.status().scans)
+    assert one.voxels() == reference(marks)
+    one.end()
+
+
+def test_marks_that_nobody_expected_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = serve(**LATER)
+    (marks,) = marked(1)
+    mapper = one.open().mapper
+    with monkeypatch.context() as patch:
+
+        def defect(*_: object) -> None:
+            raise IndexError("a defect")
+
+        patch.setattr(served_map, "decode_marks", defect)
+        ticket = one.send(marks, mapper, 1)
+        one.turn()
+    refused = one.answers[ticket]
+    assert isinstance(refused, ErrorReply)
+    assert refused.code == "internal"
+    assert one.answer(one.send(marks, mapper, 1)).scan == 1
+    one.end()
+
+
+def test_who_may_not_map(serve: Serve) -> None:
+    one = serve()
+    for make in (
+        lambda n: messages.LiveOpen(n, "lidar", "front"),
+        lambda n: messages.LiveSave(n, "lidar"),
+        lambda n: messages.LiveScan(n, "lidar", 1, 1, "1.1", 10, (0.0, 0.0, 0.0)),
+    ):
+        with pytest.raises(NotPermitted, match="may not change live maps"):
+            one.ask(make, maps=False)
+    one.ask(lambda n: messages.LiveOpen(n, "lidar"), maps=False)
+    with pytest.raises(BadRequest, match="frame 'map', not 'odom'"):
+        one.ask(lambda n: messages.LiveOpen(n, "lidar", "", "odom"))
+    one.end()
+
+
+@pytest.mark.parametrize("place", [(float("nan"), 0.0, 0.0), (0.0, float("inf"), 0.0), (0.0, 0.0, 1e12)])
+def test_places_that_are_nowhere(serve: Serve, place: tuple[float, float, float]) -> None:
+    one = serve()
+    with pytest.raises(BadRequest, match="not finite, or too far away"):
+        one.ask(lambda n: messages.LiveMove(n, "lidar", place))
+    one.end()
+
+
+# --- durable ------------------------------------------------------------------------------------
+
+
+def test_what_an_earlier_life_did_not_save_is_not_durable(serve: Serve) -> None:
+    """Nobody knows which scans a chunk that was found in memory has; its mapper may send none again."""
+    one = serve(**LATER)
+    (marks,) = marked(1)
+    opened = one.open()
+    assert one.answer(one.send(marks, opened.mapper, 1)).durable == 0
+    one.end(keep=True)
+    one = serve(**LATER)
+    opened = one.open()
+    first = opened.next_scan
+    assert one.answer(one.send(NOTHING, opened.mapper, first)).durable == 0
+    one.until(lambda: one.map.is_saved, save_all=True)
+    assert one.answer(one.send(NOTHING, opened.mapper, first + 1)).durable >= first
+    one.end()
+
+
+def test_saved_means_that_what_was_given_up_is_on_the_disk_too(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file has its name, and a power cut may take that away, until the directory was flushed."""
+    one = serve(linger_s=0.0, checkpoint_s=1e9)
+    (marks,) = marked(1)
+    mapper = one.open().mapper
+    blocked = Blocked(monkeypatch, one.live.files, "flush")
+    one.answer(one.send(marks, mapper, 1))
+    one.ask(lambda n: messages.LiveMove(n, "lidar", (5e4, 0.0, 0.0)))
+    one.until(lambda: blocked.calls and not set(marks.chunks) & set(one.live.chunks))
+    ticket = one.ask(lambda n: messages.LiveSave(n, "lidar"))
+    for _ in range(5):
+        one.turn()
+    assert ticket not in one.answers
+    blocked.may.set()
+    assert one.answer(ticket).scan == 1
+    assert one.map.status().durable == 1
+    one.end()
+
+
+def test_a_save_is_answered_when_all_that_came_before_is_durable(serve: Serve) -> None:
+    one = serve(**LATER)
+    first, second = marked(2)
+    opened = one.open()
+    one.answer(one.send(first, opened.mapper, 1))
+    one.answer(one.send(second, opened.mapper, 2))
+    reply = one.answer(one.ask(lambda n: messages.LiveSave(n, "lidar")))
+    assert (reply.scan, reply.files) == (2, len(set(first.chunks) | set(second.chunks)))
+    one.until(lambda: one.map.is_saved)
+    one.end()
+
+
+# --- a disk that is full ------------------------------------------------------------------------
+
+
+def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What changed stays in memory, is told, and saved when there is room; few tries meanwhile."""
+    one = serve(linger_s=0.0, checkpoint_s=0.1)
+    scans = marked(5)  # the last one is far away from the others
+    mapper = one.open().mapper
+    with monkeypatch.context() as patch:
+        calls = fail(patch, one.live.files, "save", errno.ENOSPC)
+        for number, marks in enumerate(scans, 1):
+            one.answer(one.send(marks, mapper, number))
+        start_s = one.now_s
+        for _ in range(50):
+            one.turn()
+            one.live.wait(0.01)
+        assert len(calls) <= 4 * (one.now_s - start_s + 2.0), "four at a time, each second"
+        status = one.map.status()
+        assert "cannot be saved: No space left" in status.problem
+        assert one.voxels() == reference(*scans)
+        assert status.dirty
+        assert {key for marks in scans for key in marks.chunks} <= set(one.live.chunks)
+    one.until(lambda: one.map.is_saved, save_all=True)
+    assert one.map.status().problem == ""
+    one.end()
+
+
+def test_a_new_mapper_needs_the_disk(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = serve()
+    with monkeypatch.context() as patch:
+        fail(patch, one.live.files, "_write_map", errno.ENOSPC)
+        with pytest.raises(CannotWrite, match="cannot be written: No space left"):
+            one.open()
+    assert one.open().mapper == 2, "a number is never given twice, whatever came of it"
+    one.end()
+
+
+def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = serve(**LATER)
+    (marks,) = marked(1)
+    mapper = one.open().mapper
+    one.answer(one.send(marks, mapper, 1))
+    with monkeypatch.context() as patch:
+        calls = fail(patch, one.live.files, "flush", errno.EIO)
+        ticket = one.ask(lambda n: messages.LiveSave(n, "lidar"))
+        one.until(lambda: calls)
+        start_s = one.now_s
+        for _ in range(30):
+            one.turn()
+            one.live.wait(0.01)
+        assert len(calls) <= 2 + (one.now_s - start_s), "once a second"
+        assert "not flushed: Input/output" in one.map.status().problem
+        assert ticket not in one.answers
+    assert one.answer(ticket).scan == 1
+    assert one.map.status().problem == ""
+    one.end()
+
+
+# --- sleeping -----------------------------------------------------------------------------------
+
+
+def test_while_a_chunk_is_loaded_nothing_turns(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = serve(**LATER)
+    blocked = Blocked(monkeypatch, one.live.files, "load")
+    (marks,) = marked(1)
+    one.send(marks, one.open().mapper, 1)
+    for _ in range(3):
+        one.turn()
+        assert one.map.next_turn_s(one.now_s) >= one.now_s + 0.05
+    blocked.may.set()
+    one.until(lambda: one.map.status().scans)
+    one.end()
+
+
+def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although more of them are due."""
+    one = serve(linger_s=1e9, checkpoint_s=0.1, saves=1)
+    blocked = Blocked(monkeypatch, one.live.files, "save")
+    (marks,) = marked(1)
+    assert len(marks.chunks) > 2
+    one.answer(one.send(marks, one.open().mapper, 1))
+    for _ in range(3):
+        one.turn()
+    assert blocked.calls == 1
+    assert one.map.next_turn_s(one.now_s) >= one.now_s + 0.05
+    blocked.may.set()
+    one.end()
