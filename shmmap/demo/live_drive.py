@@ -83,7 +83,7 @@ class LiveDriveResult:
     given_up, came_back
         How often a chunk of it left memory, and how often one came into memory again.
     budget_bytes, most_bytes
-        Memory that chunks may take, and the most that they took.
+        Memory that chunks may take, and the most that those in service took.
     active, active_bytes
         Known voxels in memory at the end of the drive, and what their chunks take there.
     kills

@@ -81,7 +81,7 @@ class Watch:
     given_up, came_back
         How often.
     most_bytes
-        The most memory that all took.
+        The most memory that those in service took.
     """
 
     def __init__(self, live: LiveMap) -> None:
@@ -100,8 +100,7 @@ class Watch:
         self.given_up += len(self._there & saved)
         self.came_back += len(self._saved & there)
         self._there, self._saved = there, saved
-        usage = self.live.status()
-        self.most_bytes = max(self.most_bytes, usage.bytes + usage.evicting_bytes)
+        self.most_bytes = max(self.most_bytes, self.live.status().bytes)
         return f"{len(there)} chunks in memory, {len(saved)} on disk alone; {self.came_back} came back"
 
 

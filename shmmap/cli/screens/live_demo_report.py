@@ -46,7 +46,8 @@ def _map(result: LiveDriveResult) -> str:
 
 def _memory(result: LiveDriveResult) -> str:
     return (
-        f"at most {format_bytes(result.most_bytes)} of {format_bytes(result.budget_bytes)};"
+        f"chunks in service took at most {format_bytes(result.most_bytes)} of"
+        f" {format_bytes(result.budget_bytes)};"
         f" {result.given_up} times a chunk was saved and given up, {result.came_back} times one came back"
     )
 

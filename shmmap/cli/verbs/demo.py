@@ -53,7 +53,7 @@ _JSON = """\
   "compare": {"moving_kept", "still_kept": shares of points}, "elevation": {"mean_m", "max_m",
   "places"}}}; exit code 1 where a scan was lost or not trusted
   With --live instead of all this: {"scans", "points", "length_m", "mapping_s",
-  "chunks", "file_bytes": of the map on disk, "budget_bytes", "most_bytes": memory of chunks,
+  "chunks", "file_bytes": of the map on disk, "budget_bytes", "most_bytes": memory of chunks in service,
   "given_up", "came_back": how often a chunk left memory, and came into it again,
   "active", "active_bytes": known voxels in memory in the end, and their memory,
   "daemon": {"killed_at": scan, "down_s", "chunks": that it found in memory},
