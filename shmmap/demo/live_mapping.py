@@ -132,18 +132,18 @@ def map_all(scans: int, mapping: Mapping, watch: Watch, daemon: DaemonProcess, p
         mapping.send(number)
         mapping.hear()
         progress.step(note=f"scan {number}: {watch.look()}")
-        if not kills.daemon_at and number >= scans // 3:
-            kills.daemon_at = number
-            sent = range(number + 1, min(number + _WITHOUT_DAEMON, scans) + 1)
-            _kill_daemon(kills, mapping, daemon, progress, sent)
-            number += len(sent)
-        elif not kills.mapper_at and number >= 2 * scans // 3:
+        if not kills.mapper_at and number >= scans // 3:
             kills.mapper_at = number
             mapping.kill()
             progress.event(f"The mapping program is killed (SIGKILL) after scan {number}")
             number = kills.resumed_at = mapping.start()
             progress.event(f"Its next run hears from the daemon that scan {number} comes next")
             continue
+        if not kills.daemon_at and number >= 2 * scans // 3:
+            kills.daemon_at = number
+            sent = range(number + 1, min(number + _WITHOUT_DAEMON, scans) + 1)
+            _kill_daemon(kills, mapping, daemon, progress, sent)
+            number += len(sent)
         number += 1
     return kills
 

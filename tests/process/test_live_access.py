@@ -163,7 +163,7 @@ def test_nobody_else_changes_what_is_in_memory(service: LiveService) -> None:
 def test_mappers_cannot_touch_each_other_s_marks(service: LiveService) -> None:
     one = service()
     marks = marks_of(one)
-    assert os.stat(marks).st_mode & 0o7777 == 0o3770
+    assert os.stat(marks).st_mode & 0o7777 == 0o1770
     make = as_user(MEMBER, MAPPERS, "sh", "-c", f"echo mine > {marks}/1a.5")
     assert make.returncode == 0, make.stderr
     path = f"{marks}/1a.5"
