@@ -14,6 +14,7 @@ from tests.benchmarks.hostile.beside import Beside
 from tests.benchmarks.hostile.report import Report
 from tests.benchmarks.hostile.stage import Stage, scene
 from tests.benchmarks.hostile.walkers import fills, walks_cold
+from tests.support.daemon_process import DaemonProcess
 from tests.support.raw_client import RawClient, circle
 
 SEGMENT_BYTES: Final = 8192
@@ -82,12 +83,17 @@ def many_segments(told: Report, stage: Stage) -> None:
             )
             with Actor(fills, daemons[size].endpoint, side, size) as filler:
                 filler.said(1200.0)
-        stack.enter_context(Beside(told, daemons[sizes[-1]]))
+
+        def walk(one: DaemonProcess) -> float:
+            with Actor(walks_cold, one.endpoint, 5.0, (0.0, span_m), (span_m - 540.0, span_m)) as walker:
+                came, took_s = walker.said(900.0)
+            return float(came / took_s)
+
         for _ in range(3):
             for size, one in daemons.items():
-                with Actor(walks_cold, one.endpoint, 5.0, (0.0, span_m), (span_m - 540.0, span_m)) as walker:
-                    came, took_s = walker.said(900.0)
-                rates[size].append(came / took_s)
+                rates[size].append(walk(one))
+        with Beside(told, daemons[sizes[-1]]):  # not before: that daemon alone would serve others, too
+            walk(daemons[sizes[-1]])
         for size, one in daemons.items():
             shown = ", ".join(f"{rate:.1f}" for rate in rates[size])
             told.tell(f"{len(one.segments())} segments: {shown} cold cells/s")
