@@ -20,6 +20,7 @@ from shmmap.client.live.patience import until_served
 from shmmap.client.live.voxels import Voxels, open_voxels
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, StaleHandle
+from shmmap.optional_packages import needed_packages
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage, area_to_message
 
@@ -107,7 +108,8 @@ class LiveMap:
         PackageMissing
             numba is not installed.
         """
-        from shmmap.client.live.mapper import LiveMapper  # imports compiled kernels
+        with needed_packages("mapping"):
+            from shmmap.client.live.mapper import LiveMapper  # imports compiled kernels
 
         return LiveMapper(self._session, self.name, name, self.frame_id, scan_filter, timeout_s)
 
