@@ -36,7 +36,7 @@ from shmmap.chunks.marks import decode_marks, encode_marks
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
-from tests.benchmarks.street_data import street
+from tests.benchmarks.street_data import data_dir, street
 
 SHM = "/dev/shm"
 MAP_ID = bytes(16)
@@ -243,6 +243,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--setting", choices=SETTINGS, action="append", help="voxel and range, metres")
     args = parser.parse_args()
+    data_dir()  # it says what is missing
     good = True
     with tempfile.TemporaryDirectory(prefix="live_insertion.") as path:
         folder = Path(path)

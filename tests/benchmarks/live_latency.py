@@ -21,6 +21,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from tests.benchmarks.street_data import data_dir
 from tests.benchmarks.warm_request import Warm
 from tests.support.divided_map import make_map
 from tests.support.live_bench import Beside, live_daemon, mapping, percentiles
@@ -50,6 +51,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0, help="of each round")
     parser.add_argument("--rounds", type=int, default=3)
     args = parser.parse_args()
+    data_dir()  # it says what is missing
     print(f"load {os.getloadavg()[0]:.2f}")
     alone: list[float] = []
     beside: list[float] = []
