@@ -128,7 +128,7 @@ def test_the_bytes_of_the_page() -> None:
 def test_everything_can_be_sent_at_once(served: DaemonProcess, plain: Plain) -> None:
     """Greeting, ready and requests, without waiting for anything; also byte by byte."""
     one = plain(served, hello=False)  # it has sent greeting and ready, and has not waited for a ready
-    numbers = [one.send("hello", 1, 3), one.send("metadata"), one.send("stats")]
+    numbers = [one.send("hello", 1, 4), one.send("metadata"), one.send("stats")]
     assert [one.reply_to(n)[0] for n in numbers] == ["welcome", "metadata_page", "stats_reply"]
     (ready,) = one.commands
     assert ready.startswith(b"\x05READY")
@@ -220,7 +220,7 @@ def test_events(served: DaemonProcess, plain: Plain) -> None:
 def test_every_minor_version_is_answered(served: DaemonProcess, plain: Plain, minor: int) -> None:
     """A client of 1.2 reads what it knows: the first elements."""
     one = plain(served, hello=False)
-    assert one.hello(minor=minor)[2:4] == [1, 3]
+    assert one.hello(minor=minor)[2:4] == [1, 4]
     cells = one.ask("area", HERE, ["points"], 30.0)
     assert [handle[0] for handle in cells[4]] == FOUR
     assert cells[5:9] == [[], b"", [], []]
