@@ -109,6 +109,7 @@ class _Worker:
 
     def run(self) -> None:
         """Serve until the daemon says that it ends, or is gone."""
+        self._tell(time.monotonic())  # who is told that the daemon is ready finds how they are
         self._send(messages.Begun(sum(len(one.live.chunks) for one in self._maps.values())))
         poller = select.poll()
         poller.register(self._channel, select.POLLIN)
