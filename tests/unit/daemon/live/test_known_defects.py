@@ -329,11 +329,13 @@ def test_what_cannot_be_saved_is_told_until_it_is(shm: Path) -> None:
     world.send(marks, at)
     told: set[str] = set()
 
-    def saved() -> bool:
-        told.update(world.map.problems.values())
-        return world.map.all_durable
+    class Noted(dict[str, str]):
+        def __setitem__(self, what: str, text: str) -> None:
+            told.add(text)
+            super().__setitem__(what, text)
 
-    world.until(saved, save_all=True)
+    world.map.problems = Noted()
+    world.until(lambda: world.map.all_durable, save_all=True)
     assert told
     assert all(text.endswith("No space left on device") for text in told)
     assert not world.map.problems
