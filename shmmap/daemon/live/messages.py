@@ -15,6 +15,7 @@ from shmmap.daemon.config_live import LiveSettings
 from shmmap.protocol.live import LiveMapRow
 
 __all__ = [
+    "MOST_OF_A_SESSION",
     "Answer",
     "Ask",
     "Begin",
@@ -111,6 +112,9 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
 
 ToLive: TypeAlias = Begin | Ask | Left | End
 FromLive: TypeAlias = Begun | Failed | Answer | Status | Ended
+
+MOST_OF_A_SESSION: Final = 64
+"""Requests that are passed on before they are answered."""
 
 encode: Final = msgspec.msgpack.Encoder().encode
 

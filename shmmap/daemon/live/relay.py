@@ -26,7 +26,7 @@ from shmmap.logfmt import log
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import start_child
 from shmmap.protocol.codec import encode
-from shmmap.protocol.live import LiveListed, LiveRequest
+from shmmap.protocol.live import LiveList, LiveListed, LiveRequest
 
 __all__ = ["LiveRelay", "NoLiveMaps"]
 
@@ -38,8 +38,10 @@ PAUSES_S: Final = (0.0, 0.5, 2.0, 10.0, 30.0)
 """Before another worker is started for one that ended: the first time, and later ones in a row."""
 STARTS: Final = 2
 """Workers that may be killed before the maps are in memory."""
-MOST_OF_A_SESSION: Final = 64
-"""Requests that may wait for their answers."""
+END_PATIENCE_S: Final = 0.1
+"""How long the loop waits for a killed worker to end; one that hangs in the kernel may take for ever."""
+HEARD_AT_ONCE: Final = 16
+"""Messages of the worker that one turn of the loop takes in."""
 MOST_BYTES: Final = 1 << 12
 """Of a request about live maps: names and numbers."""
 MOST_UNSENT: Final = 4096
@@ -57,7 +59,7 @@ class NoLiveMaps:
     def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
         """Say that there are none."""
         del body, now_s
-        if type(message).__name__ == "LiveList":
+        if isinstance(message, LiveList):
             session.connection.reply(encode(LiveListed(message.request, ())))
             return
         raise BadRequest(
@@ -175,7 +177,9 @@ class LiveRelay:
 
     def hear(self) -> None:
         """Hear what the worker says, and send on what it did not take."""
-        while self._channel is not None:
+        for _ in range(HEARD_AT_ONCE):
+            if self._channel is None:
+                return
             try:
                 data, _ = receive_packet(self._channel, self._buffer)
             except BlockingIOError:
@@ -239,7 +243,8 @@ class LiveRelay:
             self._channel = None
         if self._process is not None:
             self._process.kill()
-            self._process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(END_PATIENCE_S)
             self._process = None
         self._unsent.clear()
         self._serving = False
@@ -261,7 +266,7 @@ class LiveRelay:
         if len(body) > MOST_BYTES:
             raise BadRequest(f"a request about a live map has at most {MOST_BYTES} bytes")
         waiting = self._waiting.get(session.slot, 0)
-        if waiting >= MOST_OF_A_SESSION:
+        if waiting >= messages.MOST_OF_A_SESSION:
             raise Busy(f"{waiting} requests of this session about live maps wait", hint="wait for some")
         if self._channel is None:
             raise LiveInterrupted("the process that keeps live maps is being started anew")

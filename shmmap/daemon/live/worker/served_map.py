@@ -15,7 +15,7 @@ from shmmap.chunks.marks import decode_marks
 from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live.live_map import LiveMap
-from shmmap.daemon.live.messages import Ask
+from shmmap.daemon.live.messages import MOST_OF_A_SESSION, Ask
 from shmmap.daemon.live.records import Chunk, Scan, State
 from shmmap.daemon.live.windows import place_ahead
 from shmmap.daemon.live.worker.changes import Changes
@@ -36,8 +36,6 @@ AHEAD_S: Final = 2.0
 """Chunks are loaded for where a mapper will be then, if it goes on as it does."""
 MOST_AHEAD_CHUNKS: Final = 4.0
 MANIFEST_S: Final = 60.0
-MOST_OF_A_SESSION: Final = 64
-"""Requests of one that the daemon passes on before they are answered."""
 LEASES_S: Final = 0.25
 """How often the kernel is asked whether what was given up is still mapped."""
 
@@ -98,10 +96,8 @@ class ServedMap:
 
     def handle(self, ask: Ask, message: messages.LiveRequest, now_s: float) -> None:
         """Answer a request now or later; raises what refuses it."""
-        if isinstance(message, messages.LiveScan | messages.LiveSave) and not ask.maps:
-            raise NotPermitted(
-                "this user may not change live maps", hint="its group is `live_group` of the daemon"
-            )
+        if isinstance(message, messages.LiveScan | messages.LiveSave):
+            _require_mapper(ask)
         if isinstance(message, messages.LiveOpen):
             self._answer(ask.ticket, self._open(ask, message))
         elif isinstance(message, messages.LiveScan):
@@ -135,10 +131,7 @@ class ServedMap:
             probabilities=msgspec.structs.astuple(fixed.occupancy),
         )  # fmt: skip
         if message.mapper:
-            if not ask.maps:
-                raise NotPermitted(
-                    "this user may not change live maps", hint="its group is `live_group` of the daemon"
-                )
+            _require_mapper(ask)
             active = self._on_disk(lambda: self.mappers.open(ask.uid, message.mapper, ask.session))
             reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
             reply.marks_dir, reply.most_marks_bytes = self._marks.path, MOST_MARKS_BYTES
@@ -323,3 +316,11 @@ class ServedMap:
             self.live.remove_from_memory()
         self.live.close()
         return unsaved
+
+
+def _require_mapper(ask: Ask) -> None:
+    if not ask.maps:
+        raise NotPermitted(
+            "this user may not change live maps",
+            hint="root, the daemon's own user and members of its `live_group` may",
+        )

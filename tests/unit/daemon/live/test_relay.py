@@ -17,7 +17,6 @@ from shmmap.daemon.live import messages, relay
 from shmmap.daemon.live.relay import (
     IN_ORDER_S,
     MOST_BYTES,
-    MOST_OF_A_SESSION,
     MOST_UNSENT,
     PAUSES_S,
     LiveRelay,
@@ -73,7 +72,7 @@ class World:
         ours, theirs = channel()
         theirs.setblocking(False)
         self.workers.append(theirs)
-        return SimpleNamespace(kill=lambda: None, wait=lambda: 0), ours
+        return SimpleNamespace(kill=lambda: None, wait=lambda _seconds: 0), ours
 
     def started(self) -> None:
         """Another worker that has all maps in memory."""
@@ -134,7 +133,7 @@ def test_each_gets_its_own_answer(world: World) -> None:
 
 def test_a_session_waits_for_so_many_and_no_more(world: World) -> None:
     a, b = Asker(1), Asker(2)
-    for number in range(MOST_OF_A_SESSION):
+    for number in range(messages.MOST_OF_A_SESSION):
         world.ask(a, number)
     with pytest.raises(Busy, match="64 requests"):
         world.ask(a)
@@ -271,3 +270,17 @@ def test_where_there_are_no_live_maps() -> None:
     with pytest.raises(BadRequest, match="no live maps") as told:
         none.ask(asker, LiveMove(1, "lidar", (0.0, 0.0, 0.0)), b"", 0.0)
     assert "--live NAME" in told.value.hint
+
+
+def test_a_turn_of_the_loop_hears_a_bounded_number_of_messages(world: World) -> None:
+    """Whatever the worker has to say, clients are heard in between."""
+    worker = world.workers[0]
+    for number in range(relay.HEARD_AT_ONCE + 3):
+        worker.send(messages.encode(messages.Answer(10_000 + number, b"")))
+    told: list[object] = []
+    hear = world.relay._told
+    world.relay._told = lambda message: (told.append(message), hear(message))[1]  # type: ignore[method-assign,func-returns-value]
+    world.relay.hear()
+    assert len(told) == relay.HEARD_AT_ONCE
+    world.relay.hear()
+    assert len(told) == relay.HEARD_AT_ONCE + 3

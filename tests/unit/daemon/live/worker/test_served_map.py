@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from shmmap.chunks.marks import Marks
+from shmmap.daemon.live.messages import MOST_OF_A_SESSION
 from shmmap.daemon.live.worker import served_map
 from shmmap.errors import BadRequest, CannotWrite, NotPermitted
 from shmmap.protocol import live as messages
@@ -131,11 +132,11 @@ def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.Monk
     mapper = one.open().mapper
     for session in range(1, 6):
         one.open(session=session)
-        for _ in range(served_map.MOST_OF_A_SESSION):
+        for _ in range(MOST_OF_A_SESSION):
             one.send(marks, mapper, 1, session=session)
             one.turn()
         one.map.left(session)
-    assert len(one.map._tickets[mapper, 1]) == served_map.MOST_OF_A_SESSION
+    assert len(one.map._tickets[mapper, 1]) == MOST_OF_A_SESSION
     blocked.may.set()
     one.until(lambda: one.map.status().scans)
     assert one.voxels() == reference(marks)
