@@ -160,9 +160,9 @@ class LiveMap(RuleBasedStateMachine):
             self.disk[chunk.key] = content
             self.map.saved(chunk, content.version, self.now_s)
 
-    @rule()
-    def flush(self) -> None:
-        if self.map.flush_is_due:
+    @rule(everything=st.booleans())
+    def flush(self, *, everything: bool = True) -> None:
+        if self.map.flush_is_due(self.now_s, everything=everything):
             self.map.durability.begin()
             self.flushing = {key: content.copy() for key, content in self.disk.items()}
 
@@ -172,7 +172,7 @@ class LiveMap(RuleBasedStateMachine):
         """Names that are as they were when it began are safe; or none more than before."""
         flushing, self.flushing = self.flushing, None
         if fails or flushing is None:
-            self.map.durability.failed()
+            self.map.durability.failed(self.now_s)
         else:
             self.safe = flushing
             self.durable += self.map.durability.flushed()

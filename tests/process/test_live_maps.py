@@ -109,6 +109,10 @@ def test_voxels_of_an_area_and_since_a_change(live_daemon: LiveDaemon) -> None:
         assert not names  # each was opened
 
 
+TIMES = {"live.map": 3, "live.synced": 1, "live.flushed": 1}
+"""How often a step is taken until the worker is killed in it; the others often."""
+
+
 @pytest.mark.parametrize("label", LIVE_STEPS)
 def test_a_worker_killed_at_any_step_loses_nothing(
     live_daemon: LiveDaemon, tmp_path: Path, label: str
@@ -116,7 +120,7 @@ def test_a_worker_killed_at_any_step_loses_nothing(
     """The mapper notices nothing but a pause: what was not answered it sends again, and it counts once."""
     scans = drive(10)
     one = live_daemon(start=False)
-    one.environment["SHMMAP_TEST_CRASH"] = f"{label}:{3 if label == 'live.map' else 5}:{tmp_path}/reached"
+    one.environment["SHMMAP_TEST_CRASH"] = f"{label}:{TIMES.get(label, 5)}:{tmp_path}/reached"
     one.start()
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")

@@ -3,11 +3,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from typing import Final
 
+from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.records import Chunk, Scan
 
 __all__ = ["Durability"]
+
+TOGETHER_S: Final = 1.0
+"""Files that were written in this time are flushed together: each once, however often it was written."""
 
 
 class Durability:
@@ -19,16 +25,35 @@ class Durability:
         Chunks whose files were written since the last flush began, with the versions.
     flushing
         What the flush that is under way makes durable.
+    retry_s
+        Not before that: a flush failed.
     """
 
     def __init__(self) -> None:
         self.written: list[tuple[Chunk, int]] = []
         self.flushing: list[tuple[Chunk, int]] = []
+        self._written_keys: set[ChunkKey] = set()
+        self._flushing_keys: set[ChunkKey] = set()
+        self._first_s = math.inf
+        self.retry_s = -math.inf
+
+    @property
+    def due_s(self) -> float:
+        """When what was written is to be flushed; infinity for not at all."""
+        return max(self._first_s + TOGETHER_S, self.retry_s)
+
+    def note_written(self, chunk: Chunk, version: int, now_s: float) -> None:
+        """A chunk's file was written."""
+        self._first_s = min(self._first_s, now_s)
+        self.written.append((chunk, version))
+        self._written_keys.add(chunk.key)
 
     def note_loaded(self, chunk: Chunk) -> None:
         """A chunk has come back as its file is, which may not be durable yet."""
-        if any(other.key == chunk.key for other, _ in (*self.written, *self.flushing)):
+        if chunk.key in self._written_keys:
             self.written.append((chunk, chunk.version))
+        elif chunk.key in self._flushing_keys:
+            self.flushing.append((chunk, chunk.version))
         else:
             chunk.durable = chunk.version
 
@@ -50,10 +75,15 @@ class Durability:
     def begin(self) -> None:
         """A flush begins: it makes durable what was written until now."""
         self.flushing, self.written = self.written, []
+        self._flushing_keys, self._written_keys = self._written_keys, set()
+        self._first_s = math.inf
 
-    def failed(self) -> None:
-        """The flush did not come about."""
+    def failed(self, retry_s: float) -> None:
+        """The flush did not come about; it is tried again then."""
         self.flushing, self.written = [], self.flushing + self.written
+        self._written_keys |= self._flushing_keys
+        self._flushing_keys = set()
+        self._first_s, self.retry_s = -math.inf, retry_s
 
     def flushed(self) -> list[Scan]:
         """The flush is over; returns the scans that are durable by that."""
@@ -65,5 +95,5 @@ class Durability:
                 del scan.to_save[chunk.key]
                 if scan.durable:
                     done.append(scan)
-        self.flushing = []
+        self.flushing, self._flushing_keys = [], set()
         return done

@@ -15,7 +15,6 @@ from itertools import count
 from typing import Final, Protocol
 
 from shmmap.errors import InstanceBusy
-from shmmap.failpoints import step
 
 __all__ = [
     "DAMAGED",
@@ -26,6 +25,7 @@ __all__ = [
     "FolderToRead",
     "keep_aside",
     "replace_file",
+    "write_beside",
 ]
 
 INTERIM: Final = ".tmp"
@@ -66,16 +66,24 @@ class Files(FilesToRead, Protocol):
         """Have all names on the disk as they are now."""
 
 
-def replace_file(files: Files, name: str, data: bytes) -> None:
-    """Put a file, which is on the disk, in the place of what has its name; `sync_names` makes that last."""
+def write_beside(files: Files, name: str, data: bytes) -> str:
+    """Write what is to get this name under another one, which is returned."""
     interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
     try:
         files.write(interim, data)
-        step("live.written")
+    except OSError:
+        with contextlib.suppress(OSError):
+            files.remove(interim)
+        raise
+    return interim
+
+
+def replace_file(files: Files, name: str, data: bytes) -> None:
+    """Put a file, which is on the disk, in the place of what has its name; `sync_names` makes that last."""
+    interim = write_beside(files, name, data)
+    try:
         files.sync(interim)
-        step("live.synced")
         files.rename(interim, name)
-        step("live.renamed")
     except OSError:
         with contextlib.suppress(OSError):
             files.remove(interim)
@@ -126,8 +134,16 @@ class FolderToRead:
 
     def read(self, name: str, most: int = -1) -> bytes:
         """The first ``most`` bytes of a file, or all."""
-        with open(self._open(name, os.O_RDONLY), "rb") as file:
-            return file.read(most)
+        fd = self._open(name, os.O_RDONLY)
+        try:
+            left = os.fstat(fd).st_size if most < 0 else most
+            parts = []
+            while left and (part := os.read(fd, left)):
+                parts.append(part)
+                left -= len(part)
+            return b"".join(parts)
+        finally:
+            os.close(fd)
 
 
 class Folder(FolderToRead):
@@ -160,10 +176,13 @@ class Folder(FolderToRead):
 
     def write(self, name: str, data: bytes) -> None:
         """Make a file of a new name."""
-        with open(self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb", buffering=0) as file:
+        fd = self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        try:
             left = memoryview(data)
             while left:
-                left = left[file.write(left) :]
+                left = left[os.write(fd, left) :]
+        finally:
+            os.close(fd)
 
     def sync(self, name: str) -> None:
         """Have what was written on the disk."""

@@ -36,6 +36,8 @@ __all__ = ["LiveMap"]
 
 CHUNKS_A_TURN: Final = 64
 """Chunks that take in a scan in one turn: 37 us each."""
+MOST_UNFLUSHED: Final = 32 << 20
+"""Files that are written and not flushed: beyond it the disk is waited for, and what is not saved stays."""
 
 
 @dataclass(eq=False, slots=True)
@@ -92,12 +94,12 @@ class LiveMap:
     _parts: dict[Scan, _Part] = field(default_factory=dict)
     _running: dict[Future[Any], Callable[[Future[Any], float], None]] = field(default_factory=dict)
     _generation: int = 0
-    _flush_s: float = 0.0
 
     def __post_init__(self) -> None:
         self.residency = Residency(self.limits, new_bytes=memory_bytes(0))
         self._writer = ChunkWriter(self.files.settings.occupancy, self.undo)
-        self._threads = ThreadPoolExecutor(self.limits.loads + self.limits.saves, "live-files")
+        most = self.limits.loads + self.limits.saves + 1  # one flushes
+        self._threads = ThreadPoolExecutor(most, "live-files")
         self._generation = self.files.begin_life() << 32
         for key, row in self.files.rows.items():
             self.residency.note_size(key, memory_bytes(row.bricks))
@@ -172,12 +174,17 @@ class LiveMap:
             if not given_up.is_mapped:
                 self.released(lease)
         while (cold := residency.next_load(now_s)) is not None:
-            self._start(self.files.load, cold.key, then=partial(self._loaded, cold))
-        while (dirty := residency.next_save(now_s, everything=save_all)) is not None:
+            self._generation += 1
+            identity = self.identity(cold.key, self._generation)
+            self._start(self._load, identity, then=partial(self._loaded, cold))
+        while (
+            self.files.unflushed_bytes < MOST_UNFLUSHED
+            and (dirty := residency.next_save(now_s, everything=save_all)) is not None
+        ):
             view = self.chunks[dirty.key].view
             copy = ChunkView(bytes(view.data[: chunk_bytes(int(view.state["bricks"]))]))
             self._start(self._save, dirty.key, copy, then=partial(self._saved, dirty, dirty.version))
-        if residency.flush_is_due and now_s >= self._flush_s:
+        if residency.flush_is_due(now_s, everything=save_all):
             residency.durability.begin()
             self._start(self.files.flush, then=self._flushed)
 
@@ -226,18 +233,21 @@ class LiveMap:
 
     # --- files ----------------------------------------------------------------------------------
 
-    def _loaded(self, chunk: Chunk, future: Future[bytes | None], now_s: float) -> None:
-        self._generation += 1
-        identity = self.identity(chunk.key, self._generation)
+    def _load(self, identity: ChunkIdentity) -> ChunkFile:
+        """Bring a chunk into memory as its file is, or new; a file that is of no use is put aside."""
+        key = identity.key
+        data = self.files.load(key)
         content: bytes | bytearray = new_header(identity)
+        if data is not None:
+            try:
+                content = decode_chunk(data, identity, key.text)
+            except MapDataError as error:
+                self.files.put_aside(key, error.message)
+        return self.memory.create(content)
+
+    def _loaded(self, chunk: Chunk, future: Future[ChunkFile], now_s: float) -> None:
         try:
-            data = future.result()
-            if data is not None:
-                try:
-                    content = decode_chunk(data, identity, chunk.key.text)
-                except MapDataError as error:
-                    self.files.put_aside(chunk.key, error.message)
-            file = self.memory.create(content)
+            file = future.result()
         except (OSError, PackageMissing) as error:
             self._failed("loaded", chunk.key.text, str(error))
             self.residency.load_failed(chunk, now_s)
@@ -292,8 +302,7 @@ class LiveMap:
             future.result()
         except OSError as error:
             self._failed("flushed", "", error.strerror)
-            self._flush_s = now_s + RETRY_S
-            self.residency.durability.failed()
+            self.residency.durability.failed(now_s + RETRY_S)
             return
         self._succeeded("flushed")
         for scan in self.residency.durability.flushed():
@@ -311,6 +320,10 @@ class LiveMap:
     def close(self) -> None:
         """Leave memory and files as they are."""
         self._threads.shutdown()
+        for future in self._running:
+            if future.exception() is None and isinstance(chunk := future.result(), ChunkFile):
+                chunk.close()  # it has come, and there was no turn since
+        self._running.clear()
         for file in self.chunks.values():
             file.close()
         for kept in self.kept.values():

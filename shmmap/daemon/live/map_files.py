@@ -3,9 +3,10 @@
 
 - ``map.json`` says what the map is, and never forgets a mapper's number; it is on the disk before any of
   that is used.
-- ``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name, is on the disk
-  before it takes the place of an older one, and only then may its memory be freed.  It is *durable* after
-  `MapFiles.flush`.
+- ``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name; from then on
+  no death of a process loses it, and its memory may be freed.  `MapFiles.flush` has it on the disk, then in
+  the place of an older one, and then it is *durable*.  Until that its bytes are kept, in case that the disk
+  fails, and for whoever loads it again: what is written often is flushed seldom.
 - ``manifest.json`` lists the chunks that are durable.  It is written last, and only says what somebody may
   have taken away; all else is read from the chunks' headers.
 - What cannot be read is put aside as ``3_-1_0.chunk.damaged.1``, told, and never overwritten.
@@ -16,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import threading
+from dataclasses import dataclass
 from typing import Final
 
 import msgspec
@@ -35,15 +37,32 @@ from shmmap.daemon.live.disk.map_record import (
     read_map,
     write_rows,
 )
-from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
+from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file, write_beside
 from shmmap.errors import BadRequest, ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 
 __all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
 
+_UNFLUSHED_ENTRY: Final = 1 << 10
+"""What a file that is not flushed counts beside its bytes."""
 SCANS_AHEAD: Final = 1 << 20
 """Numbers of scans that ``map.json`` leaves to a mapper before it is written again: a day's, at 10 Hz."""
+
+
+@dataclass(eq=False, slots=True)
+class _Written:
+    """A chunk's file that has not got its name yet."""
+
+    interim: str
+    data: bytes
+    row: Row
+    is_flushed: bool = False  # just now
+    failed: bool = False
+
+    @property
+    def nbytes(self) -> int:
+        return len(self.data) + _UNFLUSHED_ENTRY
 
 
 class MapFiles:
@@ -64,6 +83,8 @@ class MapFiles:
         Files that were put aside since the start, and why.
     missing : dict
         Chunks that were durable and are not there any more, or only in an older version.
+    unflushed_bytes : int
+        What is written and not durable takes so much memory here.
 
     Raises
     ------
@@ -80,8 +101,10 @@ class MapFiles:
         self.rows: dict[ChunkKey, Row] = {}
         self.damaged: dict[str, str] = {}
         self.missing: dict[ChunkKey, Row] = {}
-        self._unflushed = False
-        self._flushing = threading.Lock()
+        self.unflushed_bytes = 0
+        self._written: dict[ChunkKey, _Written] = {}
+        self._durable: dict[ChunkKey, Row] = {}
+        self._changing, self._flushing = threading.Lock(), threading.Lock()
         names = files.names()
         if MAP_FILE in names:
             self._map = self._read_map(settings)
@@ -179,42 +202,84 @@ class MapFiles:
         """Read the file of a chunk; None where there is none.  Raises OSError."""
         if key not in self.rows:
             return None
-        return self.files.read(key.text + CHUNK)
+        written = self._written.get(key)
+        return written.data if written is not None else self.files.read(key.text + CHUNK)
 
     def put_aside(self, key: ChunkKey, why: str) -> str:
         """Keep a file that cannot be read under another name, which is returned."""
         name = keep_aside(self.files, key.text + CHUNK)
         self.rows.pop(key, None)
+        self._durable.pop(key, None)
         self.damaged[name] = why
         log.error("chunk put aside", chunk=key.text, file=name, reason=why)
         return name
 
     def save(self, key: ChunkKey, data: bytes) -> None:
-        """Write the file of a chunk in the place of an older one; durable after `flush`.
+        """Write the file of a chunk, which takes the place of an older one and is durable after `flush`.
 
         When this returns, the chunk's memory may be freed: no death of a process loses it.
         """
-        header = read_file_header(data)
-        replace_file(self.files, key.text + CHUNK, data)
-        self.rows[key] = Row.of(header)
-        self._unflushed = True
+        row = Row.of(read_file_header(data))
+        written = _Written(write_beside(self.files, key.text + CHUNK, data), data, row)
+        step("live.written")
+        with self._changing:
+            before = self._written.get(key)
+            self._written[key] = written
+            self.rows[key] = row
+            self.unflushed_bytes += written.nbytes - (before.nbytes if before is not None else 0)
+            needless = before is not None and not before.is_flushed
+        if before is not None and needless:
+            with contextlib.suppress(OSError):  # it may have its name; else it goes with the next start
+                self.files.remove(before.interim)
 
     def flush(self) -> None:
-        """Make durable what was saved."""
+        """Make durable what was saved; what comes meanwhile is for the next time."""
         with self._flushing:  # who comes second waits until it is so
-            if self._unflushed:
-                self._unflushed = False  # what is saved from now on is for the next one
-                try:
-                    self.files.sync_names()
-                except OSError:
-                    self._unflushed = True
-                    raise
+            with self._changing:
+                taken = dict(self._written)
+                for one in taken.values():
+                    one.is_flushed = True
+            if not taken:
+                return
+            try:
+                for key, one in taken.items():
+                    self._sync(key, one)
+                step("live.synced")
+                for key, one in taken.items():
+                    self.files.rename(one.interim, key.text + CHUNK)
+                    step("live.renamed")
+                self.files.sync_names()
                 step("live.flushed")
+            except OSError:
+                self._keep_for_later(taken)
+                raise
+            self._durable.update((key, one.row) for key, one in taken.items())
+            with self._changing:
+                for key, one in taken.items():
+                    if self._written.get(key) is one:
+                        del self._written[key]
+                        self.unflushed_bytes -= one.nbytes
+
+    def _sync(self, key: ChunkKey, one: _Written) -> None:
+        if one.failed:  # what the kernel could not write once it may have thrown away
+            old, one.interim = one.interim, write_beside(self.files, key.text + CHUNK, one.data)
+            with contextlib.suppress(FileNotFoundError):  # it had its name already
+                self.files.remove(old)
+        self.files.sync(one.interim)
+
+    def _keep_for_later(self, taken: dict[ChunkKey, _Written]) -> None:
+        """A flush came to nothing: all of it is written again, but what is newer by now."""
+        with self._changing:
+            for key, one in taken.items():
+                one.is_flushed, one.failed = False, True
+                if self._written.get(key) is not one:
+                    with contextlib.suppress(OSError):
+                        self.files.remove(one.interim)
 
     def write_manifest(self) -> None:
         """Make durable what was saved, and list it."""
         self.flush()
-        write_rows(self.files, dict(self.rows))
+        write_rows(self.files, dict(self._durable))
 
     # --- the start ------------------------------------------------------------------------------
 
@@ -242,8 +307,8 @@ class MapFiles:
                 if name.startswith(f".{place}.") and (old is None or old.version < header.version):
                     if old is None and place in names:
                         self.put_aside(header.key, "it cannot be read, and a whole one was beside it")
+                    self.files.sync(name)
                     self.files.rename(name, place)
-                    self._unflushed = True
                     continue
             self.files.remove(name)
 
@@ -263,7 +328,8 @@ class MapFiles:
                 self.put_aside(key, "its header or its length is wrong")
             else:
                 self.rows[key] = Row.of(header)
-        self.flush()
+        self.files.sync_names()
+        self._durable = dict(self.rows)
         listed: dict[str, Row] = {}
         if MANIFEST in names:
             with contextlib.suppress(msgspec.MsgspecError):  # it is written anew

@@ -103,6 +103,8 @@ class Chunk:
         What is in memory, what its file holds, and what no power cut takes away.
     under_way
         It is being loaded.
+    leaving
+        It is saved in order to be given up.
     retry_s
         Before that its file is not tried again.
     missing_bytes
@@ -121,6 +123,7 @@ class Chunk:
     saved: int = 0
     durable: int = 0
     under_way: bool = False
+    leaving: bool = False
     retry_s: float = -math.inf
     dirty_since_s: float = 0.0
     changed_s: float = -math.inf

@@ -8,7 +8,7 @@ next (`next_load`, `ready`, `next_save`, `next_eviction`) and tells when it was 
   holds any more, or when memory is short: the furthest first.
 - A scan is never dropped: for a chunk that is not in memory it waits, and scans are applied in the order in
   which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
-- A chunk that was written is saved before it is given up, and after `Limits.checkpoint_s` at the latest;
+- A chunk that was written is saved before it is given up, and is durable after `Limits.checkpoint_s`;
   one that is written while it is saved is dirty again.
 """
 
@@ -20,7 +20,7 @@ from itertools import takewhile
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.durability import Durability
+from shmmap.daemon.live.durability import TOGETHER_S, Durability
 from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan, State
 from shmmap.daemon.live.windows import Windows
 
@@ -30,6 +30,8 @@ RETRY_S: Final = 1.0
 """How long after a file could not be read or written it is tried again."""
 REVIEW_S: Final = 0.1
 """How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
+REVIEWED_OF_NEWS: Final = 32
+"""Where memory is short, they are also gone over when one in so many came or changed since."""
 
 
 class Residency:
@@ -63,13 +65,16 @@ class Residency:
         self.chunk_bytes = self.leased_bytes = self.waiting_bytes = self.active = 0
         self.loading = self.saving = 0
         self._new_bytes = new_bytes
+        self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # then it is flushed
         self._sizes: dict[ChunkKey, int] = {}
         self.windows = Windows(limits.radius, limits.hysteresis)
         self._missing: list[ChunkKey] = []  # near, not in memory; the nearest last
         self._needing: dict[ChunkKey, Chunk] = {}
         self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
-        self._victims: list[Chunk] = []  # the first to give up last
+        self._victims: dict[State, list[Chunk]] = {State.CLEAN: [], State.DIRTY: []}  # the first last
         self._review_s = self._save_s = -math.inf  # neither before
+        self._reviewed_short = False
+        self._news = 0  # what came, changed, or was saved since chunks were gone over
         self._leases_given = 0
         self.durability = Durability()
 
@@ -151,6 +156,7 @@ class Residency:
         if not chunk.waiting:
             del self._needing[chunk.key]
         self._resize(chunk, nbytes, active)
+        self._news += 1
         chunk.missing_bytes, chunk.changed_s = 0, now_s
         if version > chunk.version:
             chunk.version = version
@@ -217,6 +223,7 @@ class Residency:
         self.loading -= 1
         chunk.under_way = False
         chunk.state = State.CLEAN
+        self._news += 1
         self._resize(chunk, nbytes, active)
         chunk.version = chunk.saved = version
         self.durability.note_loaded(chunk)
@@ -242,42 +249,58 @@ class Residency:
             for chunk in self._needing.values()
         )
 
+    def _may_go(self, chunk: Chunk, now_s: float, *, short: bool) -> bool:
+        """Whether a chunk may be given up; one that can take in a scan now does that first."""
+        if chunk.state is State.LOADING or (chunk.waiting and not self._lacks_memory(chunk)):
+            return False
+        return short or not self.is_wanted(chunk, now_s)
+
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
         """What to give up next: unwanted ones, and where memory is short others, the furthest first."""
         short = self._is_short(now_s)
-
-        def may_go(chunk: Chunk) -> bool:
-            return (
-                chunk.state is not State.LOADING
+        if not any(self._victims.values()) and self._may_review(now_s, short=short):
+            self._review(now_s, short=short)
+        left = self._victims[state]
+        while left:
+            chunk = left.pop()
+            if (
+                chunk.state is state
                 and self.chunks.get(chunk.key) is chunk
-                and (short or not self.is_wanted(chunk, now_s))
-            )
-
-        self._victims = [chunk for chunk in self._victims if may_go(chunk)]
-        if not self._victims and now_s >= self._review_s:
-            self._review_s = now_s + REVIEW_S
-            self._victims = sorted(
-                (chunk for chunk in self.chunks.values() if may_go(chunk)),
-                key=lambda chunk: (
-                    not chunk.waiting, not self.is_wanted(chunk, now_s), self.windows.distance(chunk.key),
-                    chunk.state is State.CLEAN, -chunk.active,
-                ),
-            )  # fmt: skip
-        for chunk in reversed(self._victims):
-            if chunk.state is state and chunk.retry_s <= now_s:
+                and chunk.retry_s <= now_s
+                and self._may_go(chunk, now_s, short=short)
+            ):
                 return chunk
         return None
+
+    def _may_review(self, now_s: float, *, short: bool) -> bool:
+        """Whether all chunks are gone over again: seldom, or where memory is short and much has happened."""
+        if short and (not self._reviewed_short or self._news * REVIEWED_OF_NEWS >= len(self.chunks)):
+            return True
+        return now_s >= self._review_s
+
+    def _review(self, now_s: float, *, short: bool) -> None:
+        self._review_s, self._reviewed_short, self._news = now_s + REVIEW_S, short, 0
+        found = sorted(
+            (chunk for chunk in self.chunks.values() if self._may_go(chunk, now_s, short=short)),
+            key=lambda chunk: (
+                not chunk.waiting, not self.is_wanted(chunk, now_s), self.windows.distance(chunk.key),
+                chunk.state is State.CLEAN, -chunk.active,
+            ),
+        )  # fmt: skip
+        for state, left in self._victims.items():
+            left[:] = (chunk for chunk in found if chunk.state is state)
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
         """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
         if self.saving >= self.limits.saves or now_s < self._save_s:
             return None
-        due_s = math.inf if everything else now_s - self.limits.checkpoint_s
+        due_s = math.inf if everything else now_s - self._save_after_s
         old = takewhile(lambda one: one.dirty_since_s <= due_s, self._dirty.values())
         due = next((one for one in old if one.retry_s <= now_s), None)
-        best = self._next_victim(now_s, State.DIRTY) or due
+        victim = self._next_victim(now_s, State.DIRTY)
+        best = victim or due
         if best is not None:
-            best.state = State.SAVING
+            best.state, best.leaving = State.SAVING, best is victim
             del self._dirty[best.key]
             self.saving += 1
         return best
@@ -287,10 +310,13 @@ class Residency:
         self.saving -= 1
         chunk.saved = version
         self._sizes[chunk.key] = chunk.nbytes
-        self.durability.written.append((chunk, version))
+        self.durability.note_written(chunk, version, now_s)
         chunk.state = State.CLEAN
+        self._news += 1
         if chunk.version > version:
             self._soil(chunk, now_s)
+        elif chunk.leaving:
+            self._victims[State.CLEAN].append(chunk)
 
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
         """A file could not be written: the chunk stays in memory, and is tried again."""
@@ -303,11 +329,13 @@ class Residency:
         """Whether no change is in memory alone."""
         return not self._dirty and not self.saving and not self.durability.written + self.durability.flushing
 
-    @property
-    def flush_is_due(self) -> bool:
-        """Whether enough files were written that are not durable yet, or no more are to come for now."""
-        written, flushing = self.durability.written, self.durability.flushing
-        return bool(written) and not flushing and (not self.saving or len(written) >= self.limits.saves)
+    def flush_is_due(self, now_s: float, *, everything: bool = False) -> bool:
+        """Whether files that were written are to be made durable now: those of some time together, or all."""
+        if self.durability.flushing:
+            return False
+        if everything and not self.saving:
+            return bool(self.durability.written) and now_s >= self.durability.retry_s
+        return now_s >= self.durability.due_s
 
     # --- giving up ------------------------------------------------------------------------------
 
@@ -342,9 +370,11 @@ class Residency:
     def next_event_s(self, now_s: float) -> float:
         """When there is something to do although nothing happens; infinity for never."""
         times = [chunk.retry_s for chunk in self._needing.values() if chunk.retry_s > now_s]
+        if not self.durability.flushing:
+            times.append(self.durability.due_s)
         if self._dirty and self.saving < self.limits.saves:  # else there is when one has been saved
             first = next(iter(self._dirty.values()))
-            times.append(max(first.dirty_since_s + self.limits.checkpoint_s, first.retry_s, self._save_s))
+            times.append(max(first.dirty_since_s + self._save_after_s, first.retry_s, self._save_s))
         if self._needing or len(self.chunks) > sum(key in self.chunks for key in self.windows.near):
             times.append(now_s + REVIEW_S)
         return max(now_s, min(times, default=math.inf))

@@ -278,7 +278,7 @@ class ServedMap:
         live, residency = self.live, self.live.residency
         states = [chunk.state for chunk in residency.chunks.values()]
         missing = [f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items()]
-        damaged = [f"{name}: {why}" for name, why in live.files.damaged.items()]
+        damaged = [f"{name}: {why}" for name, why in list(live.files.damaged.items())]  # other threads load
         return messages.LiveMapRow(
             self.settings.name, self.settings.path, live.files.settings.resolution,
             live.files.settings.frame_id, chunks=len(live.chunks), active=residency.active,

@@ -145,6 +145,7 @@ def test_a_damaged_file_is_put_aside_and_never_overwritten(tmp_path: Path) -> No
     assert again.rows == {}
     assert set(again.missing) == set(KEYS)
     again.save(KEYS[0], chunk(again, KEYS[0], 1))
+    again.flush()
     assert again.put_aside(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
     assert (tmp_path / "0_0_0.chunk.damaged.1").read_bytes() == b"CORRUPTED DATA"
     assert again.load(KEYS[0]) is None
@@ -170,17 +171,90 @@ def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, tmp_
     folder = Folder(tmp_path)
     made = MapFiles(folder, SETTINGS)
     made.save(KEYS[0], chunk(made, KEYS[0], 1))
+    made.flush()
     names = sorted(folder.names())
-    for what in ("write", "sync", "rename"):
-        with monkeypatch.context() as patch:
-            patch.setattr(folder, what, _full)
-            with pytest.raises(OSError, match="No space"):
-                made.save(KEYS[0], chunk(made, KEYS[0], 2))
-        assert sorted(folder.names()) == names, what
-        assert version_of(made, KEYS[0]) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "write", _full)
+        with pytest.raises(OSError, match="No space"):
+            made.save(KEYS[0], chunk(made, KEYS[0], 2))
+    assert sorted(folder.names()) == names
+    assert version_of(made, KEYS[0]) == 1
     made.save(KEYS[0], chunk(made, KEYS[0], 2))
+    made.flush()
+    assert sorted(folder.names()) == names
     assert version_of(made, KEYS[0]) == 2
     folder.close()
+
+
+@pytest.mark.parametrize("what", ["sync", "rename", "sync_names"])
+def test_what_a_disk_does_not_flush_is_kept_and_written_again(
+    monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """After a flush that failed, what the kernel had may be gone: the second one has nothing of it."""
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    for key in KEYS:
+        made.save(key, chunk(made, key, 1))
+    made.flush()
+    names = sorted(disk.names())
+    for key in KEYS:
+        made.save(key, chunk(made, key, 2))
+    unflushed = made.unflushed_bytes
+    with monkeypatch.context() as patch:
+        calls = [0]
+
+        def at_the_second(*arguments: str) -> None:
+            calls[0] += 1
+            if calls[0] == 2 or what == "sync_names":
+                _full()
+            getattr(CutDisk, what)(disk, *arguments)
+
+        patch.setattr(disk, what, at_the_second)
+        with pytest.raises(OSError, match="No space"):
+            made.flush()
+    assert [version_of(made, key) for key in KEYS] == [2, 2, 2]
+    assert made.unflushed_bytes == unflushed
+    made.save(KEYS[1], chunk(made, KEYS[1], 3))
+    written = noted(monkeypatch, disk, "write")
+    made.flush()
+    assert len(written) == 2, "those that nothing newer has come for"
+    assert sorted(disk.names()) == names
+    assert made.unflushed_bytes == 0
+    assert [version_of(MapFiles(disk, SETTINGS), key) for key in KEYS] == [2, 3, 2]
+
+
+def test_what_is_saved_often_is_flushed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    for version in (1, 2, 3):
+        made.save(KEYS[0], chunk(made, KEYS[0], version))
+        assert len([name for name in disk.names() if name.endswith(".tmp")]) == 1
+        assert version_of(made, KEYS[0]) == version
+    synced = noted(monkeypatch, disk, "sync")
+    made.flush()
+    assert len(synced) == 1
+    assert "0_0_0.chunk" in disk.names()
+
+
+def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The older one gets its place, the newer one is for the next time."""
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 1))
+
+    def meanwhile(name: str) -> None:
+        CutDisk.sync(disk, name)
+        made.save(KEYS[0], chunk(made, KEYS[0], 2))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(disk, "sync", meanwhile)
+        made.flush()
+    assert version_of(made, KEYS[0]) == 2
+    assert made.unflushed_bytes
+    made.write_manifest()
+    assert made.unflushed_bytes == 0
+    assert sorted(disk.names()) == ["0_0_0.chunk", "manifest.json", "map.json"]
+    assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 2
 
 
 def test_what_was_not_flushed_is_flushed_later(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,6 +286,18 @@ def test_what_cannot_be_read_just_now_is_not_put_aside(
 
 def _full(*_: object) -> None:
     raise OSError(28, os.strerror(28))
+
+
+def noted(monkeypatch: pytest.MonkeyPatch, disk: CutDisk, what: str) -> list[str]:
+    """Names of files with which something is done from now on."""
+    found: list[str] = []
+
+    def do(name: str, *more: bytes) -> None:
+        found.append(name)
+        getattr(CutDisk, what)(disk, name, *more)
+
+    monkeypatch.setattr(disk, what, do)
+    return found
 
 
 class Drive:

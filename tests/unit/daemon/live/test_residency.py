@@ -8,6 +8,7 @@ import math
 import pytest
 
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.durability import TOGETHER_S
 from shmmap.daemon.live.records import Chunk, Limits, Scan, State
 from shmmap.daemon.live.residency import RETRY_S, REVIEW_S, Residency
 
@@ -162,11 +163,12 @@ def test_a_change_is_saved_in_time_the_oldest_first() -> None:
     for number in range(3):
         one.move(number, (number + 0.5, 0.5, 0.5))
         chunks.append(written(one, ChunkKey(number, 0, 0), float(number)))
-    assert one.next_save(9.9) is None
-    assert one.next_event_s(9.9) == 10.0
-    assert one.next_save(10.0) is chunks[0]
-    assert one.next_save(10.0) is None
-    assert one.next_save(10.0, everything=True) is chunks[1]
+    in_time = PLENTY.checkpoint_s - TOGETHER_S  # it is durable when it was flushed
+    assert one.next_save(in_time - 0.1) is None
+    assert one.next_event_s(in_time - 0.1) == in_time
+    assert one.next_save(in_time) is chunks[0]
+    assert one.next_save(in_time) is None
+    assert one.next_save(in_time, everything=True) is chunks[1]
 
 
 def test_a_chunk_that_is_written_while_it_is_saved_is_dirty_again() -> None:
@@ -178,8 +180,9 @@ def test_a_chunk_that_is_written_while_it_is_saved_is_dirty_again() -> None:
     apply(one, chunk, 20.0)
     assert one.next_save(99.0, everything=True) is None, "one save of a chunk at a time"
     one.saved(chunk, 1, 21.0)
-    assert one.next_save(30.9) is None
-    assert one.next_save(31.0) is chunk
+    in_time = 21.0 + PLENTY.checkpoint_s - TOGETHER_S
+    assert one.next_save(in_time - 0.1) is None
+    assert one.next_save(in_time) is chunk
     one.saved(chunk, 2, 31.0)
     assert one.next_save(99.0, everything=True) is None, "it is clean"
 
@@ -196,7 +199,9 @@ def test_durable_is_what_was_flushed() -> None:
         chunk = one.next_save(0.0, everything=True)
         assert chunk is not None
         one.saved(chunk, 1, 0.0)
-    assert one.flush_is_due
+    assert not one.flush_is_due(0.0), "more may come"
+    assert one.flush_is_due(TOGETHER_S)
+    assert one.flush_is_due(0.0, everything=True)
     assert len(first.to_save) == 2
     assert flush(one) == [first]
     assert first.to_save == {}
@@ -412,3 +417,45 @@ def test_what_was_given_up_is_missing_until_it_is_flushed() -> None:
     durability.flushed()
     assert durability.missing(one.chunks.values()) == []
     assert chunk.durable == 1
+
+
+# --- giving up many ------------------------------------------------------------------------------
+
+
+def test_where_memory_is_short_nobody_waits_for_the_next_review() -> None:
+    """Scans that come from elsewhere each: what they need takes the place of the last one's at once."""
+    one = Residency(Limits(40, radius=0, loads=100, saves=100), new_bytes=10)
+    for number in range(20):
+        keys = [ChunkKey(10 * number + at, 0, 0) for at in range(4)]
+        scan = scan_of(*keys, number=number + 1)
+        one.add(scan)
+        for _ in range(20):
+            while (dirty := one.next_save(0.0)) is not None:
+                one.saved(dirty, dirty.version, 0.0)
+            while (lease := one.next_eviction(0.0)) is not None:
+                one.released(lease)
+            while (chunk := one.next_load(0.0)) is not None:
+                one.loaded(chunk, version=0, nbytes=10, active=0)
+            for ready, _ in one.ready():
+                apply(one, ready)
+        assert scan.applied, "at the same moment as all others"
+
+
+def test_giving_up_is_not_a_search_each_time() -> None:
+    """Of so many chunks each is looked at a few times, not once for every other one."""
+    one = Residency(Limits(10**9, radius=0, loads=10**6, linger_s=0.0))
+    for number in range(2000):
+        one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)
+    looked = [0]
+    may_go = one._may_go
+
+    def counted(chunk: Chunk, now_s: float, *, short: bool) -> bool:
+        looked[0] += 1
+        return may_go(chunk, now_s, short=short)
+
+    one._may_go = counted  # type: ignore[method-assign]
+    gone = 0
+    while one.next_eviction(1.0) is not None:
+        gone += 1
+    assert gone == 2000
+    assert looked[0] <= 3 * 2000

@@ -14,6 +14,7 @@ from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.checking import CheckedMap, check, repair
+from shmmap.daemon.live.disk.map_record import write_rows
 from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
 from shmmap.daemon.live.folder import Folder, FolderToRead
 from shmmap.daemon.live.map_files import MapFiles
@@ -207,9 +208,9 @@ def _spoil(manifest: Path) -> None:
 
 def _forget_one(manifest: Path) -> None:
     folder = Folder(manifest.parent)
-    files = MapFiles(folder, SETTINGS)
-    files.rows.popitem()
-    files.write_manifest()
+    rows = dict(MapFiles(folder, SETTINGS).rows)
+    rows.popitem()
+    write_rows(folder, rows)
     folder.close()
 
 
