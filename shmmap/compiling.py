@@ -52,8 +52,10 @@ def read_only(dtype: Any, dimensions: int) -> Any:
     return numba.types.Array(dtype, dimensions, "C", readonly=True)
 
 
-def compiled(*signatures: Any) -> Callable[[F], F]:
+def compiled(*signatures: Any, brief: bool = False) -> Callable[[F], F]:
     """Compile a kernel for these signatures now; it runs without the interpreter lock.
+
+    One that is ``brief`` keeps it: to get it back among other threads takes longer than some microseconds.
 
     Without a signature it is compiled when it is first called with arguments of new types.
     """
@@ -64,7 +66,7 @@ def compiled(*signatures: Any) -> Callable[[F], F]:
             # numba chooses a function's cache when it is decorated, by this process-wide setting
             _config.CACHE_DIR = str(_DIRECTORY) if _DIRECTORY is not None else before
             dispatcher = numba.njit(
-                list(signatures) or None, nogil=True, cache=_DIRECTORY is not None, error_model="numpy"
+                list(signatures) or None, nogil=not brief, cache=_DIRECTORY is not None, error_model="numpy"
             )(function)
         finally:
             _config.CACHE_DIR = before

@@ -19,7 +19,7 @@ _ONE: Final = np.uint64(1)
 _trailing_zeros: Any = numbers.trailing_zeros
 
 
-@compiled(types.int64(read_only(uint16, 1), read_only(uint16, 1), uint16[::1]))
+@compiled(types.int64(read_only(uint16, 1), read_only(uint16, 1), uint16[::1]), brief=True)
 def touched_bricks(index: Any, words: Any, touched: Any) -> Any:
     """Find the bricks that words lie in.
 
@@ -69,7 +69,8 @@ def _add(index: Any, cells: Any, word: Any, bits: Any, step: Any, limits: Any, c
     types.void(
         uint16[::1], int16[::1], read_only(uint16, 1), read_only(uint64, 1), int64, read_only(int64, 1),
         int64[::1],
-    )
+    ),
+    brief=True,
 )  # fmt: skip
 def add_evidence(index: Any, cells: Any, words: Any, bits: Any, hits: Any, limits: Any, counts: Any) -> None:
     """Add the evidence of one scan to a chunk; ``cells`` has room for the bricks that become known.
@@ -102,14 +103,14 @@ def _typed_fence(_context: Any) -> Any:
 _fence: Any = intrinsic(_typed_fence)
 
 
-@compiled(types.void(uint64[::1]))
+@compiled(types.void(uint64[::1]), brief=True)
 def begin_writing(sequence: Any) -> None:
     """Make the sequence, (1,), odd before anything else changes."""
     sequence[0] |= _ONE
     _fence()
 
 
-@compiled(types.void(uint64[::1]))
+@compiled(types.void(uint64[::1]), brief=True)
 def end_writing(sequence: Any) -> None:
     """Make it the next even number after everything else has changed."""
     _fence()

@@ -9,6 +9,8 @@ error here and not a signal later.  A file never gets shorter.
 from __future__ import annotations
 
 import contextlib
+import errno
+import mmap
 import os
 import re
 from collections.abc import Iterator
@@ -83,8 +85,8 @@ class ChunkFile:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes."""
-        return os.fstat(self._fd).st_blocks * 512
+        """Memory that it takes: what the file has, in whole pages."""
+        return -(-len(self.view.data) // mmap.PAGESIZE) * mmap.PAGESIZE
 
     def grow(self, bricks: int) -> ChunkView:
         """Make room for so many bricks, at least.
@@ -100,11 +102,15 @@ class ChunkFile:
             self.view = view_at(self._address, size)
         return self.view
 
-    def close(self) -> None:
-        """Unmap it; nothing of ``view`` may be used any more."""
+    def unmap(self) -> int:
+        """Unmap it; nothing of ``view`` may be used any more.  Returns its descriptor."""
         self.view = ChunkView(bytearray(HEADER_BYTES))
         unmap_chunk(self._address)
-        os.close(self._fd)
+        return self._fd
+
+    def close(self) -> None:
+        """Unmap it; nothing of ``view`` may be used any more."""
+        os.close(self.unmap())
 
 
 class ChunkMemory:
@@ -156,8 +162,8 @@ class ChunkMemory:
         name = self.name(identity.key, identity.generation)
         fd = os.open(".", os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600, dir_fd=self._fd)
         try:
-            os.posix_fallocate(fd, 0, len(content))
-            os.pwrite(fd, content, 0)
+            if os.pwrite(fd, content, 0) != len(content):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             if self._gid >= 0:
                 os.fchown(fd, -1, self._gid)
             os.fchmod(fd, self._mode)
@@ -211,9 +217,7 @@ class ChunkMemory:
         chunk.view.state["state"] = OUT_OF_SERVICE
         name = chunk.name + _GONE
         os.rename(chunk.name.lstrip("/"), name.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
-        kept = os.dup(chunk._fd)
-        chunk.close()
-        return GivenUp(name, kept)
+        return GivenUp(name, chunk.unmap())
 
     def given_up(self) -> Iterator[tuple[ChunkKey, GivenUp]]:
         """What an earlier writer gave up, and readers may still map."""
