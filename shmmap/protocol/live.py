@@ -237,6 +237,8 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
         The longest file of marks.
     probabilities
         The six that the log-odds stand for, as they were set.
+    applied
+        All scans of the mapper up to this one are in the map: at least.
     """
 
     request: int
@@ -257,6 +259,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     next_scan: int = 1
     most_marks_bytes: int = 0
     probabilities: tuple[float, ...] = ()
+    applied: int = 0
 
 
 class LiveApplied(msgspec.Struct, array_like=True, tag="live_applied"):

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -21,7 +23,7 @@ from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
 import shmmap
 from tests.support.daemon_process import DaemonProcess
-from tests.support.live_daemon import LiveDaemon
+from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, reference
 from tests.support.patience import Patience
@@ -88,6 +90,46 @@ def words(tmp_path: Path) -> Words:
         return ["run", "--live", "lidar", *files, *LIMITS, "--endpoint", one.endpoint, *more]
 
     return make
+
+
+@pytest.mark.parametrize("ended", ["killed", "stopped"])
+def test_a_run_goes_on_where_it_was(
+    live_daemon: LiveDaemon, words: Words, tmp_path: Path, ended: str
+) -> None:
+    """The program ends in the middle, and the worker or the daemon after it; scans keep their numbers."""
+    one = live_daemon()
+    whole = words(one, "--json", scans=12)
+    half = tmp_path / "half"
+    (half / "scans").mkdir(parents=True)
+    for path in sorted((tmp_path / "drive12" / "scans").iterdir()):
+        if int(path.stem.removeprefix("scan_")) < 5:
+            (half / "scans" / path.name).symlink_to(path)
+    first = [word.replace("drive12/scans", "half/scans") for word in whole]
+    assert run(*first, "--wait", "0").returncode == 0
+    if ended == "killed":
+        os.kill(worker_of(one), signal.SIGKILL)
+    else:
+        assert one.stop() == 0
+        one.start()
+    done = run(*whole, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert "5 scans are in the map, 7 are left" in done.stderr
+    said = json.loads(done.stdout)
+    assert [said[name] for name in ("scans", "first_scan", "last_scan", "applied")] == [7, 6, 12, 12]
+    assert on_disk(one) == expected(read_drive(tmp_path / "drive12"))
+    again = run(*whole, "--resume")
+    assert again.returncode == 0
+    assert "12 scans are in the map, 0 are left" in again.stderr
+    assert on_disk(one) == expected(read_drive(tmp_path / "drive12"))
+
+
+def test_a_publishers_scans_are_not_resumed(live_daemon: LiveDaemon) -> None:
+    one = live_daemon()
+    done = run(
+        "run", "--live", "lidar", "--scans", "tcp://127.0.0.1:9", "--resume", "--endpoint", one.endpoint
+    )
+    assert done.returncode == 2
+    assert "--resume is for a directory" in done.stderr
 
 
 def test_a_drive_from_files(live_daemon: LiveDaemon, words: Words, tmp_path: Path) -> None:

@@ -59,13 +59,13 @@ def marked(scans: int = SCANS) -> list[Marks]:
     return [marker.mark(points, pose)[0] for points, pose in drive(scans)]
 
 
-def undo_in(shm: Path) -> UndoRecord:
-    """The undo record in shared memory, made if there is none."""
-    fd = os.open(shm / "undo", os.O_RDWR | os.O_CREAT, 0o600)
-    os.ftruncate(fd, UNDO_BYTES)
-    data = mmap.mmap(fd, UNDO_BYTES)
+def record_in(shm: Path, name: str, nbytes: int) -> mmap.mmap:
+    """Something in shared memory that outlives whoever writes it, made of zeros if there is none."""
+    fd = os.open(shm / name, os.O_RDWR | os.O_CREAT, 0o600)
+    os.ftruncate(fd, nbytes)
+    data = mmap.mmap(fd, nbytes)
     os.close(fd)
-    return UndoRecord(data)
+    return data
 
 
 def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tuple[LiveMap, Folder]:
@@ -73,7 +73,10 @@ def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tup
     folder = Folder(disk)
     limits = Limits(budget, linger_s=0.05, checkpoint_s=checkpoint_s, waiting_bytes=1)
     made = LiveMap(
-        MapFiles(folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")), undo_in(shm), limits
+        MapFiles(folder, SETTINGS),
+        ChunkMemory(str(shm), live_prefix("test", "lidar")),
+        UndoRecord(record_in(shm, "undo", UNDO_BYTES)),
+        limits,
     )
     try:
         adopt(made, time.monotonic())

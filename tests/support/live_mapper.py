@@ -29,7 +29,7 @@ def main() -> None:
     """Send scans, one after the other."""
     endpoint, first, last = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     all_marks, poses = marked(), [pose for _, pose in drive()]
-    sender = _Sender(endpoint, "lidar", "front", "", PATIENCE_S, PATIENCE_S)
+    sender = _Sender(endpoint, "lidar", "front", "", PATIENCE_S, PATIENCE_S, resume=False)
     opened = sender.opened
     for number in range(first, last + 1):
         data = encode_marks(marks_of(number, all_marks), opened.map_id, opened.mapper, number)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
 from shmmap.chunks.marks import Marks, encode_marks
 from shmmap.chunks.voxels import voxels_of
 from shmmap.daemon.config_live import LiveSettings
@@ -18,11 +19,12 @@ from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.messages import Ask
 from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
 from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.served_map import ServedMap
 from shmmap.daemon.live.worker.voxel_lists import VoxelLists
 from shmmap.protocol import live as messages
-from tests.support.live_drive import RESOLUTION, SETTINGS, undo_in
+from tests.support.live_drive import RESOLUTION, SETTINGS, record_in
 from tests.support.patience import Patience
 from tests.support.slow_occupancy import Voxel
 
@@ -45,14 +47,15 @@ class Served:
         self._folder = Folder(disk)
         self.live = LiveMap(
             MapFiles(self._folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")),
-            undo_in(shm), Limits(budget_bytes, **limits),
+            UndoRecord(record_in(shm, "undo", UNDO_BYTES)), Limits(budget_bytes, **limits),
         )  # fmt: skip
         lists = VoxelLists(self.live, str(shm), 0o600, -1)
         lists.remove_all()
         adopt(self.live, 0.0)
         self.marks = MarksDirectory(str(shm / "marks"))
         settings = LiveSettings("lidar", str(disk), resolution=RESOLUTION)
-        self.map = ServedMap(settings, self.live, lists, self.marks, self._answer)
+        applied = AppliedScans(record_in(shm, "applied", APPLIED_BYTES))
+        self.map = ServedMap(settings, self.live, lists, self.marks, applied, self._answer)
 
     def _answer(self, ticket: int, reply: Any) -> None:
         assert ticket not in self.answers, "nothing is answered twice"

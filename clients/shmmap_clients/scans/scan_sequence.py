@@ -94,6 +94,10 @@ class ScanSequence:
     def __len__(self) -> int:
         return len(self.files)
 
+    def leave_out(self, count: int) -> None:
+        """Begin after so many scans."""
+        del self.files[:count], self._rows[:count]
+
     def __iter__(self) -> Iterator[Scan]:
         for path, row in zip(self.files, self._rows, strict=True):
             columns = read_scan_fields(path)

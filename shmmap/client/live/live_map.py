@@ -88,7 +88,12 @@ class LiveMap:
         return f"<LiveMap {self.name}, voxels of {self.resolution} m in frame {self.frame_id}>"
 
     def mapper(
-        self, name: str, scan_filter: ScanFilter | None = None, *, timeout_s: float = 60.0
+        self,
+        name: str,
+        scan_filter: ScanFilter | None = None,
+        *,
+        resume: bool = False,
+        timeout_s: float = 60.0,
     ) -> LiveMapper:
         """Send scans to this map.
 
@@ -98,6 +103,10 @@ class LiveMap:
             Which mapper this is, at most 64 characters: each program that maps has its own, and keeps it.
         scan_filter
             Which points count.
+        resume
+            For a program that gives the same scans in the same order each time, from files: the next scan is
+            the one after `LiveMapper.applied`, which the program begins with. Should it begin earlier,
+            scans get numbers that they did not have, and count again.
         timeout_s
             How long a scan may take until it is applied, a restart of the daemon included.
 
@@ -111,7 +120,9 @@ class LiveMap:
         with needed_packages("mapping"):
             from shmmap.client.live.mapper import LiveMapper  # imports compiled kernels
 
-        return LiveMapper(self._session, self.name, name, self.frame_id, scan_filter, timeout_s)
+        return LiveMapper(
+            self._session, self.name, name, self.frame_id, scan_filter, timeout_s, resume=resume
+        )
 
     def move_to(self, x: float, y: float, z: float) -> None:
         """Say where this process is, metres in the map's frame: chunks around it stay in memory."""

@@ -71,8 +71,9 @@ class _Sender:
     """
 
     def __init__(
-        self, path: str, live_map: str, name: str, frame_id: str, connect_s: float, timeout_s: float
-    ) -> None:
+        self, path: str, live_map: str, name: str, frame_id: str, connect_s: float, timeout_s: float,
+        *, resume: bool,
+    ) -> None:  # fmt: skip
         self._map, self._name, self._frame_id, self._timeout_s = live_map, name, frame_id, timeout_s
         self.changed = threading.Condition()
         self.error: ShmmapError | None = None
@@ -84,7 +85,7 @@ class _Sender:
         except BaseException:
             self._connection.close()
             raise
-        self.applied = self.durable = self.opened.next_scan - 1
+        self.applied = self.durable = self.opened.applied if resume else self.opened.next_scan - 1
         self._thread = threading.Thread(target=self._run, name=f"mapper {name}", daemon=True)
         self._thread.start()
 
@@ -193,14 +194,16 @@ class LiveMapper:
 
     def __init__(
         self, session: Session, live_map: str, name: str, frame_id: str, scan_filter: ScanFilter | None,
-        timeout_s: float,
+        timeout_s: float, *, resume: bool,
     ) -> None:  # fmt: skip
         if not name:
             raise BadRequest("a mapper needs a name", hint="one that the program keeps: 'front_lidar'")
         self.name = name
         self.counts = Counts(0, 0, 0, 0, 0)
         self._timeout_s = timeout_s
-        sender = self._sender = _Sender(session.path, live_map, name, frame_id, session.timeout_s, timeout_s)
+        sender = self._sender = _Sender(
+            session.path, live_map, name, frame_id, session.timeout_s, timeout_s, resume=resume
+        )
         # also when nobody calls close(), and at the end of the program
         self._end = weakref.finalize(self, sender.end, patience_s=LAST_S)
         self._marker = Marker(sender.opened.resolution, scan_filter)
@@ -256,7 +259,7 @@ class LiveMapper:
 
     @property
     def applied(self) -> int:
-        """Highest number of a scan that is in the map: no death of a process takes it out."""
+        """All scans up to this one are in the map: no death of a process takes them out."""
         return self._sender.applied
 
     @property

@@ -288,9 +288,9 @@ class LiveMap:
         if self.problems.pop(what, ""):
             log.info(f"chunks are {what} again")
 
-    def list_files(self) -> None:
-        """Have the manifest written, beside the rest."""
-        self._start(self.files.write_manifest, then=self._listed)
+    def list_files(self, applied: dict[int, int]) -> None:
+        """Have the manifest written, beside the rest; what is ``applied`` is durable."""
+        self._start(self.files.write_manifest, applied, then=self._listed)
 
     def _listed(self, future: Future[None], now_s: float) -> None:
         del now_s

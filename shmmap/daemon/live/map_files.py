@@ -83,6 +83,8 @@ class MapFiles:
         Files that were put aside since the start, and why.
     missing : dict
         Chunks that were durable and are not there any more, or only in an older version.
+    applied : dict
+        Up to which scan of each mapper, by its number, all are durable, as far as the manifest says.
     unflushed_bytes : int
         What is written and not durable takes so much memory here.
 
@@ -102,6 +104,7 @@ class MapFiles:
         self.damaged: dict[str, str] = {}
         self.missing: dict[ChunkKey, Row] = {}
         self.unflushed_bytes = 0
+        self.applied: dict[int, int] = {}
         self._written: dict[ChunkKey, _Written] = {}
         self._durable: dict[ChunkKey, Row] = {}
         self._changing, self._flushing = threading.Lock(), threading.Lock()
@@ -276,10 +279,15 @@ class MapFiles:
                     with contextlib.suppress(OSError):
                         self.files.remove(one.interim)
 
-    def write_manifest(self) -> None:
-        """Make durable what was saved, and list it."""
+    def write_manifest(self, applied: dict[int, int] | None = None) -> None:
+        """Make durable what was saved, and list it.
+
+        ``applied`` says up to which scan of each mapper all are durable; None where it is not known.
+        """
         self.flush()
-        write_rows(self.files, dict(self._durable))
+        if applied is not None:
+            self.applied = {**self.applied, **applied}
+        write_rows(self.files, dict(self._durable), self.applied)
 
     # --- the start ------------------------------------------------------------------------------
 
@@ -333,7 +341,8 @@ class MapFiles:
         listed: dict[str, Row] = {}
         if MANIFEST in names:
             with contextlib.suppress(msgspec.MsgspecError):  # it is written anew
-                listed = msgspec.json.decode(self.files.read(MANIFEST), type=Manifest).chunks
+                manifest = msgspec.json.decode(self.files.read(MANIFEST), type=Manifest)
+                listed, self.applied = manifest.chunks, manifest.applied
         for text, row in listed.items():
             with contextlib.suppress(BadRequest):
                 key = ChunkKey.from_text(text)

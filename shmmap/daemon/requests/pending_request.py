@@ -31,8 +31,8 @@ CELLS_A_STEP: Final = 32
 MOST_OF_A_SESSION: Final = 64
 """Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
 MOST_REQUESTS: Final = 16_384
-MOST_CELLS_OF_A_PROCESS: Final = 40_000
-MOST_CELLS: Final = 400_000
+MOST_CELLS_OF_A_PROCESS: Final = 20_000
+MOST_CELLS: Final = 200_000
 """Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
 
 OVERDUE_AT_ONCE: Final = 256

@@ -156,6 +156,7 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             5,
             9,
             (0.7, 0.4),
+            77,
         ),
         [
             "live_opened",
@@ -177,11 +178,12 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             5,
             9,
             [0.7, 0.4],
+            77,
         ],
         (
-            "dc0013ab6c6976655f6f70656e656402c41000000000000000000000000000000000cb3fc9999999"
+            "dc0014ab6c6976655f6f70656e656402c41000000000000000000000000000000000cb3fc9999999"
             "99999aa36d6170cd034fd1fe6bd1f838cd0d940000a82f6465762f73686da32f702ecfffffffffff"
-            "ffffffa22f6d01050992cb3fe6666666666666cb3fd999999999999a"
+            "ffffffa22f6d01050992cb3fe6666666666666cb3fd999999999999a4d"
         ),
     ),
     (

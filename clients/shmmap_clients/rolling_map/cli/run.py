@@ -85,6 +85,12 @@ def add_parser(subparsers: Any) -> None:
         help=f"name under which scans are counted: each running program needs its own (default: {_NAME})",
     )
     parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="begin after the scans of this directory that are in the map already: where a run of the same"
+        " command was killed, or ended by a restart",
+    )
+    parser.add_argument(
         "--frame",
         metavar="ID",
         help="frame of the poses: another one than the map's is refused (default: as --params says, else the"
@@ -114,13 +120,21 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Map the scans to their end."""
+    from shmmap import BadRequest
     from shmmap_clients.rolling_map.drive import map_drive
     from shmmap_clients.rolling_map.statistics import DriveStatistics
+    from shmmap_clients.scans.scan_sequence import ScanSequence
     from shmmap_clients.scans.scan_source import open_scans
+    from shmmap_clients.streams import is_endpoint
 
     parameters = parameters_from(args)
     shown = shown_from(args, parameters)
     scan_filter = scan_filter_from(args, parameters)
+    if args.resume and is_endpoint(args.scans):
+        raise BadRequest(
+            "--resume is for a directory of scans",
+            hint="leave it out: a publisher's scans count as they come",
+        )
     statistics = DriveStatistics()
     with contextlib.ExitStack() as stack:
         scans = open_scans(args.scans, args.poses, stack)
@@ -128,7 +142,10 @@ def run(args: argparse.Namespace) -> int:
         live = client.live(args.live, frame_id=_frame(args, parameters))
         if parameters is not None:
             parameters.check_map(live)
-        mapper = stack.enter_context(live.mapper(args.mapper, scan_filter))
+        mapper = stack.enter_context(live.mapper(args.mapper, scan_filter, resume=args.resume))
+        if isinstance(scans, ScanSequence) and args.resume:
+            scans.leave_out(mapper.applied)
+            print_line(f"{mapper.applied} scans are in the map, {len(scans)} are left", file=sys.stderr)
         announce_scans(args)
         for mapped in map_drive(scans, mapper):
             statistics.add(mapped)
@@ -167,6 +184,8 @@ def _settled(args: argparse.Namespace, mapper: LiveMapper, statistics: DriveStat
     from shmmap import NoAnswer
 
     last = statistics.last
+    if last is None and args.resume and mapper.applied:
+        return 0  # an earlier run had come to the end
     if last is None:
         return nothing_found(args, f"no scan came from {args.scans}", name=_NAME)
     if args.wait > 0:

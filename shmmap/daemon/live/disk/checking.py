@@ -189,5 +189,5 @@ def repair(files: Files, found: CheckedMap) -> None:
     for one in found.damaged:
         one.kept_as = keep_aside(files, one.file)
     if found.manifest != "current" and not found.unreadable:
-        write_rows(files, found.rows)
+        write_rows(files, found.rows, {})  # who plays scans again brings back what was damaged
         found.rewritten = True

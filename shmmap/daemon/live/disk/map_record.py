@@ -110,10 +110,19 @@ class MapRecord(msgspec.Struct):
 
 
 class Manifest(msgspec.Struct):
-    """``manifest.json``."""
+    """``manifest.json``.
+
+    Attributes
+    ----------
+    chunks
+        Those that are durable.
+    applied
+        Up to which scan of each mapper, by its number, all are durable: at least.
+    """
 
     format: int
     chunks: dict[str, Row]
+    applied: dict[int, int] = {}
 
 
 def read_map(files: FilesToRead) -> MapRecord:
@@ -136,8 +145,8 @@ def read_map(files: FilesToRead) -> MapRecord:
     return found
 
 
-def write_rows(files: Files, rows: Mapping[ChunkKey, Row]) -> None:
-    """Write the manifest: these chunks are durable."""
-    listed = Manifest(MAP_FORMAT, {key.text: row for key, row in rows.items()})
+def write_rows(files: Files, rows: Mapping[ChunkKey, Row], applied: dict[int, int]) -> None:
+    """Write the manifest: these chunks, and all scans of mappers up to these, are durable."""
+    listed = Manifest(MAP_FORMAT, {key.text: row for key, row in rows.items()}, applied)
     replace_file(files, MANIFEST, msgspec.json.encode(listed))
     files.sync_names()

@@ -29,6 +29,7 @@ from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles, MapSettings
 from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
 from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.served_map import ServedMap
 from shmmap.daemon.live.worker.voxel_lists import VoxelLists
@@ -87,10 +88,10 @@ class _Worker:
         memory = ChunkMemory(wanted.shm_dir, prefix, mode=mode, gid=wanted.gid)
         self._closing.callback(memory.close)
         files = MapFiles(folder, _fixed(settings))
-        self._closing.callback(_forget_undo, wanted.shm_dir + prefix, memory)
+        self._closing.callback(_forget_records, wanted.shm_dir + prefix, memory)
         live = LiveMap(
-            files, memory, _undo_record(wanted.shm_dir + prefix + "undo"), _limits(settings, budget),
-            usual_codec(), on_work_done=self._wake,
+            files, memory, UndoRecord(_record(wanted.shm_dir + prefix + "undo", UNDO_BYTES)),
+            _limits(settings, budget), usual_codec(), on_work_done=self._wake,
         )  # fmt: skip
         lists = VoxelLists(live, wanted.shm_dir, mode, wanted.gid)
         lists.remove_all()
@@ -99,7 +100,8 @@ class _Worker:
             "live map in memory", map=settings.name, path=settings.path, chunks=found,
             files=len(live.files.rows), damaged=len(live.files.damaged), missing=len(live.files.missing),
         )  # fmt: skip
-        return ServedMap(settings, live, lists, marks, self._answer)
+        applied = AppliedScans(_record(wanted.shm_dir + prefix + "applied", APPLIED_BYTES))
+        return ServedMap(settings, live, lists, marks, applied, self._answer)
 
     def _wake(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -232,15 +234,16 @@ def _limits(settings: LiveSettings, budget_bytes: int) -> Limits:
     )  # fmt: skip
 
 
-def _forget_undo(prefix: str, memory: ChunkMemory) -> None:
-    """Remove the undo record where no chunk is left that it could be for."""
+def _forget_records(prefix: str, memory: ChunkMemory) -> None:
+    """Remove what is kept of chunks in memory where there is none any more."""
     if not list(memory.names()):
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(prefix + "undo")
+        for name in ("undo", "applied"):
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(prefix + name)
 
 
-def _undo_record(path: str) -> UndoRecord:
-    """The undo record in shared memory, made if there is none."""
+def _record(path: str, nbytes: int) -> mmap.mmap:
+    """A file in shared memory that outlives this process, made of zeros if there is none."""
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     fd = os.open(path, flags, 0o600)
     try:
@@ -250,8 +253,8 @@ def _undo_record(path: str) -> UndoRecord:
                 f"{path} is not a file of this user, but of user {status.st_uid}",
                 hint="remove it, or choose another name for the instance",
             )
-        os.posix_fallocate(fd, 0, UNDO_BYTES)
-        return UndoRecord(mmap.mmap(fd, UNDO_BYTES))
+        os.posix_fallocate(fd, 0, nbytes)
+        return mmap.mmap(fd, nbytes)
     finally:
         os.close(fd)
 

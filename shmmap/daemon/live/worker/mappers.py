@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from shmmap.chunks.layout import MAPPERS
 from shmmap.daemon.live.map_files import MapFiles, Mapper
+from shmmap.daemon.live.worker.applied_scans import AppliedScans
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 
 __all__ = ["ActiveMapper", "Mappers"]
@@ -28,11 +29,11 @@ class ActiveMapper:
     session
         Who maps under it now; 0: nobody.
     last
-        Highest number of a scan that was taken in.
+        Highest number of a scan that was taken in; in an earlier life, that is known to be in the map.
     used
         Order of use: the greatest was used last.
-    unsaved
-        Scans that were taken in and are not durable.
+    unapplied, unsaved
+        Scans that were taken in and are not applied, and not durable.
     """
 
     mapper: Mapper
@@ -40,7 +41,13 @@ class ActiveMapper:
     session: int = 0
     last: int = 0
     used: int = 0
+    unapplied: set[int] = field(default_factory=set)
     unsaved: set[int] = field(default_factory=set)
+
+    @property
+    def applied(self) -> int:
+        """All scans up to this one are in the map."""
+        return min(self.unapplied) - 1 if self.unapplied else self.last
 
     @property
     def durable(self) -> int:
@@ -51,10 +58,14 @@ class ActiveMapper:
 class Mappers:
     """The mappers of one map."""
 
-    def __init__(self, files: MapFiles) -> None:
+    def __init__(self, files: MapFiles, record: AppliedScans) -> None:
         self._files = files
+        self._record = record
         self._uses = 0
-        self.by_number = {one.number: ActiveMapper(one, one.scans + 1) for one in files.mappers}
+        self.by_number: dict[int, ActiveMapper] = {}
+        for one in files.mappers:
+            last = max(record.of(one.number), files.applied.get(one.number, 0))
+            self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
         """Let a session map under a name; one that did before does not any more.
@@ -91,6 +102,17 @@ class Mappers:
         oldest = min(idle, key=lambda one: one.used)
         self._files.forget_mapper(oldest.mapper)
         del self.by_number[oldest.mapper.number]
+
+    def taken(self, active: ActiveMapper, scan: int) -> None:
+        """A scan is on its way into the map; it may have come before."""
+        active.unapplied.add(scan)
+        active.unsaved.add(scan)
+        active.last = max(active.last, scan)
+
+    def applied(self, active: ActiveMapper, scan: int) -> None:
+        """A scan is in the map."""
+        active.unapplied.discard(scan)
+        self._record.note(active.mapper.number, active.applied, self.by_number)
 
     def next_scan(self, active: ActiveMapper) -> int:
         """The least number that a new scan may have: no earlier one, of any life, had it."""

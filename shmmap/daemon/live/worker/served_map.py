@@ -18,6 +18,7 @@ from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import MOST_OF_A_SESSION, Ask
 from shmmap.daemon.live.records import Chunk, Scan, State
 from shmmap.daemon.live.windows import place_ahead
+from shmmap.daemon.live.worker.applied_scans import AppliedScans
 from shmmap.daemon.live.worker.changes import Changes
 from shmmap.daemon.live.worker.mappers import Mappers
 from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
@@ -57,7 +58,7 @@ class ServedMap:
 
     Parameters
     ----------
-    live
+    live, applied
         In memory, with what an earlier life left.
     answer
         Takes a ticket and the reply to it.
@@ -69,12 +70,13 @@ class ServedMap:
         live: LiveMap,
         lists: VoxelLists,
         marks: MarksDirectory,
+        applied: AppliedScans,
         answer: Callable[[int, _Reply], None],
     ) -> None:
         self.settings = settings
         self.live = live
         self.changes = Changes(time.time_ns())
-        self.mappers = Mappers(live.files)
+        self.mappers = Mappers(live.files, applied)
         self.readers = Readers(live, self.changes, lists, answer)
         self._marks = marks
         self._answer = answer
@@ -134,6 +136,7 @@ class ServedMap:
             _require_mapper(ask)
             active = self._on_disk(lambda: self.mappers.open(ask.uid, message.mapper, ask.session))
             reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
+            reply.applied = active.applied
             reply.marks_dir, reply.most_marks_bytes = self._marks.path, MOST_MARKS_BYTES
         return reply
 
@@ -182,8 +185,7 @@ class ServedMap:
             return
         data = self._marks.take(message.marks, message.bytes, ask.session, ask.uid)
         marks = decode_marks(data, self.live.files.map_id, message.mapper, message.scan)
-        active.last = max(active.last, message.scan)
-        active.unsaved.add(message.scan)
+        self.mappers.taken(active, message.scan)
         self._tickets[message.mapper, message.scan] = [(ask.ticket, message.request)]
         self.live.add(message.mapper, message.scan, marks, message.bytes)
 
@@ -215,8 +217,11 @@ class ServedMap:
 
     def _on_applied(self, scan: Scan) -> None:
         self._scans += 1
+        durable = 0
         active = self.mappers.by_number.get(scan.mapper)
-        durable = active.durable if active is not None and self._earlier_is_durable() else 0
+        if active is not None:
+            self.mappers.applied(active, scan.number)
+            durable = active.durable if self._earlier_is_durable() else 0
         for ticket, request in self._tickets.pop((scan.mapper, scan.number), ()):
             self._answer(ticket, messages.LiveApplied(request, scan.number, durable))
 
@@ -230,6 +235,11 @@ class ServedMap:
         active = self.mappers.by_number.get(scan.mapper)
         if active is not None:
             active.unsaved.discard(scan.number)
+
+    def _durable_scans(self) -> dict[int, int]:
+        """Up to which scan of each mapper all are on the disk, as far as is known."""
+        known = self._earlier_is_durable()
+        return {number: one.durable for number, one in self.mappers.by_number.items()} if known else {}
 
     def _refuse(self, ask: Ask, request: int, error: ShmmapError) -> None:
         self._answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))
@@ -260,7 +270,7 @@ class ServedMap:
             self._leases_s = now_s + LEASES_S
         if now_s >= self._manifest_s and self.changes.number != self._listed:
             self._manifest_s, self._listed = now_s + MANIFEST_S, self.changes.number
-            self.live.list_files()
+            self.live.list_files(self._durable_scans())
 
     def next_turn_s(self, now_s: float) -> float:
         """When the next turn is due, if nothing happens before."""
@@ -310,7 +320,7 @@ class ServedMap:
         unsaved = sum(chunk.version > chunk.saved for chunk in self.live.residency.chunks.values())
         if not keep and not unsaved:
             try:
-                self.live.files.write_manifest()
+                self.live.files.write_manifest(self._durable_scans())
             except OSError as error:
                 log.warning("manifest not written", map=self.settings.name, reason=error.strerror)
             self.live.remove_from_memory()

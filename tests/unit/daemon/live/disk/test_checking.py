@@ -210,7 +210,7 @@ def _forget_one(manifest: Path) -> None:
     folder = Folder(manifest.parent)
     rows = dict(MapFiles(folder, SETTINGS).rows)
     rows.popitem()
-    write_rows(folder, rows)
+    write_rows(folder, rows, {})
     folder.close()
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from shmmap.chunks.layout import MAPPERS
 from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings
+from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
 from shmmap.daemon.live.worker.mappers import Mappers
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 from tests.support.cut_disk import CutDisk
@@ -23,8 +24,14 @@ def disk() -> CutDisk:
 
 
 @pytest.fixture
-def mappers(disk: CutDisk) -> Mappers:
-    return Mappers(MapFiles(disk, SETTINGS))
+def memory() -> bytearray:
+    """What outlives a worker."""
+    return bytearray(APPLIED_BYTES)
+
+
+@pytest.fixture
+def mappers(disk: CutDisk, memory: bytearray) -> Mappers:
+    return Mappers(MapFiles(disk, SETTINGS), AppliedScans(memory))
 
 
 def test_a_user_and_a_name_are_one_mapper(mappers: Mappers) -> None:
@@ -95,12 +102,54 @@ def test_what_is_durable(mappers: Mappers) -> None:
     assert active.durable == 4
 
 
+def test_a_later_life_knows_what_is_in_the_map(disk: CutDisk, memory: bytearray, mappers: Mappers) -> None:
+    """Up to the last scan before which none is missing, in whatever order they were applied."""
+    front, rear = mappers.open(1000, "front", 1), mappers.open(1000, "rear", 2)
+    for scan in (1, 2, 3, 4):
+        mappers.taken(front, scan)
+    for scan, then in ((2, 0), (1, 2), (4, 2)):
+        mappers.applied(front, scan)
+        assert front.applied == then
+    mappers.taken(rear, 9)
+    mappers.applied(rear, 9)
+    later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(memory))
+    assert (later.open(1000, "front", 1).applied, later.open(1000, "rear", 2).applied) == (2, 9)
+    assert later.open(1000, "new", 3).applied == 0
+
+
+def test_without_memory_the_manifest_says_what_is_in_the_map(disk: CutDisk, mappers: Mappers) -> None:
+    front = mappers.open(1000, "front", 1)
+    files = MapFiles(disk, SETTINGS)
+    files.write_manifest({front.mapper.number: 7})
+    files.write_manifest(None)  # nothing new is known
+    for record, applied in ((bytearray(APPLIED_BYTES), 7), (_noted(front.mapper.number, 12), 12)):
+        later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(record))
+        assert later.open(1000, "front", 1).applied == applied
+
+
+def _noted(mapper: int, scan: int) -> bytearray:
+    memory = bytearray(APPLIED_BYTES)
+    AppliedScans(memory).note(mapper, scan, {mapper})
+    return memory
+
+
+def test_rows_of_mappers_that_gave_way_are_used_again() -> None:
+    record = AppliedScans(bytearray(APPLIED_BYTES))
+    known = set(range(1, MAPPERS + 1))
+    for mapper in known:
+        record.note(mapper, 10 * mapper, known)
+    record.note(100, 7, known | {100})
+    assert record.of(100) == 0, "there is no room, and nothing is lost by that"
+    record.note(100, 7, (known - {5}) | {100})
+    assert (record.of(100), record.of(5), record.of(6)) == (7, 0, 60)
+
+
 def test_a_later_life_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Mappers) -> None:
     """Also when one of an earlier life comes again first: of those after it nothing is known."""
     front = mappers.open(1000, "front", 1)
     for scan in range(1, 8):
         mappers.expect(front.mapper.number, scan, 1).last = scan
-    later = Mappers(MapFiles(disk, SETTINGS))
+    later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(bytearray(APPLIED_BYTES)))
     active = later.open(1000, "front", 1)
     assert active.mapper.number == front.mapper.number
     first = later.next_scan(active)

@@ -12,7 +12,7 @@ import pytest
 
 from shmmap.chunks.applying import UNDO_BYTES
 from shmmap.daemon.live import messages
-from shmmap.daemon.live.worker.main import HEARD_AT_ONCE, _undo_record, _Worker
+from shmmap.daemon.live.worker.main import HEARD_AT_ONCE, _record, _Worker
 from shmmap.errors import CannotStart
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import channel
@@ -46,9 +46,9 @@ def test_answers_wait_for_a_daemon_that_is_busy() -> None:
 
 def test_the_undo_record_is_made_and_found_again(tmp_path: Path) -> None:
     path = tmp_path / "undo"
-    _undo_record(str(path))._data[100:103] = b"abc"
+    _record(str(path), UNDO_BYTES)[100:103] = b"abc"
     assert (path.stat().st_size, path.stat().st_mode & 0o777) == (UNDO_BYTES, 0o600)
-    assert bytes(_undo_record(str(path))._data[100:103]) == b"abc"
+    assert bytes(_record(str(path), UNDO_BYTES)[100:103]) == b"abc"
 
 
 @pytest.mark.root
@@ -58,14 +58,14 @@ def test_an_undo_record_of_somebody_else_is_not_used(tmp_path: Path) -> None:
     path.write_bytes(bytes(UNDO_BYTES))
     os.chown(path, MEMBER, -1)
     with pytest.raises(CannotStart, match=f"but of user {MEMBER}"):
-        _undo_record(str(path))
+        _record(str(path), UNDO_BYTES)
 
 
 def test_a_pipe_or_a_link_is_no_undo_record(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(CannotStart, match="is not a file"):
-        _undo_record(str(tmp_path / "pipe"))
+        _record(str(tmp_path / "pipe"), UNDO_BYTES)
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OSError, match="symbolic links"):
-        _undo_record(str(tmp_path / "link"))
+        _record(str(tmp_path / "link"), UNDO_BYTES)
     assert not (tmp_path / "elsewhere").exists()
