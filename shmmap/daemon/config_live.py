@@ -46,7 +46,7 @@ class LiveSettings(msgspec.Struct, frozen=True):
         Fixed when the map is made, see `shmmap.chunks.occupancy.Occupancy`.
     radius, hysteresis, linger_s, checkpoint_s, most_active
         What stays in memory, and for how long changes are there alone, see
-        `shmmap.daemon.live.records.Limits`.
+        `shmmap.daemon.live.paging.records.Limits`.
     """
 
     name: str

@@ -286,7 +286,9 @@ class LiveDurable(msgspec.Struct, array_like=True, tag="live_durable"):
 
 
 class LiveChunkRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """A chunk: ``state`` is ``loading``, ``clean``, ``dirty``, ``saving``, or ``saved`` for on disk alone.
+    """A chunk: ``state`` is ``loading``, ``clean``, ``dirty``, ``saving``, ``evicting`` or ``saved``.
+
+    ``evicting``: given up, and still mapped by readers; ``saved``: on disk alone.
 
     ``version`` rises with each scan that it takes in; ``bytes`` is its memory, or its file.
     """

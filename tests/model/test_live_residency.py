@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan, State
-from shmmap.daemon.live.residency import RETRY_S, Residency
+from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan, State
+from shmmap.daemon.live.paging.residency import RETRY_S, Residency
 
 NEW = 10
 MOST = 60
@@ -190,10 +190,10 @@ class LiveMap(RuleBasedStateMachine):
         )
         assert lease.nbytes == content.nbytes
 
-    @precondition(lambda self: self.map.leases)
+    @precondition(lambda self: self.map.leases.by_number)
     @rule(data=st.data())
     def release(self, data: st.DataObject) -> None:
-        self.map.released(data.draw(st.sampled_from(list(self.map.leases.values()))))
+        self.map.leases.end(data.draw(st.sampled_from(list(self.map.leases.by_number.values()))))
 
     # --- what always holds --------------------------------------------------------------------
 
@@ -205,7 +205,7 @@ class LiveMap(RuleBasedStateMachine):
         loading = {chunk.key: chunk.nbytes for chunk in self.loads}
         assert self.map.chunk_bytes == sum(sizes.values()) + sum(loading.values())
         assert self.map.active == sum(content.version % 4 for content in self.memory.values())
-        used = self.map.chunk_bytes + self.map.leased_bytes
+        used = self.map.chunk_bytes + self.map.leases.nbytes
         assert used <= self.limits.budget_bytes or self.map.chunk_bytes <= self.limits.reserve_bytes
         waiting = [scan for scan in self.scans if not scan.applied]
         assert self.map.waiting_bytes == 3 * len(waiting)
@@ -232,8 +232,8 @@ class LiveMap(RuleBasedStateMachine):
             if at_rest and all(scan.durable for scan in self.scans):
                 break
             if not self.limits.reserve_bytes:  # else what readers keep does not matter
-                for lease in list(self.map.leases.values()):
-                    self.map.released(lease)
+                for lease in list(self.map.leases.by_number.values()):
+                    self.map.leases.end(lease)
             self.begin_load()
             if self.loads:
                 self._end_load(self.loads.pop(), fails=False)

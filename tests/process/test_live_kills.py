@@ -32,7 +32,7 @@ from tests.support.patience import Patience
 
 KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "6"))
 SCANS_A_KILL = 12
-LONGEST_S = 0.4
+LONGEST_S = 0.03
 
 
 class Mapper:
@@ -129,7 +129,7 @@ def test_whoever_is_killed_whenever(keep: Callable[[], DaemonProcess]) -> None:
     rng.shuffle(order)
     try:
         for who in order[:KILLS]:
-            mapper.until(mapper.applied + 1)
+            mapper.until(mapper.applied + rng.randint(1, SCANS_A_KILL // 2))
             mapper.hear(rng.uniform(0.0, LONGEST_S))
             if mapper.done:
                 break

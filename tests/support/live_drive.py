@@ -30,7 +30,7 @@ from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles, MapSettings
-from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.paging.records import Limits
 from tests.support.slow_occupancy import Voxel
 
 RESOLUTION = 0.2
@@ -120,7 +120,7 @@ def main() -> None:
             made.move("mapper", tuple(poses[number - 1][:3, 3].tolist()))
             made.add(1, number, marks, 1)
         made.turn(time.monotonic(), time.time_ns(), save_all=not waiting)
-        most = max(most, made.residency.chunk_bytes + made.residency.leased_bytes)
+        most = max(most, made.residency.chunk_bytes + made.residency.leases.nbytes)
         made.wait(0.05)
     made.files.write_manifest()
     made.close()

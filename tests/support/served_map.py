@@ -18,7 +18,7 @@ from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.messages import Ask
-from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.paging.records import Limits
 from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
 from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.served_map import ServedMap
@@ -36,12 +36,15 @@ class Served:
 
     Attributes
     ----------
+    shm : Path
+        Directory of its shared memory.
     answers : dict
         By ticket; each asks under a number of its own, and the ticket is the same.
     """
 
     def __init__(self, shm: Path, disk: Path, budget_bytes: int = 10**9, **limits: Any) -> None:
         self.now_s = 0.0
+        self.shm = shm
         self.answers: dict[int, Any] = {}
         self._files = 0
         self._folder = Folder(disk)

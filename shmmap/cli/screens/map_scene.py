@@ -29,6 +29,7 @@ GLYPHS: Final = {
     "saved": (".", "bright_black"),
     "clean": ("#", "green"),
     "loading": ("l", "bright_black"),
+    "evicting": ("e", "yellow"),
     "saving": ("w", "cyan"),
     "dirty": ("d", "blue"),
     "window": ("o", "red"),

@@ -32,8 +32,8 @@ class ChunkInfo(msgspec.Struct, frozen=True):
     key
         Which one.
     state
-        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, or
-        ``saved``: on disk alone.
+        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, ``evicting`` (given up,
+        and still mapped by readers), or ``saved``: on disk alone.
     active, occupied, free
         Known voxels, and of these occupied and free ones.
     bytes

@@ -154,7 +154,7 @@ class LiveMap:
     # --- chunks ---------------------------------------------------------------------------------
 
     def chunks(self, area: geometry.Box | Sphere | None = None, *, saved: bool = False) -> list[ChunkInfo]:
-        """List chunks in memory, in the order of their keys.
+        """List chunks in memory, and on their way into it or out of it, in the order of their keys.
 
         Parameters
         ----------

@@ -27,8 +27,8 @@ from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, GivenUp, memory_bytes
 from shmmap.daemon.live.map_files import MapFiles
-from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan
-from shmmap.daemon.live.residency import RETRY_S, Residency
+from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan
+from shmmap.daemon.live.paging.residency import RETRY_S, Residency
 from shmmap.errors import MapDataError, PackageMissing
 from shmmap.logfmt import log
 
@@ -106,7 +106,7 @@ class LiveMap:
 
     def keep(self, key: ChunkKey, given_up: GivenUp) -> None:
         """Count what is out of service until nobody maps it."""
-        self.kept[self.residency.lease(key, given_up.nbytes).number] = given_up
+        self.kept[self.residency.leases.begin(key, given_up.nbytes).number] = given_up
 
     def take_over(self, chunk: ChunkFile, now_s: float) -> None:
         """A chunk is in memory since an earlier life of the writer, and whole."""
@@ -147,12 +147,12 @@ class LiveMap:
     def released(self, lease: Lease) -> None:
         """Nobody maps what was given up any more."""
         self.memory.forget(self.kept.pop(lease.number))
-        self.residency.released(lease)
+        self.residency.leases.end(lease)
 
     def look_at_leases(self) -> None:
         """Free what nobody maps any more."""
         for number in [number for number, kept in self.kept.items() if not kept.is_mapped]:
-            self.released(self.residency.leases[number])
+            self.released(self.residency.leases.by_number[number])
 
     # --- a turn ---------------------------------------------------------------------------------
 

@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-import threading
-from dataclasses import dataclass
 from typing import Final
 
 import msgspec
@@ -37,32 +35,16 @@ from shmmap.daemon.live.disk.map_record import (
     read_map,
     write_rows,
 )
-from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file, write_beside
+from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
+from shmmap.daemon.live.unflushed_files import UnflushedFiles
 from shmmap.errors import BadRequest, ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 
 __all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
 
-_UNFLUSHED_ENTRY: Final = 1 << 10
-"""What a file that is not flushed counts beside its bytes."""
 SCANS_AHEAD: Final = 1 << 20
 """Numbers of scans that ``map.json`` leaves to a mapper before it is written again: a day's, at 10 Hz."""
-
-
-@dataclass(eq=False, slots=True)
-class _Written:
-    """A chunk's file that has not got its name yet."""
-
-    interim: str
-    data: bytes
-    row: Row
-    is_flushed: bool = False  # just now
-    failed: bool = False
-
-    @property
-    def nbytes(self) -> int:
-        return len(self.data) + _UNFLUSHED_ENTRY
 
 
 class MapFiles:
@@ -85,8 +67,6 @@ class MapFiles:
         Chunks that were durable and are not there any more, or only in an older version.
     applied : dict
         Up to which scan of each mapper, by its number, all are durable, as far as the manifest says.
-    unflushed_bytes : int
-        What is written and not durable takes so much memory here.
 
     Raises
     ------
@@ -103,11 +83,9 @@ class MapFiles:
         self.rows: dict[ChunkKey, Row] = {}
         self.damaged: dict[str, str] = {}
         self.missing: dict[ChunkKey, Row] = {}
-        self.unflushed_bytes = 0
+        self._unflushed = UnflushedFiles(files)
         self.applied: dict[int, int] = {}
-        self._written: dict[ChunkKey, _Written] = {}
         self._durable: dict[ChunkKey, Row] = {}
-        self._changing, self._flushing = threading.Lock(), threading.Lock()
         names = files.names()
         if MAP_FILE in names:
             self._map = self._read_map(settings)
@@ -205,8 +183,8 @@ class MapFiles:
         """Read the file of a chunk; None where there is none.  Raises OSError."""
         if key not in self.rows:
             return None
-        written = self._written.get(key)
-        return written.data if written is not None else self.files.read(key.text + CHUNK)
+        unflushed = self._unflushed.get(key)
+        return unflushed if unflushed is not None else self.files.read(key.text + CHUNK)
 
     def put_aside(self, key: ChunkKey, why: str) -> str:
         """Keep a file that cannot be read under another name, which is returned."""
@@ -223,61 +201,18 @@ class MapFiles:
         When this returns, the chunk's memory may be freed: no death of a process loses it.
         """
         row = Row.of(read_file_header(data))
-        written = _Written(write_beside(self.files, key.text + CHUNK, data), data, row)
-        step("live.written")
-        with self._changing:
-            before = self._written.get(key)
-            self._written[key] = written
-            self.rows[key] = row
-            self.unflushed_bytes += written.nbytes - (before.nbytes if before is not None else 0)
-            needless = before is not None and not before.is_flushed
-        if before is not None and needless:
-            with contextlib.suppress(OSError):  # it may have its name; else it goes with the next start
-                self.files.remove(before.interim)
+        self._unflushed.write(key, data)
+        self.rows[key] = row
 
     def flush(self) -> None:
         """Make durable what was saved; what comes meanwhile is for the next time."""
-        with self._flushing:  # who comes second waits until it is so
-            with self._changing:
-                taken = dict(self._written)
-                for one in taken.values():
-                    one.is_flushed = True
-            if not taken:
-                return
-            try:
-                for key, one in taken.items():
-                    self._sync(key, one)
-                step("live.synced")
-                for key, one in taken.items():
-                    self.files.rename(one.interim, key.text + CHUNK)
-                    step("live.renamed")
-                self.files.sync_names()
-                step("live.flushed")
-            except OSError:
-                self._keep_for_later(taken)
-                raise
-            self._durable.update((key, one.row) for key, one in taken.items())
-            with self._changing:
-                for key, one in taken.items():
-                    if self._written.get(key) is one:
-                        del self._written[key]
-                        self.unflushed_bytes -= one.nbytes
+        for key, data in self._unflushed.flush().items():
+            self._durable[key] = Row.of(read_file_header(data))
 
-    def _sync(self, key: ChunkKey, one: _Written) -> None:
-        if one.failed:  # what the kernel could not write once it may have thrown away
-            old, one.interim = one.interim, write_beside(self.files, key.text + CHUNK, one.data)
-            with contextlib.suppress(FileNotFoundError):  # it had its name already
-                self.files.remove(old)
-        self.files.sync(one.interim)
-
-    def _keep_for_later(self, taken: dict[ChunkKey, _Written]) -> None:
-        """A flush came to nothing: all of it is written again, but what is newer by now."""
-        with self._changing:
-            for key, one in taken.items():
-                one.is_flushed, one.failed = False, True
-                if self._written.get(key) is not one:
-                    with contextlib.suppress(OSError):
-                        self.files.remove(one.interim)
+    @property
+    def unflushed_bytes(self) -> int:
+        """What is written and not durable takes so much memory here."""
+        return self._unflushed.nbytes
 
     def write_manifest(self, applied: dict[int, int] | None = None) -> None:
         """Make durable what was saved, and list it.

@@ -31,7 +31,14 @@ _JSON = """\
                "box": [min_x, min_y, min_z, max_x, max_y, max_z] in metres}]}
 Exit code: 0, 2 when there is no such map, or 69 when no daemon answers."""
 
-_COLOURS = {"clean": "green", "dirty": "blue", "saving": "cyan", "loading": "bright_black", "saved": "dim"}
+_COLOURS = {
+    "clean": "green",
+    "dirty": "blue",
+    "saving": "cyan",
+    "loading": "bright_black",
+    "evicting": "yellow",
+    "saved": "dim",
+}
 """Rolling-Bonxai's colours: clean green, dirty blue, not there yet dark."""
 _COLUMNS = (
     Column("CHUNK"),
@@ -55,8 +62,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="one live map, chunk by chunk",
         description="Show a live map and its chunks, cubes of 64 voxels a side.\n"
-        "STATE: loading; clean; dirty when it was changed since it was saved; saving; saved when it is on "
-        "the disk alone.\n"
+        "STATE: loading; clean; dirty when it was changed since it was saved; saving; evicting when it was "
+        "given up, and readers still map it; saved when it is on the disk alone.\n"
         "X, Y, Z: lower corner, metres, map frame.  CHANGES: how many scans changed it.",
         json=_JSON,
     )

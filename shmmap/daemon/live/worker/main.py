@@ -28,7 +28,7 @@ from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles, MapSettings
-from shmmap.daemon.live.records import Limits
+from shmmap.daemon.live.paging.records import Limits
 from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
 from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.served_map import ServedMap

@@ -7,12 +7,14 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 from shmmap.chunks.reading import KINDS
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.map_files import Row
 from shmmap.daemon.live.messages import Ask
+from shmmap.daemon.live.paging.records import State
 from shmmap.daemon.live.worker.changes import Changes
 from shmmap.daemon.live.worker.voxel_lists import VoxelLists, check_area, touches
 from shmmap.errors import BadRequest, CannotWrite, ShmmapError
@@ -20,6 +22,9 @@ from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
 
 __all__ = ["Readers"]
+
+NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
+"""Of a chunk that has no file."""
 
 
 @dataclass(eq=False, slots=True)
@@ -59,11 +64,11 @@ class Readers:
         since = message.since if known else 0
         keys = (key for key in live.chunks if not since or self.changes.is_newer(key, since))
         wanted: list[ChunkKey] = [key for key in keys if touches(message.area, key, resolution)]
-        if message.saved:
-            wanted += [
-                key for key in list(live.files.rows)  # other threads save
-                if key not in live.chunks and touches(message.area, key, resolution)
-            ]  # fmt: skip
+        others = set(list(live.files.rows) if message.saved else ())  # a copy: other threads save
+        if not since:
+            others |= self._given_up.keys()
+            others |= {key for key, one in live.residency.chunks.items() if one.state is State.LOADING}
+        wanted += [key for key in others if key not in live.chunks and touches(message.area, key, resolution)]
         if message.after is not None:
             wanted = [key for key in wanted if key > message.after]
         page = heapq.nsmallest(messages.MOST_CHUNK_ROWS, wanted)
@@ -80,16 +85,30 @@ class Readers:
 
     def _row(self, key: ChunkKey) -> messages.LiveChunkRow:
         there = self.live.chunks.get(key)
-        if there is None:
-            row = self.live.files.rows[key]
+        known = self.live.residency.chunks.get(key)
+        if there is None or known is None:
+            row = self.live.files.rows.get(key, NOTHING)
+            state_now, nbytes = "saved", row.bytes
+            if known is not None and known.state is State.LOADING:
+                state_now, nbytes = known.state.value, known.nbytes
+            elif (given_up := self._given_up.get(key)) is not None:
+                state_now, nbytes = "evicting", given_up
             return messages.LiveChunkRow(
-                key, 0, row.version, "saved", row.active, row.occupied, row.free, row.bytes
+                key, 0, row.version, state_now, row.active, row.occupied, row.free, nbytes
             )
-        state, known = there.view.state, self.live.residency.chunks[key]
+        state = there.view.state
         return messages.LiveChunkRow(
             key, there.view.identity.generation, int(state["version"]), known.state.value,
             int(state["active"]), int(state["occupied"]), int(state["free"]), known.nbytes,
         )  # fmt: skip
+
+    @property
+    def _given_up(self) -> dict[ChunkKey, int]:
+        """Bytes of chunks that are out of service, and that somebody still maps."""
+        found: dict[ChunkKey, int] = {}
+        for lease in self.live.residency.leases.by_number.values():
+            found[lease.key] = found.get(lease.key, 0) + lease.nbytes
+        return found
 
     def begin_list(self, ask: Ask, message: messages.LiveVoxels) -> None:
         """Begin a list of voxels; `go_on` answers it."""

@@ -16,8 +16,8 @@ from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import MOST_OF_A_SESSION, Ask
-from shmmap.daemon.live.records import Chunk, Scan, State
-from shmmap.daemon.live.windows import place_ahead
+from shmmap.daemon.live.paging.records import Chunk, Scan, State
+from shmmap.daemon.live.paging.windows import place_ahead
 from shmmap.daemon.live.worker.applied_scans import AppliedScans
 from shmmap.daemon.live.worker.changes import Changes
 from shmmap.daemon.live.worker.mappers import Mappers
@@ -294,7 +294,7 @@ class ServedMap:
             live.files.settings.frame_id, chunks=len(live.chunks), active=residency.active,
             bytes=residency.chunk_bytes, loading=states.count(State.LOADING),
             dirty=states.count(State.DIRTY), saving=states.count(State.SAVING),
-            evicting=len(residency.leases), evicting_bytes=residency.leased_bytes,
+            evicting=len(residency.leases.by_number), evicting_bytes=residency.leases.nbytes,
             waiting_bytes=residency.waiting_bytes, files=len(live.files.rows),
             file_bytes=sum(row.bytes for row in list(live.files.rows.values())), scans=self._scans,
             durable=self._durable, budget_bytes=live.limits.budget_bytes,

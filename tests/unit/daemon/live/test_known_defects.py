@@ -30,8 +30,8 @@ from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
 from shmmap.daemon.live.folder import Files, Folder
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles
-from shmmap.daemon.live.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.residency import Residency
+from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
+from shmmap.daemon.live.paging.residency import Residency
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.cut_disk import CutDisk
 from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, voxels_on_disk
@@ -78,7 +78,7 @@ class World:
         """One turn; no reader keeps what is given up."""
         self.now_s += 0.2
         self.map.turn(self.now_s, 1, save_all=save_all)
-        for lease in list(self.map.residency.leases.values()):
+        for lease in list(self.map.residency.leases.by_number.values()):
             self.map.released(lease)
 
     def send(self, marks: Marks, at: Position) -> Scan:

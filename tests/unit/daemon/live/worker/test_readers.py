@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
-from shmmap.chunks.layout import new_header
+from shmmap.chunks.layout import HEADER_BYTES, new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.map_files import Row
+from shmmap.daemon.live.paging.records import Scan
 from shmmap.daemon.live.worker import readers
 from shmmap.errors import BadRequest
 from shmmap.protocol import live as messages
@@ -96,6 +97,33 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
     assert found.since_known
     assert len(found.rows) == MOST_CHUNK_ROWS
     assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes where nobody has raised that"
+
+
+def test_chunks_on_their_way_in_and_out_are_listed(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Out: readers still map them; who asks what changed does not need to know, nor who maps chunks."""
+    out, back, coming = ChunkKey(1, 0, 0), ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
+    live = served.live
+    readers_of = []
+    for key in (out, back):
+        bring(served, key)
+        readers_of.append(open(f"{served.shm}{live.chunks[key].name}", "rb"))  # noqa: SIM115
+        live.keep(key, live.memory.give_up(live.chunks.pop(key)))
+        del live.residency.chunks[key]
+    bring(served, back, 2)
+    before = served.map.changes.number
+    live.residency.add(Scan(1, 1, 10, {coming}))
+    assert live.residency.next_load(0.0) is not None
+    found = {ChunkKey(*row.key): (row.state, row.generation, row.bytes) for row in page(served).rows}
+    assert found == {
+        out: ("evicting", 0, HEADER_BYTES),
+        back: ("clean", 2, HEADER_BYTES),
+        coming: ("loading", 0, HEADER_BYTES),
+    }
+    assert not page(served, since=before).rows
+    for reader in readers_of:
+        reader.close()
+    live.look_at_leases()
+    assert keys_of(page(served)) == [back, coming]
 
 
 def test_areas_and_kinds_that_make_no_sense(served: Served) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.records import Chunk, Scan
+from shmmap.daemon.live.paging.records import Chunk, Scan
 
 __all__ = ["Durability"]
 

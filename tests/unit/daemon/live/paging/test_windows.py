@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from shmmap.daemon.live.windows import place_ahead
+from shmmap.daemon.live.paging.windows import place_ahead
 
 
 @pytest.mark.parametrize(

@@ -20,18 +20,16 @@ from itertools import takewhile
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.durability import TOGETHER_S, Durability
-from shmmap.daemon.live.records import Chunk, Lease, Limits, Scan, State
-from shmmap.daemon.live.windows import Windows
+from shmmap.daemon.live.paging.durability import TOGETHER_S, Durability
+from shmmap.daemon.live.paging.leases import Leases
+from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan, State
+from shmmap.daemon.live.paging.victims import REVIEW_S, Victims
+from shmmap.daemon.live.paging.windows import Windows
 
 __all__ = ["Residency"]
 
 RETRY_S: Final = 1.0
 """How long after a file could not be read or written it is tried again."""
-REVIEW_S: Final = 0.1
-"""How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
-REVIEWED_OF_NEWS: Final = 32
-"""Where memory is short, they are also gone over when one in so many came or changed since."""
 
 
 class Residency:
@@ -50,8 +48,8 @@ class Residency:
         All that are in memory, or wanted there.
     leases
         What is out of service and may still be mapped.
-    chunk_bytes, leased_bytes, waiting_bytes
-        Memory of the two, and what waiting scans take.
+    chunk_bytes, waiting_bytes
+        Memory of chunks, and what waiting scans take.
     active
         Known voxels in memory.
     windows, durability
@@ -61,8 +59,8 @@ class Residency:
     def __init__(self, limits: Limits, *, new_bytes: int = 4096) -> None:
         self.limits = limits
         self.chunks: dict[ChunkKey, Chunk] = {}
-        self.leases: dict[int, Lease] = {}
-        self.chunk_bytes = self.leased_bytes = self.waiting_bytes = self.active = 0
+        self.leases = Leases()
+        self.chunk_bytes = self.waiting_bytes = self.active = 0
         self.loading = self.saving = 0
         self._new_bytes = new_bytes
         self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # then it is flushed
@@ -71,16 +69,13 @@ class Residency:
         self._missing: list[ChunkKey] = []  # near, not in memory; the nearest last
         self._needing: dict[ChunkKey, Chunk] = {}
         self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
-        self._victims: dict[State, list[Chunk]] = {State.CLEAN: [], State.DIRTY: []}  # the first last
-        self._review_s = self._save_s = -math.inf  # neither before
-        self._reviewed_short = False
-        self._news = 0  # what came, changed, or was saved since chunks were gone over
-        self._leases_given = 0
+        self._victims = Victims(self.chunks, self._may_go, self._leaves_last)
+        self._save_s = self._near_s = -math.inf  # not before: a file could not be written, or read
         self.durability = Durability()
 
     def _fits(self, more_bytes: int) -> bool:
         chunks = self.chunk_bytes + more_bytes
-        return chunks + self.leased_bytes <= self.limits.budget_bytes or chunks <= self.limits.reserve_bytes
+        return chunks + self.leases.nbytes <= self.limits.budget_bytes or chunks <= self.limits.reserve_bytes
 
     def _resize(self, chunk: Chunk, nbytes: int, active: int) -> None:
         self.chunk_bytes += nbytes - chunk.nbytes
@@ -101,7 +96,7 @@ class Residency:
         near = self.windows.near
         missing = (key for key in near if key not in self.chunks)
         self._missing = sorted(missing, key=near.__getitem__, reverse=True)
-        self._review_s = -math.inf
+        self._victims.look_again()
 
     def is_wanted(self, chunk: Chunk, now_s: float) -> bool:
         """Whether a chunk is to stay: a scan waits for it, it is near a client, or was just changed."""
@@ -156,7 +151,7 @@ class Residency:
         if not chunk.waiting:
             del self._needing[chunk.key]
         self._resize(chunk, nbytes, active)
-        self._news += 1
+        self._victims.news += 1
         chunk.missing_bytes, chunk.changed_s = 0, now_s
         if version > chunk.version:
             chunk.version = version
@@ -196,7 +191,7 @@ class Residency:
         for chunk in self._needing.values():
             if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes):
                 return self._begin_load(chunk)
-        if self._is_short(now_s):
+        if self._is_short(now_s) or now_s < self._near_s:
             return None
         while self._missing:
             key = self._missing[-1]
@@ -223,7 +218,7 @@ class Residency:
         self.loading -= 1
         chunk.under_way = False
         chunk.state = State.CLEAN
-        self._news += 1
+        self._victims.news += 1
         self._resize(chunk, nbytes, active)
         chunk.version = chunk.saved = version
         self.durability.note_loaded(chunk)
@@ -236,6 +231,8 @@ class Residency:
         chunk.retry_s = now_s + RETRY_S
         if not chunk.waiting:
             del self.chunks[chunk.key]
+            self._near_s = chunk.retry_s
+            self._missing[:0] = [chunk.key] if chunk.key in self.windows.near else []
 
     # --- saving ---------------------------------------------------------------------------------
 
@@ -255,40 +252,16 @@ class Residency:
             return False
         return short or not self.is_wanted(chunk, now_s)
 
+    def _leaves_last(self, chunk: Chunk, now_s: float) -> tuple[bool, bool, int, bool, int]:
+        """In which order chunks are given up, the first with the greatest: the furthest, the cleanest."""
+        return (
+            not chunk.waiting, not self.is_wanted(chunk, now_s), self.windows.distance(chunk.key),
+            chunk.state is State.CLEAN, -chunk.active,
+        )  # fmt: skip
+
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
         """What to give up next: unwanted ones, and where memory is short others, the furthest first."""
-        short = self._is_short(now_s)
-        if not any(self._victims.values()) and self._may_review(now_s, short=short):
-            self._review(now_s, short=short)
-        left = self._victims[state]
-        while left:
-            chunk = left.pop()
-            if (
-                chunk.state is state
-                and self.chunks.get(chunk.key) is chunk
-                and chunk.retry_s <= now_s
-                and self._may_go(chunk, now_s, short=short)
-            ):
-                return chunk
-        return None
-
-    def _may_review(self, now_s: float, *, short: bool) -> bool:
-        """Whether all chunks are gone over again: seldom, or where memory is short and much has happened."""
-        if short and (not self._reviewed_short or self._news * REVIEWED_OF_NEWS >= len(self.chunks)):
-            return True
-        return now_s >= self._review_s
-
-    def _review(self, now_s: float, *, short: bool) -> None:
-        self._review_s, self._reviewed_short, self._news = now_s + REVIEW_S, short, 0
-        found = sorted(
-            (chunk for chunk in self.chunks.values() if self._may_go(chunk, now_s, short=short)),
-            key=lambda chunk: (
-                not chunk.waiting, not self.is_wanted(chunk, now_s), self.windows.distance(chunk.key),
-                chunk.state is State.CLEAN, -chunk.active,
-            ),
-        )  # fmt: skip
-        for state, left in self._victims.items():
-            left[:] = (chunk for chunk in found if chunk.state is state)
+        return self._victims.next(state, now_s, short=self._is_short(now_s))
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
         """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
@@ -312,11 +285,11 @@ class Residency:
         self._sizes[chunk.key] = chunk.nbytes
         self.durability.note_written(chunk, version, now_s)
         chunk.state = State.CLEAN
-        self._news += 1
+        self._victims.news += 1
         if chunk.version > version:
             self._soil(chunk, now_s)
         elif chunk.leaving:
-            self._victims[State.CLEAN].append(chunk)
+            self._victims.saved(chunk)
 
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
         """A file could not be written: the chunk stays in memory, and is tried again."""
@@ -340,11 +313,11 @@ class Residency:
     # --- giving up ------------------------------------------------------------------------------
 
     def next_eviction(self, now_s: float) -> Lease | None:
-        """Give up a chunk that is as its file; its memory counts until `released`."""
+        """Give up a chunk that is as its file; its memory counts until its lease ends."""
         chunk = self._next_victim(now_s, State.CLEAN)
         if chunk is None:
             return None
-        lease = self.lease(chunk.key, chunk.nbytes)
+        lease = self.leases.begin(chunk.key, chunk.nbytes)
         self._resize(chunk, 0, 0)
         del self.chunks[chunk.key]
         if chunk.waiting:  # for another that comes first it gave way: later it is loaded again
@@ -355,23 +328,13 @@ class Residency:
             self._missing.insert(0, chunk.key)
         return lease
 
-    def lease(self, key: ChunkKey, nbytes: int) -> Lease:
-        """Count memory that is out of service and may still be mapped."""
-        self._leases_given += 1
-        lease = self.leases[self._leases_given] = Lease(key, self._leases_given, nbytes)
-        self.leased_bytes += nbytes
-        return lease
-
-    def released(self, lease: Lease) -> None:
-        """Nobody maps what was given up any more."""
-        del self.leases[lease.number]
-        self.leased_bytes -= lease.nbytes
-
     def next_event_s(self, now_s: float) -> float:
         """When there is something to do although nothing happens; infinity for never."""
         times = [chunk.retry_s for chunk in self._needing.values() if chunk.retry_s > now_s]
         if not self.durability.flushing:
             times.append(self.durability.due_s)
+        if self._missing and now_s < self._near_s:
+            times.append(self._near_s)
         if self._dirty and self.saving < self.limits.saves:  # else there is when one has been saved
             first = next(iter(self._dirty.values()))
             times.append(max(first.dirty_since_s + self._save_after_s, first.retry_s, self._save_s))

@@ -8,9 +8,10 @@ import math
 import pytest
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.durability import TOGETHER_S
-from shmmap.daemon.live.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.residency import RETRY_S, REVIEW_S, Residency
+from shmmap.daemon.live.paging.durability import TOGETHER_S
+from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
+from shmmap.daemon.live.paging.residency import RETRY_S, Residency
+from shmmap.daemon.live.paging.victims import REVIEW_S
 
 HERE = ChunkKey(0, 0, 0)
 PLENTY = Limits(budget_bytes=10**9, radius=0, loads=100, saves=100)
@@ -270,9 +271,9 @@ def test_a_dirty_chunk_is_saved_before_it_is_given_up() -> None:
     one.saved(chunk, 1, 5.0)
     lease = one.next_eviction(5.0)
     assert lease is not None
-    assert (lease.key, lease.nbytes, one.chunk_bytes, one.leased_bytes) == (HERE, 10, 0, 10)
-    one.released(lease)
-    assert (one.leased_bytes, one.leases) == (0, {})
+    assert (lease.key, lease.nbytes, one.chunk_bytes, one.leases.nbytes) == (HERE, 10, 0, 10)
+    one.leases.end(lease)
+    assert (one.leases.nbytes, one.leases.by_number) == (0, {})
 
 
 def test_too_many_known_voxels_are_too_many() -> None:
@@ -304,7 +305,7 @@ def test_room_that_was_made_for_one_is_not_another_s() -> None:
     for number in range(2):
         lease = one.next_eviction(5.0)
         assert lease is not None
-        one.released(lease)
+        one.leases.end(lease)
         assert one.next_load(5.0) is None, number
     assert one.may_grow(chunk, 15)
     apply(one, chunk, 5.0, grows=15)
@@ -318,7 +319,7 @@ def test_readers_cannot_keep_a_map_from_being_written() -> None:
         assert one.next_save(10.0 * number + 5.0) is chunk
         one.saved(chunk, 1, 10.0 * number + 5.0)
         assert one.next_eviction(10.0 * number + 5.0) is not None
-    assert one.leased_bytes == 40
+    assert one.leases.nbytes == 40
 
 
 def test_where_all_chunks_wait_for_room_some_give_way() -> None:
@@ -333,7 +334,7 @@ def test_where_all_chunks_wait_for_room_some_give_way() -> None:
     for _ in range(2):
         lease = one.next_eviction(5.0)
         assert lease is not None
-        one.released(lease)
+        one.leases.end(lease)
         gone.append(lease.key)
     stays = next(chunk for chunk in chunks if chunk.key not in gone)
     assert one.may_grow(stays, 20)
@@ -349,7 +350,7 @@ def test_nothing_is_due_while_a_chunk_is_loaded_or_has_no_room() -> None:
     assert one.next_load(5.0) is not None
     assert one.next_event_s(5.0) == 5.0 + REVIEW_S
     full = Residency(Limits(20, radius=0), new_bytes=10)
-    full.lease(ChunkKey(9, 9, 9), 20)
+    full.leases.begin(ChunkKey(9, 9, 9), 20)
     full.add(scan_of(HERE))
     assert full.next_load(5.0) is None
     assert full.next_event_s(5.0) == 5.0 + REVIEW_S
@@ -397,7 +398,7 @@ def test_what_has_no_memory_keeps_nobody_from_what_has() -> None:
     seen.append(one.is_ready)
     gone = one.next_eviction(9.0)
     assert gone is not None
-    one.released(gone)
+    one.leases.end(gone)
     seen.append(one.is_ready)
     assert seen == [True, False, True], "there is room now"
 
@@ -419,6 +420,19 @@ def test_what_was_given_up_is_missing_until_it_is_flushed() -> None:
     assert chunk.durable == 1
 
 
+def test_a_chunk_near_a_client_that_cannot_be_read_is_tried_again() -> None:
+    one = Residency(PLENTY)
+    one.move("a", (0.5, 0.5, 0.5))
+    chunk = one.next_load(5.0)
+    assert chunk is not None
+    one.load_failed(chunk, 5.0)
+    assert one.next_load(5.0 + 0.9 * RETRY_S) is None
+    assert one.next_event_s(5.0) == 5.0 + RETRY_S
+    again = one.next_load(5.0 + RETRY_S)
+    assert again is not None
+    assert again.key == HERE
+
+
 # --- giving up many ------------------------------------------------------------------------------
 
 
@@ -433,7 +447,7 @@ def test_where_memory_is_short_nobody_waits_for_the_next_review() -> None:
             while (dirty := one.next_save(0.0)) is not None:
                 one.saved(dirty, dirty.version, 0.0)
             while (lease := one.next_eviction(0.0)) is not None:
-                one.released(lease)
+                one.leases.end(lease)
             while (chunk := one.next_load(0.0)) is not None:
                 one.loaded(chunk, version=0, nbytes=10, active=0)
             for ready, _ in one.ready():
@@ -447,13 +461,12 @@ def test_giving_up_is_not_a_search_each_time() -> None:
     for number in range(2000):
         one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)
     looked = [0]
-    may_go = one._may_go
 
     def counted(chunk: Chunk, now_s: float, *, short: bool) -> bool:
         looked[0] += 1
-        return may_go(chunk, now_s, short=short)
+        return one._may_go(chunk, now_s, short=short)
 
-    one._may_go = counted  # type: ignore[method-assign]
+    one._victims._may_go = counted
     gone = 0
     while one.next_eviction(1.0) is not None:
         gone += 1
