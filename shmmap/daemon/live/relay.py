@@ -8,6 +8,7 @@ memory.  Who waited for an answer is told to ask again.
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import socket
 import subprocess
@@ -18,6 +19,7 @@ from typing import Final
 
 from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.live import messages
+from shmmap.daemon.live.tickets import Tickets
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
@@ -73,6 +75,14 @@ class NoLiveMaps:
     def beat(self, now_s: float) -> None:
         """Nothing has to be done."""
 
+    @property
+    def next_s(self) -> float:
+        """Never."""
+        return math.inf
+
+    def turn(self, now_s: float) -> None:
+        """Nothing has to be done."""
+
     def close(self, *, keep: bool) -> None:
         """Nothing has to be ended."""
 
@@ -113,10 +123,8 @@ class LiveRelay:
         self._channel: socket.socket | None = None
         self._buffer = packet_buffer()
         self._unsent: deque[bytes] = deque()
-        self._tickets: dict[int, tuple[Session, int]] = {}
-        self._waiting: dict[int, int] = {}  # by session
+        self._tickets = Tickets()
         self._askers: set[int] = set()
-        self._last_ticket = 0
         self._serving = False
         self._failures = 0
         self._start_s = self._served_s = 0.0
@@ -194,9 +202,8 @@ class LiveRelay:
 
     def _told(self, message: messages.FromLive) -> None:
         if isinstance(message, messages.Answer):
-            session, _ = self._tickets.pop(message.ticket, (None, 0))
+            session = self._tickets.take(message.ticket)
             if session is not None:
-                self._answered(session)
                 session.connection.reply(message.body)
         elif isinstance(message, messages.Status):
             self._events.told(message.maps)
@@ -209,13 +216,6 @@ class LiveRelay:
             log.error("live maps cannot be served", reason=message.message)
         elif isinstance(message, messages.Ended):
             self._unsaved = message.unsaved
-
-    def _answered(self, session: Session) -> None:
-        left = self._waiting.get(session.slot, 1) - 1
-        if left > 0:
-            self._waiting[session.slot] = left
-        else:
-            self._waiting.pop(session.slot, None)
 
     def _lost(self) -> None:
         """The worker has ended: tell who waits, and start another one soon."""
@@ -230,11 +230,17 @@ class LiveRelay:
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
-        error = LiveInterrupted("the process that keeps live maps ended, and is started anew")
-        tickets, self._tickets = self._tickets, {}
-        self._waiting.clear()
-        for session, request in tickets.values():
-            session.connection.refuse(request, error)
+        self._tickets.lose()
+
+    @property
+    def next_s(self) -> float:
+        """When those who wait for a worker that ended are told: at once, some at a time."""
+        return 0.0 if self._tickets.are_lost else math.inf
+
+    def turn(self, now_s: float) -> None:
+        """Tell some of them."""
+        del now_s
+        self._tickets.refuse_some()
 
     def _forget(self) -> None:
         if self._channel is not None:
@@ -265,26 +271,18 @@ class LiveRelay:
         """
         if len(body) > MOST_BYTES:
             raise BadRequest(f"a request about a live map has at most {MOST_BYTES} bytes")
-        waiting = self._waiting.get(session.slot, 0)
-        if waiting >= messages.MOST_OF_A_SESSION:
-            raise Busy(f"{waiting} requests of this session about live maps wait", hint="wait for some")
         if self._channel is None:
             raise LiveInterrupted("the process that keeps live maps is being started anew")
         if len(self._unsent) >= MOST_UNSENT:
             raise Busy("the process that keeps live maps hears nothing just now", hint="ask again")
         maps = self._may_map(session.peer, now_s)
         self._askers.add(session.slot)
-        self._last_ticket += 1
-        self._tickets[self._last_ticket] = session, message.request
-        self._waiting[session.slot] = waiting + 1
-        self._send(messages.Ask(self._last_ticket, session.slot, session.peer.uid, maps, bytes(body)))
+        ticket = self._tickets.give(session, message.request)
+        self._send(messages.Ask(ticket, session.slot, session.peer.uid, maps, bytes(body)))
 
     def left(self, session: Session) -> None:
         """A session has ended."""
-        if self._waiting.pop(session.slot, 0):
-            gone = [ticket for ticket, (asker, _) in self._tickets.items() if asker is session]
-            for ticket in gone:
-                del self._tickets[ticket]
+        self._tickets.left(session)
         if session.slot in self._askers:
             self._askers.discard(session.slot)
             if self._channel is not None:

@@ -21,6 +21,7 @@ from shmmap.daemon.live.relay import (
     PAUSES_S,
     LiveRelay,
 )
+from shmmap.daemon.live.tickets import REFUSED_AT_ONCE
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, CannotStart, ConfigError, LiveInterrupted
 from shmmap.processes.packets import packet_buffer, receive_packet
@@ -37,8 +38,9 @@ BEGIN = messages.Begin("test", (LiveSettings("lidar"),), "/dev/shm", "/dev/shm/m
 class Asker:
     """A session, with what it was answered and refused."""
 
-    def __init__(self, slot: int) -> None:
+    def __init__(self, slot: int, asker: int = 0) -> None:
         self.slot = slot
+        self.asker = asker or slot
         self.peer = SimpleNamespace(uid=1000, gid=1000, pid=slot)
         self.answered: list[bytes] = []
         self.refused: list[tuple[int, type[Exception]]] = []
@@ -99,6 +101,8 @@ class World:
     def die(self) -> None:
         self.workers[-1].close()
         self.relay.hear()
+        while self.relay.next_s <= self.now_s:
+            self.relay.turn(self.now_s)
 
     def ask(self, asker: Asker, request: int = 1) -> None:
         message = LiveMove(request, "lidar", (0.0, 0.0, 0.0))
@@ -128,7 +132,7 @@ def test_each_gets_its_own_answer(world: World) -> None:
     world.say(messages.Answer(first.ticket, b"again"))
     world.say(messages.Answer(999, b"for nobody"))
     assert (a.answered, b.answered) == ([b"for a"], [b"for b"])
-    assert (world.relay._tickets, world.relay._waiting) == ({}, {})
+    assert len(world.relay._tickets) == 0
 
 
 def test_a_session_waits_for_so_many_and_no_more(world: World) -> None:
@@ -154,7 +158,7 @@ def test_a_session_that_has_ended_is_answered_nothing(world: World) -> None:
     assert world.heard() == [messages.Left(1)], "of one that asked for nothing the worker knows nothing"
     world.say(messages.Answer(asked.ticket, b"x"))
     assert a.answered == []
-    assert (world.relay._tickets, world.relay._waiting, world.relay._askers) == ({}, {}, set())
+    assert (len(world.relay._tickets), world.relay._askers) == (0, set())
 
 
 def test_a_request_that_is_too_long(world: World) -> None:
@@ -284,3 +288,37 @@ def test_a_turn_of_the_loop_hears_a_bounded_number_of_messages(world: World) -> 
     assert len(told) == relay.HEARD_AT_ONCE
     world.relay.hear()
     assert len(told) == relay.HEARD_AT_ONCE + 3
+
+
+def test_a_process_waits_for_so_many_and_no_more_and_so_do_all(world: World) -> None:
+    """Whoever has very many sessions, or processes, keeps nobody else's answers from being waited for."""
+
+    def ask_all(askers: list[Asker]) -> None:
+        for asker in askers:
+            for number in range(messages.MOST_OF_A_SESSION):
+                world.ask(asker, number)
+                world.heard()
+
+    with pytest.raises(Busy, match="256 requests of this process"):
+        ask_all([Asker(slot, asker=7) for slot in range(1, 10)])
+    world.ask(Asker(100, asker=8))
+    with pytest.raises(Busy, match="4096 requests of all sessions"):
+        ask_all([Asker(slot) for slot in range(200, 300)])
+
+
+def test_very_many_that_wait_are_told_some_at_a_time(world: World) -> None:
+    askers = [Asker(slot) for slot in range(1, 11)]
+    for asker in askers:
+        for number in range(20):
+            world.ask(asker, number)
+    world.workers[-1].close()
+    world.relay.hear()
+    world.relay.left(askers[0])  # type: ignore[arg-type]
+    turns = 0
+    while world.relay.next_s <= world.now_s:
+        before = sum(len(asker.refused) for asker in askers)
+        world.relay.turn(world.now_s)
+        assert sum(len(asker.refused) for asker in askers) - before <= REFUSED_AT_ONCE
+        turns += 1
+    assert turns == 3
+    assert [len(asker.refused) for asker in askers] == [0] + [20] * 9
