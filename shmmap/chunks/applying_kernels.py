@@ -11,7 +11,7 @@ from numba.cpython.unsafe import numbers
 from numba.extending import intrinsic
 
 from shmmap.chunks.voxels import BRICK_VOXELS
-from shmmap.compiling import compiled, inlined, read_only
+from shmmap.compiling import compiled, read_only
 
 __all__ = ["add_evidence", "begin_writing", "end_writing", "touched_bricks"]
 
@@ -42,29 +42,6 @@ def touched_bricks(index: Any, words: Any, touched: Any) -> Any:
     return new
 
 
-@inlined
-def _add(index: Any, cells: Any, word: Any, bits: Any, step: Any, limits: Any, counts: Any) -> None:
-    low, high, occupied_above, free_below = limits[2], limits[3], limits[4], limits[5]
-    brick = word >> 2
-    if not index[brick]:
-        counts[0] += 1
-        index[brick] = counts[0]
-    base = (np.int64(index[brick]) - 1) * BRICK_VOXELS + (np.int64(word) & 3) * 64
-    active, occupied, free = 0, 0, 0
-    while bits:
-        at = base + np.int64(_trailing_zeros(bits))
-        bits &= bits - _ONE
-        before = np.int64(cells[at])
-        after = min(max(before + step, low), high)
-        cells[at] = after
-        active += np.int64(after != 0) - np.int64(before != 0)
-        occupied += np.int64(after > occupied_above) - np.int64(before > occupied_above)
-        free += np.int64(after < free_below) - np.int64(before < free_below)
-    counts[1] += active
-    counts[2] += occupied
-    counts[3] += free
-
-
 @compiled(
     types.void(
         uint16[::1], int16[::1], read_only(uint16, 1), read_only(uint64, 1), int64, read_only(int64, 1),
@@ -86,8 +63,26 @@ def add_evidence(index: Any, cells: Any, words: Any, bits: Any, hits: Any, limit
     counts
         (4,): bricks, and voxels that are known, occupied and free; brought up to date.
     """
+    low, high, occupied_above, free_below = limits[2], limits[3], limits[4], limits[5]
+    bricks, active, occupied, free = counts[0], counts[1], counts[2], counts[3]
     for n in range(words.shape[0]):
-        _add(index, cells, words[n], bits[n], limits[0] if n < hits else limits[1], limits, counts)
+        step = limits[0] if n < hits else limits[1]
+        word, left = words[n], bits[n]
+        brick = word >> 2
+        if not index[brick]:
+            bricks += 1
+            index[brick] = bricks
+        base = (np.int64(index[brick]) - 1) * BRICK_VOXELS + (np.int64(word) & 3) * 64
+        while left:
+            at = base + np.int64(_trailing_zeros(left))
+            left &= left - _ONE
+            before = np.int64(cells[at])
+            after = min(max(before + step, low), high)
+            cells[at] = after
+            active += np.int64(after != 0) - np.int64(before != 0)
+            occupied += np.int64(after > occupied_above) - np.int64(before > occupied_above)
+            free += np.int64(after < free_below) - np.int64(before < free_below)
+    counts[0], counts[1], counts[2], counts[3] = bricks, active, occupied, free
 
 
 def _typed_fence(_context: Any) -> Any:

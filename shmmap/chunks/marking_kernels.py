@@ -5,6 +5,9 @@ Voxels are counted from the corner of a window of chunks around the sensor.  The
 ``codes``, one an axis, is its place in its chunk in the lower 18 bits, and above them which of the window's
 chunks that is.  ``table`` says which slot of the bit sets each chunk of the window has, -1 for none yet.
 Both bit sets, (slots * 4096,), have a bit for each voxel of each slot, by its place in the chunk.
+
+What is done for each point or voxel stands in the loop: numba counts the references to arrays that an inlined
+function is given, each time, and that takes ten times as long as all else.
 """
 
 from __future__ import annotations
@@ -33,6 +36,10 @@ _CHUNK_BITS: Final = np.uint64(18)
 _NO_CHUNK: Final = np.uint64(2**40)
 _POINT: Final = np.uint64(32)
 _HALF: Final = 2**31
+_BLOCK: Final = 1024
+"""Points of which it is said together where they are: so the processor does several at a time."""
+_NEAR, _FAR, _TOO_NEAR, _OUTSIDE_Z, _NOT_FINITE = range(5)
+"""What counts of a point, in the order of `mark_ends`'s ``counts``."""
 
 
 def window_codes(side: int) -> NDArray[np.uint64]:
@@ -45,64 +52,37 @@ def window_codes(side: int) -> NDArray[np.uint64]:
 
 
 @inlined
-def _slot(table: Any, used: Any, chunk: Any, most: Any) -> Any:
-    """The slot of a chunk, a new one if it has none; -1 if there is none left."""
-    slot = table[chunk]
-    if slot < 0 and used[0] < most:
-        slot = used[0]
-        used[slot + 1] = chunk
-        used[0] = slot + 1
-        table[chunk] = slot
-    return slot
-
-
-@inlined
-def _mark_end(
-    i: Any, j: Any, k: Any, codes: Any, table: Any, used: Any, most: Any, which: Any, other: Any
-) -> Any:  # fmt: skip
-    """Mark where a ray ends, if neither set has it; 0 if one has, -1 if there is no slot left."""
-    code = codes[0, i] + codes[1, j] + codes[2, k]
-    slot = _slot(table, used, np.int64(code >> _CHUNK_BITS), most)
-    if slot < 0:
-        return -1
-    word = np.uint64(slot) * _WORDS + (code >> _SIX & _LOW_WORD)
-    bit = _ONE << (code & _LOW_BIT)
-    if (which[word] | other[word]) & bit:
-        return 0
-    which[word] |= bit
-    return 1
-
-
-@inlined
-def _walk(
-    steps: Any, u: Any, step_u: Any, code_u: Any, v: Any, step_v: Any, code_v: Any, delta_v: Any, w: Any,
-    step_w: Any, code_w: Any, delta_w: Any, table: Any, used: Any, most: Any, misses: Any,
-) -> Any:  # fmt: skip
-    """Mark a ray whose longest axis is u.
-
-    Along v and w the place has 32 bits behind the point, and half a step is added at the start: that is
-    Bonxai's walk with its errors as long as there are less than 2^15 steps, and no step waits for the one
-    before.  A step back is cut upwards where one forth is cut downwards.
-    """
-    by_v = ((delta_v << 32) + steps - 1) // max(steps, 1) * step_v
-    by_w = ((delta_w << 32) + steps - 1) // max(steps, 1) * step_w
-    at_u, by_u = np.uint64(u), np.uint64(step_u)
-    at_v, by_v = np.uint64((v << 32) + _HALF - np.int64(step_v < 0)), np.uint64(by_v)
-    at_w, by_w = np.uint64((w << 32) + _HALF - np.int64(step_w < 0)), np.uint64(by_w)
-    before, base = _NO_CHUNK, _ZERO
-    for _ in range(steps):
-        code = code_u[at_u] + code_v[at_v >> _POINT] + code_w[at_w >> _POINT]
-        chunk = code >> _CHUNK_BITS
-        if chunk != before:
-            slot = _slot(table, used, np.int64(chunk), most)
-            if slot < 0:
-                return False
-            base, before = np.uint64(slot) * _WORDS, chunk
-        misses[base + (code >> _SIX & _LOW_WORD)] |= _ONE << (code & _LOW_BIT)
-        at_u += by_u
-        at_v += by_v
-        at_w += by_w
-    return True
+def _place_points(
+    points: Any, begin: Any, size: Any, pose: Any, limits: Any, corner: Any, near: Any, place: Any
+) -> None:
+    """Say of some points whether they count, and in which voxels their rays end; nothing branches."""
+    inverse, low_z, high_z = limits[0], limits[3], limits[4]
+    nearest, furthest = limits[1] * limits[1], limits[2] * limits[2]
+    from_x, from_y, from_z = pose[0, 3], pose[1, 3], pose[2, 3]
+    for n in range(size):
+        # without this a float32 stays one, and points on a voxel's border fall elsewhere
+        px = np.float64(points[begin + n, 0])
+        py = np.float64(points[begin + n, 1])
+        pz = np.float64(points[begin + n, 2])
+        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + from_x
+        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + from_y
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + from_z
+        dx, dy, dz = x - from_x, y - from_y, z - from_z
+        squared = dx * dx + dy * dy + dz * dz
+        length = np.sqrt(squared)
+        far = squared >= furthest
+        x = from_x + dx / length * limits[2] if far else x
+        y = from_y + dy / length * limits[2] if far else y
+        z = from_z + dz / length * limits[2] if far else z
+        what = np.uint8(_FAR) if far else np.uint8(_NEAR)
+        what = np.uint8(_TOO_NEAR) if px * px + py * py + pz * pz < nearest else what
+        what = what if low_z <= pz <= high_z else np.uint8(_OUTSIDE_Z)
+        what = what if np.isfinite(px) & np.isfinite(py) & np.isfinite(pz) else np.uint8(_NOT_FINITE)
+        near[n] = what
+        counts = what <= np.uint8(_FAR)
+        place[0, n] = np.int32(np.floor(x * inverse) - corner[0]) if counts else 0
+        place[1, n] = np.int32(np.floor(y * inverse) - corner[1]) if counts else 0
+        place[2, n] = np.int32(np.floor(z * inverse) - corner[2]) if counts else 0
 
 
 @compiled(
@@ -141,54 +121,49 @@ def mark_ends(
     int
         How many ``ends`` there are, `NO_SLOTS` if there are too few slots.
     """
-    inverse, low_z, high_z = limits[0], limits[3], limits[4]
-    nearest, furthest = limits[1] * limits[1], limits[2] * limits[2]
-    from_x, from_y, from_z = pose[0, 3], pose[1, 3], pose[2, 3]
     rays, cut = 0, ends.shape[0]
-    for n in range(points.shape[0]):
-        # without this a float32 stays one, and points on a voxel's border fall elsewhere
-        px, py, pz = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
-        if not (np.isfinite(px) and np.isfinite(py) and np.isfinite(pz)):
-            counts[4] += 1
-            continue
-        if not (low_z <= pz <= high_z):
-            counts[3] += 1
-            continue
-        if px * px + py * py + pz * pz < nearest:
-            counts[2] += 1
-            continue
-        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + from_x
-        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + from_y
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + from_z
-        dx, dy, dz = x - from_x, y - from_y, z - from_z
-        squared = dx * dx + dy * dy + dz * dz
-        far = squared >= furthest
-        if far:
-            length = np.sqrt(squared)
-            x = from_x + dx / length * limits[2]
-            y = from_y + dy / length * limits[2]
-            z = from_z + dz / length * limits[2]
-        i = np.int64(np.floor(x * inverse)) - corner[0]
-        j = np.int64(np.floor(y * inverse)) - corner[1]
-        k = np.int64(np.floor(z * inverse)) - corner[2]
-        if far:  # what the others hit is not known yet: at the end of the array they wait for that
-            cut -= 1
-            ends[cut, 0], ends[cut, 1], ends[cut, 2] = i, j, k
-            counts[1] += 1
-            continue
-        counts[0] += 1
-        new = _mark_end(i, j, k, codes, table, used, most, hits, hits)
-        if new < 0:
-            return NO_SLOTS
-        if new:
-            ends[rays, 0], ends[rays, 1], ends[rays, 2] = i, j, k
-            rays += 1
+    near, place = np.empty(_BLOCK, np.uint8), np.empty((3, _BLOCK), np.int32)
+    for begin in range(0, points.shape[0], _BLOCK):
+        size = min(_BLOCK, points.shape[0] - begin)
+        _place_points(points, begin, size, pose, limits, corner, near, place)
+        for n in range(size):
+            what = near[n]
+            counts[what] += 1
+            if what > _FAR:
+                continue
+            if (
+                what == _FAR
+            ):  # what the others hit is not known yet: at the end of the array they wait for that
+                cut -= 1
+                ends[cut, 0], ends[cut, 1], ends[cut, 2] = place[0, n], place[1, n], place[2, n]
+                continue
+            i, j, k = place[0, n], place[1, n], place[2, n]
+            code = codes[0, i] + codes[1, j] + codes[2, k]
+            chunk = code >> _CHUNK_BITS
+            if table[chunk] < 0:
+                if used[0] >= most:
+                    return NO_SLOTS
+                used[used[0] + 1], table[chunk] = chunk, used[0]
+                used[0] += 1
+            word = np.uint64(table[chunk]) * _WORDS + (code >> _SIX & _LOW_WORD)
+            bit = _ONE << (code & _LOW_BIT)
+            if not hits[word] & bit:
+                hits[word] |= bit
+                ends[rays, 0], ends[rays, 1], ends[rays, 2] = i, j, k
+                rays += 1
     for n in range(cut, ends.shape[0]):
         i, j, k = ends[n, 0], ends[n, 1], ends[n, 2]
-        new = _mark_end(i, j, k, codes, table, used, most, misses, hits)
-        if new < 0:
-            return NO_SLOTS
-        if new:
+        code = codes[0, i] + codes[1, j] + codes[2, k]
+        chunk = code >> _CHUNK_BITS
+        if table[chunk] < 0:
+            if used[0] >= most:
+                return NO_SLOTS
+            used[used[0] + 1], table[chunk] = chunk, used[0]
+            used[0] += 1
+        word = np.uint64(table[chunk]) * _WORDS + (code >> _SIX & _LOW_WORD)
+        bit = _ONE << (code & _LOW_BIT)
+        if not (misses[word] | hits[word]) & bit:
+            misses[word] |= bit
             ends[rays, 0], ends[rays, 1], ends[rays, 2] = i, j, k
             rays += 1
     return rays
@@ -206,31 +181,73 @@ def mark_rays(
 ) -> Any:  # fmt: skip
     """Mark the voxels between the sensor's, included, and the ends, excluded.
 
-    The walk is Bonxai's ``RayIterator``: as many voxels as the longest axis has steps.  Returns whether there
-    were slots enough.
+    The walk is Bonxai's ``RayIterator``: as many voxels as the longest axis, u, has steps.  Along v and w the
+    place has 32 bits behind the point, and half a step is added at the start: that is Bonxai's walk with its
+    errors as long as there are less than 2^15 steps, and no step waits for the one before.  A step back is
+    cut upwards where one forth is cut downwards.  Returns whether there were slots enough.
     """
-    code_x, code_y, code_z = codes[0], codes[1], codes[2]
+    flat, side = codes.reshape(-1), codes.shape[1]
     for n in range(count):
         dx, dy, dz = ends[n, 0] - from_x, ends[n, 1] - from_y, ends[n, 2] - from_z
         step_x, step_y, step_z = (-1 if dx < 0 else 1), (-1 if dy < 0 else 1), (-1 if dz < 0 else 1)
         dx, dy, dz = abs(dx), abs(dy), abs(dz)
+        x, y, z = from_x, from_y + side, from_z + 2 * side  # in ``flat``
         if dx >= dy and dx >= dz:
-            enough = _walk(
-                dx, from_x, step_x, code_x, from_y, step_y, code_y, dy, from_z, step_z, code_z, dz, table,
-                used, most, misses,
-            )  # fmt: skip
+            steps, u, step_u, v, step_v, delta_v, w, step_w, delta_w = (
+                dx,
+                x,
+                step_x,
+                y,
+                step_y,
+                dy,
+                z,
+                step_z,
+                dz,
+            )
         elif dy >= dz:
-            enough = _walk(
-                dy, from_y, step_y, code_y, from_x, step_x, code_x, dx, from_z, step_z, code_z, dz, table,
-                used, most, misses,
-            )  # fmt: skip
+            steps, u, step_u, v, step_v, delta_v, w, step_w, delta_w = (
+                dy,
+                y,
+                step_y,
+                x,
+                step_x,
+                dx,
+                z,
+                step_z,
+                dz,
+            )
         else:
-            enough = _walk(
-                dz, from_z, step_z, code_z, from_x, step_x, code_x, dx, from_y, step_y, code_y, dy, table,
-                used, most, misses,
-            )  # fmt: skip
-        if not enough:
-            return False
+            steps, u, step_u, v, step_v, delta_v, w, step_w, delta_w = (
+                dz,
+                z,
+                step_z,
+                x,
+                step_x,
+                dx,
+                y,
+                step_y,
+                dy,
+            )
+        by_v = np.uint64(((delta_v << 32) + steps - 1) // max(steps, 1) * step_v)
+        by_w = np.uint64(((delta_w << 32) + steps - 1) // max(steps, 1) * step_w)
+        at_u, by_u = np.uint64(u), np.uint64(step_u)
+        at_v = np.uint64((v << 32) + _HALF - np.int64(step_v < 0))
+        at_w = np.uint64((w << 32) + _HALF - np.int64(step_w < 0))
+        before, base = _NO_CHUNK, _ZERO
+        for _ in range(steps):
+            code = flat[at_u] + flat[at_v >> _POINT] + flat[at_w >> _POINT]
+            chunk = code >> _CHUNK_BITS
+            if chunk != before:
+                if table[chunk] < 0:
+                    if used[0] >= most:
+                        return False
+                    used[used[0] + 1], table[chunk] = chunk, used[0]
+                    used[0] += 1
+                base, before = np.uint64(table[chunk]) * _WORDS, chunk
+            misses[base + (code >> _SIX & _LOW_WORD)] |= _ONE << (code & _LOW_BIT)
+            at_u += by_u
+            at_v += by_v
+            at_w += by_w
     return True
 
 
