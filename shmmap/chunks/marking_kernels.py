@@ -129,15 +129,16 @@ def mark_ends(
         for n in range(size):
             what = near[n]
             counts[what] += 1
-            if what > _FAR:
-                continue
-            if (
-                what == _FAR
-            ):  # what the others hit is not known yet: at the end of the array they wait for that
+            if what == _NEAR:
+                ends[rays, 0], ends[rays, 1], ends[rays, 2] = place[0, n], place[1, n], place[2, n]
+                rays += 1
+            elif what == _FAR:
                 cut -= 1
                 ends[cut, 0], ends[cut, 1], ends[cut, 2] = place[0, n], place[1, n], place[2, n]
-                continue
-            i, j, k = place[0, n], place[1, n], place[2, n]
+    first, end, rays = 0, rays, 0
+    for which in (hits, misses):  # where a ray is cut is a miss, if nothing was hit there
+        for n in range(first, end):
+            i, j, k = ends[n, 0], ends[n, 1], ends[n, 2]
             code = codes[0, i] + codes[1, j] + codes[2, k]
             chunk = code >> _CHUNK_BITS
             if table[chunk] < 0:
@@ -147,25 +148,11 @@ def mark_ends(
                 used[0] += 1
             word = np.uint64(table[chunk]) * _WORDS + (code >> _SIX & _LOW_WORD)
             bit = _ONE << (code & _LOW_BIT)
-            if not hits[word] & bit:
-                hits[word] |= bit
+            if not (which[word] | hits[word]) & bit:
+                which[word] |= bit
                 ends[rays, 0], ends[rays, 1], ends[rays, 2] = i, j, k
                 rays += 1
-    for n in range(cut, ends.shape[0]):
-        i, j, k = ends[n, 0], ends[n, 1], ends[n, 2]
-        code = codes[0, i] + codes[1, j] + codes[2, k]
-        chunk = code >> _CHUNK_BITS
-        if table[chunk] < 0:
-            if used[0] >= most:
-                return NO_SLOTS
-            used[used[0] + 1], table[chunk] = chunk, used[0]
-            used[0] += 1
-        word = np.uint64(table[chunk]) * _WORDS + (code >> _SIX & _LOW_WORD)
-        bit = _ONE << (code & _LOW_BIT)
-        if not (misses[word] | hits[word]) & bit:
-            misses[word] |= bit
-            ends[rays, 0], ends[rays, 1], ends[rays, 2] = i, j, k
-            rays += 1
+        first, end = cut, ends.shape[0]
     return rays
 
 

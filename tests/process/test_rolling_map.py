@@ -123,6 +123,14 @@ def test_a_run_goes_on_where_it_was(
     assert on_disk(one) == expected(read_drive(tmp_path / "drive12"))
 
 
+def test_a_run_over_other_scans_is_not_resumed(live_daemon: LiveDaemon, words: Words) -> None:
+    one = live_daemon()
+    assert run(*words(one, scans=6)).returncode == 0
+    done = run(*words(one, "--resume", scans=3))
+    assert done.returncode == 2
+    assert "has 3 scans, but 6 of mapper shmmap-rolling are in the map" in done.stderr
+
+
 def test_a_publishers_scans_are_not_resumed(live_daemon: LiveDaemon) -> None:
     one = live_daemon()
     done = run(

@@ -288,8 +288,8 @@ class LiveMap:
         if self.problems.pop(what, ""):
             log.info(f"chunks are {what} again")
 
-    def list_files(self, applied: dict[int, int]) -> None:
-        """Have the manifest written, beside the rest; what is ``applied`` is durable."""
+    def list_files(self, applied: dict[int, int] | None) -> None:
+        """Have the manifest written, beside the rest; ``applied`` as there."""
         self._start(self.files.write_manifest, applied, then=self._listed)
 
     def _listed(self, future: Future[None], now_s: float) -> None:

@@ -221,7 +221,7 @@ class MapFiles:
         """
         self.flush()
         if applied is not None:
-            self.applied = {**self.applied, **applied}
+            self.applied = applied
         write_rows(self.files, dict(self._durable), self.applied)
 
     # --- the start ------------------------------------------------------------------------------

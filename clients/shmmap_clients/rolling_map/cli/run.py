@@ -144,6 +144,12 @@ def run(args: argparse.Namespace) -> int:
             parameters.check_map(live)
         mapper = stack.enter_context(live.mapper(args.mapper, scan_filter, resume=args.resume))
         if isinstance(scans, ScanSequence) and args.resume:
+            if mapper.applied > len(scans):
+                raise BadRequest(
+                    f"{args.scans} has {len(scans)} scans, but {mapper.applied} of mapper {args.mapper} are in"
+                    " the map",
+                    hint="--resume goes on with the directory of the run before; for another one leave it out",
+                )
             scans.leave_out(mapper.applied)
             print_line(f"{mapper.applied} scans are in the map, {len(scans)} are left", file=sys.stderr)
         announce_scans(args)

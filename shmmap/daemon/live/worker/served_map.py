@@ -236,10 +236,10 @@ class ServedMap:
         if active is not None:
             active.unsaved.discard(scan.number)
 
-    def _durable_scans(self) -> dict[int, int]:
-        """Up to which scan of each mapper all are on the disk, as far as is known."""
+    def _durable_scans(self) -> dict[int, int] | None:
+        """Up to which scan of each mapper all are on the disk; None while that is not known."""
         known = self._earlier_is_durable()
-        return {number: one.durable for number, one in self.mappers.by_number.items()} if known else {}
+        return {number: one.durable for number, one in self.mappers.by_number.items()} if known else None
 
     def _refuse(self, ask: Ask, request: int, error: ShmmapError) -> None:
         self._answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))

@@ -122,6 +122,7 @@ def test_without_memory_the_manifest_says_what_is_in_the_map(disk: CutDisk, mapp
     files = MapFiles(disk, SETTINGS)
     files.write_manifest({front.mapper.number: 7})
     files.write_manifest(None)  # nothing new is known
+    assert MapFiles(disk, SETTINGS).applied == {front.mapper.number: 7}
     for record, applied in ((bytearray(APPLIED_BYTES), 7), (_noted(front.mapper.number, 12), 12)):
         later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(record))
         assert later.open(1000, "front", 1).applied == applied
