@@ -146,9 +146,9 @@ def run(args: argparse.Namespace) -> int:
         if isinstance(scans, ScanSequence) and args.resume:
             if mapper.applied > len(scans):
                 raise BadRequest(
-                    f"{args.scans} has {len(scans)} scans, but {mapper.applied} of mapper {args.mapper} are in"
-                    " the map",
-                    hint="--resume goes on with the directory of the run before; for another one leave it out",
+                    f"{args.scans} has {len(scans)} scans, but {mapper.applied} of mapper {args.mapper} are"
+                    " in the map",
+                    hint="--resume is for the same directory as in the run before; leave it out for another",
                 )
             scans.leave_out(mapper.applied)
             print_line(f"{mapper.applied} scans are in the map, {len(scans)} are left", file=sys.stderr)
