@@ -22,7 +22,7 @@ from tests.support.accounts import ADMINS, DAEMON_UID, GROUP, MEMBER, STRANGER, 
 from tests.support.attempts import ATTEMPTS
 from tests.support.daemon_process import DaemonProcess, stop
 from tests.support.live_drive import FILTER, RESOLUTION, drive
-from tests.support.live_reference import held, reference
+from tests.support.live_reference import held, mapped_around, reference
 from tests.support.mapping_process import MappingProcess
 from tests.support.other_account import SCANS, as_client
 from tests.support.patience import Patience
@@ -114,9 +114,9 @@ def settled(live: LiveMap, scan: int) -> ChunkInfo:
     here = ChunkKey(*np.floor(place / (64 * RESOLUTION)).astype(int).tolist())
     live.move_to(*place)
     waiting = Patience()
-    while waiting(len(live.chunks()) != 27 or any(one.key.distance(here) > 1 for one in live.chunks())):
+    while waiting(len(near := mapped_around(live, here)) != 27 or len(live.chunks()) != 27):
         pass
-    return next(one for one in live.chunks() if one.key == here)
+    return next(one for one in near if one.key == here)
 
 
 def test_members_of_the_mappers_group_map_and_readers_read(service: LiveService) -> None:

@@ -26,7 +26,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked
-from tests.support.live_reference import held, reference
+from tests.support.live_reference import held, mapped_around, reference
 from tests.support.patience import Patience
 from tests.support.slow_occupancy import walk
 
@@ -53,7 +53,7 @@ def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -
         live.move_to(*origin)
         here = ChunkKey(*np.floor(origin / (64 * RESOLUTION)).astype(int).tolist())
         waiting = Patience()
-        while waiting(sum(chunk.key.distance(here) <= 1 for chunk in live.chunks()) < 27):
+        while waiting(len(mapped_around(live, here)) < 27):
             pass
         near = np.array(
             [voxel for voxel in expected if np.abs(np.array(voxel) - origin / RESOLUTION).max() < 60]

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import shmmap
-from shmmap.client.live.live_map import LiveMap
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.client.live.live_map import ChunkInfo, LiveMap
 from tests.support.live_drive import FILTER, RESOLUTION
 from tests.support.slow_occupancy import SlowOccupancy, Voxel
 
-__all__ = ["held", "reference"]
+__all__ = ["held", "mapped_around", "reference"]
 
 Scan = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -38,3 +39,12 @@ def held(live: LiveMap, scope: str = "all", area: shmmap.Box | None = None) -> d
             assert (x, y, z) not in found
             found[x, y, z] = value
     return found
+
+
+def mapped_around(live: LiveMap, here: ChunkKey) -> list[ChunkInfo]:
+    """Return the chunks in memory that touch this one, itself among them; 27 once all have been loaded."""
+    return [
+        one
+        for one in live.chunks()
+        if one.key.distance(here) <= 1 and one.state not in ("loading", "evicting")
+    ]
