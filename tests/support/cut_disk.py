@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -15,6 +16,7 @@ class PowerCut(BaseException):
 class _File:
     data: bytes
     synced: bool = False
+    was: bytes = b""
 
 
 @dataclass
@@ -23,25 +25,23 @@ class CutDisk:
 
     What is written is safe after `sync`, a name after `sync_names`.  After a cut, `after` gives the disk as
     it may be found: of the names that were changed since the last `sync_names` any are as before, and of a
-    file that was not synced there is nothing, a part, or zeros in the place of the rest.
+    file that was not synced there is what it was before, a part, or zeros in the place of the rest.
     """
 
     operations: int = 10**9
+    exchanges: bool = True
     _names: dict[str, _File] = field(default_factory=dict)
     _safe: dict[str, _File] = field(default_factory=dict)
-    _changes: list[tuple[str, _File | None]] = field(default_factory=list)
+    _changes: list[dict[str, _File | None]] = field(default_factory=list)  # each as a whole
 
     def _count(self) -> None:
         if self.operations == 0:
             raise PowerCut
         self.operations -= 1
 
-    def _set(self, name: str, file: _File | None) -> None:
-        self._changes.append((name, file))
-        if file is None:
-            del self._names[name]
-        else:
-            self._names[name] = file
+    def _change(self, change: dict[str, _File | None]) -> None:
+        self._changes.append(change)
+        _apply(change, self._names)
 
     def names(self) -> list[str]:
         """All names."""
@@ -62,7 +62,22 @@ class CutDisk:
         """Make a file."""
         assert name not in self._names
         self._count()
-        self._set(name, _File(data))
+        self._change({name: _File(data)})
+
+    def overwrite(self, name: str, data: bytes) -> None:
+        """Write over what a file has, whatever its names are on the disk."""
+        self._count()
+        file = self._names[name]
+        file.data, file.was, file.synced = data, file.data, False
+
+    def exchange(self, one: str, other: str) -> None:
+        """Each gets the other's name, at once."""
+        if one not in self._names or other not in self._names:
+            raise FileNotFoundError(other)
+        if not self.exchanges:
+            raise OSError(errno.EINVAL, "the file system cannot")
+        self._count()
+        self._change({one: self._names[other], other: self._names[one]})
 
     def sync(self, name: str) -> None:
         """Its content is safe."""
@@ -72,16 +87,14 @@ class CutDisk:
     def rename(self, old: str, new: str) -> None:
         """Another name, at once: never both, never none."""
         self._count()
-        file = self._names.pop(old)
-        self._names[new] = file
-        self._changes.append((f"{old}\0{new}", file))
+        self._change({old: None, new: self._names[old]})
 
     def remove(self, name: str) -> None:
         """Remove a file."""
         if name not in self._names:
             raise FileNotFoundError(name)
         self._count()
-        self._set(name, None)
+        self._change({name: None})
 
     def sync_names(self) -> None:
         """All names are safe."""
@@ -99,23 +112,23 @@ class CutDisk:
             How much of so many bytes is there; a negative number: zeros follow.
         """
         found = dict(self._safe)
-        for name, file in self._changes:
-            if not keeps():
-                continue
-            old, _, new = name.partition("\0")
-            if new:
-                found.pop(old, None)
-                assert file is not None
-                found[new] = file
-            elif file is None:
-                found.pop(name, None)
-            else:
-                found[name] = file
+        for change in self._changes:
+            if keeps():
+                _apply(change, found)
         disk = CutDisk()
         for name, file in found.items():
             data = file.data
             if not file.synced:
                 size = part(len(data))
-                data = data[:size] if size >= 0 else data[:-size] + bytes(len(data) + size)
+                rest = file.was[size:] if size >= 0 else bytes(len(data) + size)
+                data = data[: abs(size)] + rest
             disk._names[name] = disk._safe[name] = _File(data, synced=True)
         return disk
+
+
+def _apply(change: dict[str, _File | None], names: dict[str, _File]) -> None:
+    for name, file in change.items():
+        if file is None:
+            names.pop(name, None)
+        else:
+            names[name] = file

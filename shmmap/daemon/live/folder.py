@@ -8,6 +8,8 @@ a power cut may leave either as it was, or, of a file, any part of it.
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
 import fcntl
 import os
 import secrets
@@ -34,6 +36,10 @@ DAMAGED: Final = ".damaged."
 """What stands between the name that a file had and a number when it was put aside."""
 
 
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+_RENAME_EXCHANGE: Final = 2
+
+
 class FilesToRead(Protocol):
     """Files in one directory, by name."""
 
@@ -53,8 +59,14 @@ class Files(FilesToRead, Protocol):
     def write(self, name: str, data: bytes) -> None:
         """Make a file of a new name."""
 
+    def overwrite(self, name: str, data: bytes) -> None:
+        """Write over a file that nobody needs; if that fails it has some of both."""
+
     def sync(self, name: str) -> None:
         """Have what was written on the disk."""
+
+    def exchange(self, one: str, other: str) -> None:
+        """Have two files each get the other's name, at once; OSError where the file system cannot."""
 
     def rename(self, old: str, new: str) -> None:
         """Give a file another name, in the place of what has it."""
@@ -134,16 +146,20 @@ class FolderToRead:
 
     def read(self, name: str, most: int = -1) -> bytes:
         """The first ``most`` bytes of a file, or all."""
-        fd = self._open(name, os.O_RDONLY)
-        try:
-            left = os.fstat(fd).st_size if most < 0 else most
-            parts = []
-            while left and (part := os.read(fd, left)):
-                parts.append(part)
-                left -= len(part)
-            return b"".join(parts)
-        finally:
-            os.close(fd)
+        while True:
+            fd = self._open(name, os.O_RDONLY)
+            try:
+                before = os.fstat(fd)
+                left = before.st_size if most < 0 else most
+                parts = []
+                while left and (part := os.read(fd, left)):
+                    parts.append(part)
+                    left -= len(part)
+                after = os.fstat(fd)
+                if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
+                    return b"".join(parts)
+            finally:  # else another file has the name by now, and this one was written over
+                os.close(fd)
 
 
 class Folder(FolderToRead):
@@ -176,11 +192,20 @@ class Folder(FolderToRead):
 
     def write(self, name: str, data: bytes) -> None:
         """Make a file of a new name."""
-        fd = self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        self._write(self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), data)
+
+    def overwrite(self, name: str, data: bytes) -> None:
+        """Write over a file that nobody needs; if that fails it has some of both."""
+        self._write(self._open(name, os.O_WRONLY), data)
+
+    def _write(self, fd: int, data: bytes) -> None:
         try:
+            before = os.fstat(fd).st_size
             left = memoryview(data)
             while left:
                 left = left[os.write(fd, left) :]
+            if before > len(data):
+                os.ftruncate(fd, len(data))
         finally:
             os.close(fd)
 
@@ -188,9 +213,18 @@ class Folder(FolderToRead):
         """Have what was written on the disk."""
         fd = self._open(name, os.O_RDONLY)
         try:
-            os.fsync(fd)
+            os.fdatasync(fd)
         finally:
             os.close(fd)
+
+    def exchange(self, one: str, other: str) -> None:
+        """Have two files each get the other's name, at once; OSError where the file system cannot."""
+        swap = getattr(_libc, "renameat2", None)
+        if swap is None:
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+        if swap(self._fd, os.fsencode(one), self._fd, os.fsencode(other), _RENAME_EXCHANGE):
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), one)
 
     def rename(self, old: str, new: str) -> None:
         """Give a file another name, in the place of what has it."""

@@ -214,6 +214,10 @@ class MapFiles:
         """What is written and not durable takes so much memory here."""
         return self._unflushed.nbytes
 
+    def remove_spare(self) -> None:
+        """Remove what is only there to be written over."""
+        self._unflushed.remove_spare()
+
     def write_manifest(self, applied: dict[int, int] | None = None) -> None:
         """Make durable what was saved, and list it.
 
@@ -247,7 +251,7 @@ class MapFiles:
             if header is not None:
                 place = header.key.text + CHUNK
                 old = self._header(place)
-                if name.startswith(f".{place}.") and (old is None or old.version < header.version):
+                if old is None or old.version < header.version:
                     if old is None and place in names:
                         self.put_aside(header.key, "it cannot be read, and a whole one was beside it")
                     self.files.sync(name)

@@ -4,6 +4,10 @@
 A file is written under another name than its own.  `UnflushedFiles.flush` has it on the disk, gives it its
 name, and has the name on the disk, too.  Until then its bytes are kept: what the kernel could not write it
 throws away, and then the file is written anew.
+
+What was replaced is not deleted but kept for what is written next, since file systems take long to make a
+file: ext4 looks at every one that was deleted in the last seconds.  It is written over only when its own
+name, too, is on the disk as another file's, so that nothing needs it whatever happens.
 """
 
 from __future__ import annotations
@@ -54,6 +58,7 @@ class UnflushedFiles:
         self._files = files
         self.nbytes = 0
         self._written: dict[ChunkKey, _Written] = {}
+        self._spare: list[str] = []
         self._changing, self._flushing = threading.Lock(), threading.Lock()
 
     def get(self, key: ChunkKey) -> bytes | None:
@@ -63,16 +68,42 @@ class UnflushedFiles:
 
     def write(self, key: ChunkKey, data: bytes) -> None:
         """Write the file of a chunk; raises OSError, and then all is as it was."""
-        written = _Written(write_beside(self._files, key.text + CHUNK, data), data)
+        written = _Written(self._write(data), data)
         step("live.written")
         with self._changing:
             before = self._written.get(key)
             self._written[key] = written
             self.nbytes += written.nbytes - (before.nbytes if before is not None else 0)
-            needless = before is not None and not before.is_flushed
-        if before is not None and needless:
-            with contextlib.suppress(OSError):  # it may have its name; else it goes with the next start
-                self._files.remove(before.interim)
+            if before is not None and not before.is_flushed and not before.failed:
+                self._spare.append(before.interim)
+        if before is not None and before.failed:
+            self._remove(before.interim)  # or an older file that had its name, and may have it on the disk
+
+    def _write(self, data: bytes) -> str:
+        """Write a file over a spare one, or a new one; returns its name."""
+        with self._changing:
+            spare = self._spare.pop() if self._spare else ""
+        try:
+            if not spare:
+                return write_beside(self._files, CHUNK.removeprefix("."), data)
+            self._files.overwrite(spare, data)
+        except OSError:
+            if spare:
+                self._remove(spare)
+            self.remove_spare()  # the disk may be full
+            raise
+        return spare
+
+    def _remove(self, name: str) -> None:
+        with contextlib.suppress(OSError):  # it goes with the next start
+            self._files.remove(name)
+
+    def remove_spare(self, kept: int = 0) -> None:
+        """Remove what is kept to be written over, but so many."""
+        with self._changing:
+            self._spare, needless = self._spare[:kept], self._spare[kept:]
+        for name in needless:
+            self._remove(name)
 
     def flush(self) -> dict[ChunkKey, bytes]:
         """Make durable what was written, and return it; what comes meanwhile is for the next time.
@@ -90,11 +121,13 @@ class UnflushedFiles:
             if not taken:
                 return {}
             try:
-                for key, one in taken.items():
-                    self._sync(key, one)
+                for one in taken.values():
+                    self._sync(one)
                 step("live.synced")
+                replaced = []
                 for key, one in taken.items():
-                    self._files.rename(one.interim, key.text + CHUNK)
+                    if self._give_name(one.interim, key.text + CHUNK):
+                        replaced.append(one.interim)
                     step("live.renamed")
                 self._files.sync_names()
                 step("live.flushed")
@@ -106,14 +139,24 @@ class UnflushedFiles:
                     if self._written.get(key) is one:
                         del self._written[key]
                         self.nbytes -= one.nbytes
+                self._spare += replaced
+            self.remove_spare(len(taken))
             return {key: one.data for key, one in taken.items()}
 
-    def _sync(self, key: ChunkKey, one: _Written) -> None:
+    def _sync(self, one: _Written) -> None:
         if one.failed:
-            old, one.interim = one.interim, write_beside(self._files, key.text + CHUNK, one.data)
-            with contextlib.suppress(FileNotFoundError):  # it had its name already
-                self._files.remove(old)
+            old, one.interim = one.interim, write_beside(self._files, CHUNK.removeprefix("."), one.data)
+            self._remove(old)  # or an older file that had its name, or nothing
         self._files.sync(one.interim)
+
+    def _give_name(self, interim: str, name: str) -> bool:
+        """Give a file its name; whether the one that had it has the other now."""
+        try:
+            self._files.exchange(interim, name)
+        except OSError:  # there is none, or the file system cannot
+            self._files.rename(interim, name)
+            return False
+        return True
 
     def _keep_for_later(self, taken: dict[ChunkKey, _Written]) -> None:
         """A flush came to nothing: all of it is written again, but what is newer by now."""
@@ -121,5 +164,4 @@ class UnflushedFiles:
             for key, one in taken.items():
                 one.is_flushed, one.failed = False, True
                 if self._written.get(key) is not one:
-                    with contextlib.suppress(OSError):
-                        self._files.remove(one.interim)
+                    self._remove(one.interim)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, read_file_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, Manifest, Row, write_rows
 from shmmap.daemon.live.disk.stored_map import StoredMap
@@ -140,10 +141,23 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
         unreadable=unreadable,
         missing=_missing(listed, rows, told) if isinstance(listed, dict) else [],
         manifest=("current" if listed == rows else "stale") if isinstance(listed, dict) else listed,
-        interim=[name for name in stored.names if name.startswith(".") and name.endswith(INTERIM)],
+        interim=[
+            name
+            for name in stored.names
+            if name.startswith(".") and name.endswith(INTERIM) and not _is_older(files, name, rows)
+        ],
         aside=stored.aside,
         strange=stored.strange,
     )
+
+
+def _is_older(files: FilesToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
+    """Whether a file is only there to be written over: its chunk's own is as new."""
+    try:
+        header = read_file_header(files.read(name, FILE_HEADER_BYTES))
+    except (OSError, MapDataError):
+        return False
+    return header.key in rows and rows[header.key].version >= header.version
 
 
 def _row_or_error(stored: StoredMap, key: ChunkKey) -> Row | MapDataError:

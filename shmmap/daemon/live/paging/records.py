@@ -56,8 +56,8 @@ class Limits:
     hysteresis: float = 0.2
     linger_s: float = 2.0
     checkpoint_s: float = 10.0
-    loads: int = 4
-    saves: int = 4
+    loads: int = 16
+    saves: int = 16
 
 
 @dataclass(eq=False, slots=True)

@@ -261,7 +261,8 @@ class Residency:
 
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
         """What to give up next: unwanted ones, and where memory is short others, the furthest first."""
-        return self._victims.next(state, now_s, short=self._is_short(now_s))
+        idle = not self.loading and not self.saving
+        return self._victims.next(state, now_s, short=self._is_short(now_s), idle=idle)
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
         """The chunk to save now: one that is to be given up, else one whose time has come, or all."""

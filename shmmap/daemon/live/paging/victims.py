@@ -59,27 +59,27 @@ class Victims:
         """A chunk that was saved to be given up is clean."""
         self._found[State.CLEAN].append(chunk)
 
-    def next(self, state: State, now_s: float, *, short: bool) -> Chunk | None:
-        """The next of these, clean or dirty, if there is one."""
-        if not any(self._found.values()) and self._may_review(now_s, short=short):
+    def next(self, state: State, now_s: float, *, short: bool, idle: bool) -> Chunk | None:
+        """The next of these, clean or dirty, if there is one; ``idle``: nothing goes on but this."""
+        if self._is_review_due(now_s, short=short, idle=idle):
             self._review(now_s, short=short)
         left = self._found[state]
         while left:
             chunk = left.pop()
-            if (
-                chunk.state is state
-                and self._chunks.get(chunk.key) is chunk
-                and chunk.retry_s <= now_s
-                and self._may_go(chunk, now_s, short=short)
-            ):
-                return chunk
+            if chunk.state is state and self._chunks.get(chunk.key) is chunk and chunk.retry_s <= now_s:
+                if self._may_go(chunk, now_s, short=short):
+                    return chunk
+                if self._reviewed_short and not short:  # its turn comes when memory is short again
+                    left.append(chunk)
+                    return None
         return None
 
-    def _may_review(self, now_s: float, *, short: bool) -> bool:
+    def _is_review_due(self, now_s: float, *, short: bool, idle: bool) -> bool:
         """Whether all chunks are gone over again: seldom, or where memory is short and much has happened."""
-        if short and (not self._reviewed_short or self.news * REVIEWED_OF_NEWS >= len(self._chunks)):
-            return True
-        return now_s >= self._review_s
+        if any(self._found.values()):
+            return self._reviewed_short and not short and now_s >= self._review_s
+        much = self.news > 0 if idle else self.news * REVIEWED_OF_NEWS >= len(self._chunks)
+        return now_s >= self._review_s or (short and (much or not self._reviewed_short))
 
     def _review(self, now_s: float, *, short: bool) -> None:
         self._review_s, self._reviewed_short, self.news = now_s + REVIEW_S, short, 0

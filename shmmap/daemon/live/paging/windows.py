@@ -52,6 +52,7 @@ class Windows:
         self._radius = radius
         self._hysteresis = hysteresis
         self._centers: dict[object, ChunkKey] = {}
+        self._distances: dict[ChunkKey, int] = {}  # what was asked for since a window moved
         self.near: dict[ChunkKey, int] = {}
 
     def move(self, client: object, position: tuple[float, float, float]) -> bool:
@@ -92,6 +93,7 @@ class Windows:
 
     def _look_around(self) -> None:
         reach = range(-self._radius, self._radius + 1)
+        self._distances.clear()
         self.near = {}
         for center in self._centers.values():
             for x in reach:
@@ -103,4 +105,8 @@ class Windows:
 
     def distance(self, key: ChunkKey) -> int:
         """Chunks to the nearest client; 0 where there is none."""
-        return min((key.distance(center) for center in self._centers.values()), default=0)
+        found = self._distances.get(key)
+        if found is None:
+            found = min((key.distance(center) for center in self._centers.values()), default=0)
+            self._distances[key] = found
+        return found

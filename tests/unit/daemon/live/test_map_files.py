@@ -17,6 +17,7 @@ from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings, Row
+from shmmap.daemon.live.unflushed_files import UnflushedFiles
 from shmmap.errors import ConfigError, InstanceBusy, MapDataError
 from tests.support.cut_disk import CutDisk, PowerCut
 
@@ -160,11 +161,12 @@ def test_a_file_that_did_not_get_its_name_is_taken_if_it_is_newer() -> None:
     disk.write(".0_0_0.chunk.bbbb.tmp", chunk(made, KEYS[0], 6))
     disk.write(".0_0_0.chunk.cccc.tmp", chunk(made, KEYS[0], 9)[:-1])
     disk.write(".-1_2_0.chunk.dddd.tmp", chunk(made, KEYS[1], 1))
-    disk.write(".-1_2_0.chunk.eeee.tmp", chunk(made, KEYS[0], 99))
+    disk.write(".chunk.eeee.tmp", chunk(made, KEYS[2], 3))
+    disk.write(".2_3_5.chunk.ffff.tmp", chunk(made, KEYS[1], 2))
     disk.write(".map.json.ffff.tmp", b"{}")
     again = MapFiles(disk, SETTINGS)
-    assert [version_of(again, key) for key in KEYS] == [7, 1, 0]
-    assert sorted(disk.names()) == ["-1_2_0.chunk", "0_0_0.chunk", "map.json"]
+    assert [version_of(again, key) for key in KEYS] == [7, 2, 3], "whatever they are called"
+    assert sorted(disk.names()) == sorted([*(key.text + ".chunk" for key in KEYS), "map.json"])
 
 
 def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -181,8 +183,80 @@ def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, tmp_
     assert version_of(made, KEYS[0]) == 1
     made.save(KEYS[0], chunk(made, KEYS[0], 2))
     made.flush()
+    made.remove_spare()
     assert sorted(folder.names()) == names
     assert version_of(made, KEYS[0]) == 2
+    folder.close()
+
+
+def test_files_are_written_over_again(tmp_path: Path) -> None:
+    """Making a file takes long: what was replaced is used again, once nothing can need it."""
+    folder = Folder(tmp_path)
+    made = MapFiles(folder, SETTINGS)
+    files = []
+    for version in range(1, 8):
+        for key in KEYS:
+            made.save(key, chunk(made, key, version))
+        made.flush()
+        files.append({path.stat().st_ino for path in tmp_path.iterdir() if ".chunk" in path.name})
+    assert [len(some) for some in files[:2]] == [len(KEYS), 2 * len(KEYS)]
+    assert all(later == files[1] for later in files[2:]), "no more are made"
+    assert [version_of(made, key) for key in KEYS] == [7, 7, 7]
+    made.remove_spare()
+    assert sorted(folder.names()) == sorted([*(key.text + ".chunk" for key in KEYS), "map.json"])
+    folder.close()
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_a_file_system_that_cannot_exchange_names(exchanges: bool) -> None:
+    disk = CutDisk(exchanges=exchanges)
+    made = MapFiles(disk, SETTINGS)
+    for version in (1, 2):
+        made.save(KEYS[0], chunk(made, KEYS[0], version))
+        made.flush()
+    assert len([name for name in disk.names() if name.endswith(".tmp")]) == exchanges
+    assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 2
+    assert sorted(disk.names()) == ["0_0_0.chunk", "map.json"], "the older one goes"
+
+
+def test_what_cannot_be_written_over_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that is spare gives its room back."""
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    for version in (1, 2):
+        for key in KEYS:
+            made.save(key, chunk(made, key, version))
+        made.flush()
+    assert len([name for name in disk.names() if name.endswith(".tmp")]) == len(KEYS)
+    with monkeypatch.context() as patch:
+        patch.setattr(disk, "overwrite", _full)
+        with pytest.raises(OSError, match="No space"):
+            made.save(KEYS[0], chunk(made, KEYS[0], 3))
+    assert not [name for name in disk.names() if name.endswith(".tmp")]
+    assert [version_of(made, key) for key in KEYS] == [2, 2, 2]
+
+
+def test_who_reads_a_file_that_is_written_over_reads_the_one_in_its_place(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = Folder(tmp_path)
+    for name, content in (("one", b"a" * 5000), ("other", b"b" * 4000)):
+        folder.write(name, content)
+        os.utime(tmp_path / name, (0, 0))
+    read = os.read
+
+    def meanwhile(fd: int, most: int) -> bytes:
+        monkeypatch.setattr(os, "read", read)
+        half = read(fd, most // 2)
+        folder.exchange("one", "other")
+        folder.overwrite("other", b"c" * 5000)
+        return half
+
+    monkeypatch.setattr(os, "read", meanwhile)
+    assert folder.read("one") == b"b" * 4000
+    assert folder.read("other") == b"c" * 5000
+    folder.overwrite("other", b"d" * 10)
+    assert folder.read("other") == b"d" * 10
     folder.close()
 
 
@@ -197,6 +271,7 @@ def test_what_a_disk_does_not_flush_is_kept_and_written_again(
         made.save(key, chunk(made, key, 1))
     made.flush()
     names = sorted(disk.names())
+    disk.exchanges = what != "rename"
     for key in KEYS:
         made.save(key, chunk(made, key, 2))
     unflushed = made.unflushed_bytes
@@ -218,6 +293,7 @@ def test_what_a_disk_does_not_flush_is_kept_and_written_again(
     written = noted(monkeypatch, disk, "write")
     made.flush()
     assert len(written) == 2, "those that nothing newer has come for"
+    made.remove_spare()
     assert sorted(disk.names()) == names
     assert made.unflushed_bytes == 0
     assert [version_of(MapFiles(disk, SETTINGS), key) for key in KEYS] == [2, 3, 2]
@@ -228,7 +304,7 @@ def test_what_is_saved_often_is_flushed_once(monkeypatch: pytest.MonkeyPatch) ->
     made = MapFiles(disk, SETTINGS)
     for version in (1, 2, 3):
         made.save(KEYS[0], chunk(made, KEYS[0], version))
-        assert len([name for name in disk.names() if name.endswith(".tmp")]) == 1
+        assert len([name for name in disk.names() if name.endswith(".tmp")]) == min(version, 2)
         assert version_of(made, KEYS[0]) == version
     synced = noted(monkeypatch, disk, "sync")
     made.flush()
@@ -253,6 +329,7 @@ def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch) -> N
     assert made.unflushed_bytes
     made.write_manifest()
     assert made.unflushed_bytes == 0
+    made.remove_spare()
     assert sorted(disk.names()) == ["0_0_0.chunk", "manifest.json", "map.json"]
     assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 2
 
@@ -331,11 +408,12 @@ class Drive:
                 self.mappers = made.add_mapper(0, "m").number
 
 
+@pytest.mark.parametrize("exchanges", [True, False])
 @pytest.mark.parametrize("seed", range(60))
-def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int) -> None:
+def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int, exchanges: bool) -> None:
     """The disk may then be in any state that is allowed; and the power may fail again in the next life."""
     rng = random.Random(seed)
-    disk = CutDisk(operations=rng.randint(0, 70))
+    disk = CutDisk(rng.randint(0, 70), exchanges)
     durable: dict[ChunkKey, int] = {}
     mappers = lives = 0
     for _ in range(4):
@@ -356,24 +434,34 @@ def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int) -> None:
         assert made.add_mapper(0, "next").number > mappers
         assert made.begin_life() > lives
         mappers += 1
-        disk.operations = rng.randint(0, 70)
+        disk.operations, disk.exchanges = rng.randint(0, 70), exchanges
 
 
-@pytest.mark.parametrize("skipped", ["sync", "sync_names"])
+@pytest.mark.parametrize("defect", ["sync", "sync_names", "early"])
 def test_such_a_cut_would_lose_something_if_nobody_waited_for_the_disk(
-    monkeypatch: pytest.MonkeyPatch, skipped: str
+    monkeypatch: pytest.MonkeyPatch, defect: str
 ) -> None:
     """What the tests above find is not nothing."""
-    monkeypatch.setattr(CutDisk, skipped, lambda *_: None)
+    if defect == "early":  # a file is written over before its name is on the disk as another file's
+        right = UnflushedFiles._give_name
+
+        def early(self: UnflushedFiles, interim: str, name: str) -> bool:
+            if exchanged := right(self, interim, name):
+                self._files.overwrite(interim, b"another chunk")
+            return exchanged
+
+        monkeypatch.setattr(UnflushedFiles, "_give_name", early)
+    else:
+        monkeypatch.setattr(CutDisk, defect, lambda *_: None)
 
     def fails(seed: int) -> bool:
         try:
-            test_a_power_cut_at_any_operation_loses_nothing_durable(seed)
+            test_a_power_cut_at_any_operation_loses_nothing_durable(seed, exchanges=True)
         except (AssertionError, MapDataError):
             return True
         return False
 
-    assert sum(map(fails, range(20))) > 5
+    assert sum(map(fails, range(60))) > 5
 
 
 def test_the_manifest_lists_what_is_durable() -> None:
