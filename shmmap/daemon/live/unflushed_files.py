@@ -74,10 +74,11 @@ class UnflushedFiles:
             before = self._written.get(key)
             self._written[key] = written
             self.nbytes += written.nbytes - (before.nbytes if before is not None else 0)
-            if before is not None and not before.is_flushed and not before.failed:
-                self._spare.append(before.interim)
-        if before is not None and before.failed:
-            self._remove(before.interim)  # or an older file that had its name, and may have it on the disk
+            needless = before if before is not None and not before.is_flushed else None
+            if needless is not None and not needless.failed:
+                self._spare.append(needless.interim)
+        if needless is not None and needless.failed:
+            self._remove(needless.interim)  # or an older file, which may have its own name on the disk
 
     def _write(self, data: bytes) -> str:
         """Write a file over a spare one, or a new one; returns its name."""

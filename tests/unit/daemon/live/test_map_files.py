@@ -312,15 +312,21 @@ def test_what_is_saved_often_is_flushed_once(monkeypatch: pytest.MonkeyPatch) ->
     assert "0_0_0.chunk" in disk.names()
 
 
-def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The older one gets its place, the newer one is for the next time."""
+@pytest.mark.parametrize("again", [False, True])
+def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch, *, again: bool) -> None:
+    """The older one gets its place, the newer one is for the next time; also after a flush that failed."""
     disk = CutDisk()
     made = MapFiles(disk, SETTINGS)
     made.save(KEYS[0], chunk(made, KEYS[0], 1))
+    if again:
+        with monkeypatch.context() as patch:
+            patch.setattr(disk, "sync_names", _full)
+            with pytest.raises(OSError, match="No space"):
+                made.flush()
 
     def meanwhile(name: str) -> None:
-        CutDisk.sync(disk, name)
         made.save(KEYS[0], chunk(made, KEYS[0], 2))
+        CutDisk.sync(disk, name)
 
     with monkeypatch.context() as patch:
         patch.setattr(disk, "sync", meanwhile)

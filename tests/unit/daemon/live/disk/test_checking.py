@@ -244,6 +244,15 @@ def test_a_file_that_cannot_be_opened_is_not_taken_for_a_damaged_one(tmp_path: P
     assert (tmp_path / "manifest.json").read_bytes() == before
 
 
+def test_what_is_only_there_to_be_written_over_is_not_told(tmp_path: Path) -> None:
+    stored_drive(tmp_path)
+    path = largest(tmp_path)
+    (tmp_path / ".chunk.abcd.tmp").write_bytes(path.read_bytes())
+    assert checked(tmp_path).interim == []
+    path.unlink()
+    assert checked(tmp_path).interim == [".chunk.abcd.tmp"], "the next start takes it over"
+
+
 def test_files_that_are_no_chunks(tmp_path: Path) -> None:
     stored_drive(tmp_path)
     names = [".0_0_0.chunk.abcd.tmp", "0_0.chunk", "9_9_9.chunk.damaged.1", "notes.txt"]
