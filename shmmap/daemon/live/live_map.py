@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 from shmmap.chunks.applying import ChunkWriter, UndoRecord
 from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
@@ -26,6 +26,7 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, GivenUp, memory_bytes
+from shmmap.daemon.live.file_threads import FileThreads, Job
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan
 from shmmap.daemon.live.paging.residency import RETRY_S, Residency
@@ -36,11 +37,6 @@ __all__ = ["LiveMap"]
 
 CHUNKS_A_TURN: Final = 64
 """Chunks that take in a scan in one turn: 37 us each."""
-FILE_THREADS: Final = 4
-"""One of them flushes.  More would wait for each other: all that they do between two calls of the kernel
-they do one at a time."""
-FILES_TOGETHER: Final = 8
-"""Files that a thread reads or writes, one after the other, until it says so: to be told costs as much."""
 MOST_UNFLUSHED: Final = 32 << 20
 """Files that are written and not flushed: beyond it the disk is waited for, and what is not saved stays."""
 
@@ -51,13 +47,6 @@ class _Part:
 
     marks: Marks
     places: dict[ChunkKey, tuple[int, int, int]]  # first word, end, hits
-
-
-class _Job(NamedTuple):
-    """What a thread does, and what is done with that afterwards, in the next turn."""
-
-    work: Callable[[], Any]
-    then: Callable[[Future[Any], float], None]
 
 
 @dataclass(eq=False)
@@ -104,13 +93,12 @@ class LiveMap:
     kept: dict[int, GivenUp] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
     _parts: dict[Scan, _Part] = field(default_factory=dict)
-    _running: dict[Future[list[Future[Any]]], list[_Job]] = field(default_factory=dict)
     _generation: int = 0
 
     def __post_init__(self) -> None:
         self.residency = Residency(self.limits, new_bytes=memory_bytes(0))
         self._writer = ChunkWriter(self.files.settings.occupancy, self.undo)
-        self._threads = ThreadPoolExecutor(FILE_THREADS, "live-files")
+        self._threads = FileThreads(lambda: self.on_work_done())
         self._generation = self.files.begin_life() << 32
         for key, row in self.files.rows.items():
             self.residency.note_size(key, memory_bytes(row.bricks))
@@ -171,13 +159,11 @@ class LiveMap:
     @property
     def all_durable(self) -> bool:
         """Whether everything that came is on the disk, and no file is being read or written."""
-        return not self._parts and not self._running and self.residency.all_durable
+        return not self._parts and self._threads.are_idle and self.residency.all_durable
 
     def turn(self, now_s: float, now_ns: int, *, save_all: bool = False) -> None:
         """Do what can be done now, without waiting for the disk."""
-        for future in [future for future in self._running if future.done()]:
-            for job, outcome in zip(self._running.pop(future), future.result(), strict=True):
-                job.then(outcome, now_s)
+        self._threads.tell(now_s)
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_A_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
@@ -190,8 +176,8 @@ class LiveMap:
         while (cold := residency.next_load(now_s)) is not None:
             self._generation += 1
             identity = self.identity(cold.key, self._generation)
-            jobs.append(_Job(partial(self._load, identity), partial(self._loaded, cold)))
-        self._start(jobs)
+            jobs.append(Job(partial(self._load, identity), partial(self._loaded, cold)))
+        self._threads.start(jobs)
         jobs = []
         while (
             self.files.unflushed_bytes < MOST_UNFLUSHED
@@ -200,22 +186,15 @@ class LiveMap:
             view = self.chunks[dirty.key].view
             copy = ChunkView(bytes(view.data[: chunk_bytes(int(view.state["bricks"]))]))
             saved = partial(self._saved, dirty, dirty.version)
-            jobs.append(_Job(partial(self._save, dirty.key, copy), saved))
-        self._start(jobs)
+            jobs.append(Job(partial(self._save, dirty.key, copy), saved))
+        self._threads.start(jobs)
         if residency.flush_is_due(now_s, everything=save_all):
             residency.durability.begin()
-            self._start([_Job(self.files.flush, self._flushed)])
+            self._threads.start([Job(self.files.flush, self._flushed)])
 
     def wait(self, seconds: float) -> None:
         """Wait until a file was read or written, at most so long; not at all if there is none."""
-        wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
-
-    def _start(self, jobs: list[_Job]) -> None:
-        for first in range(0, len(jobs), FILES_TOGETHER):
-            some = jobs[first : first + FILES_TOGETHER]
-            future = self._threads.submit(_outcomes, [job.work for job in some])
-            self._running[future] = some
-            future.add_done_callback(lambda _future: self.on_work_done())
+        self._threads.wait(seconds)
 
     # --- applying -------------------------------------------------------------------------------
 
@@ -310,7 +289,7 @@ class LiveMap:
 
     def list_files(self, applied: dict[int, int] | None) -> None:
         """Have the manifest written, beside the rest; ``applied`` as there."""
-        self._start([_Job(partial(self.files.write_manifest, applied), self._listed)])
+        self._threads.start([Job(partial(self.files.write_manifest, applied), self._listed)])
 
     def _listed(self, future: Future[None], now_s: float) -> None:
         del now_s
@@ -339,28 +318,13 @@ class LiveMap:
 
     def close(self) -> None:
         """Leave memory and files as they are."""
-        self._threads.shutdown()
+        for done in self._threads.close():
+            if isinstance(done, ChunkFile):
+                done.close()  # it has come, and there was no turn since
         self.files.remove_spare()
-        for outcome in (one for future in self._running for one in future.result()):
-            if outcome.exception() is None and isinstance(chunk := outcome.result(), ChunkFile):
-                chunk.close()  # it has come, and there was no turn since
-        self._running.clear()
         for file in self.chunks.values():
             file.close()
         for kept in self.kept.values():
             os.close(kept.fd)
         self.chunks.clear()
         self.kept.clear()
-
-
-def _outcomes(works: list[Callable[[], Any]]) -> list[Future[Any]]:
-    """Do one after the other; what came of each."""
-    found: list[Future[Any]] = []
-    for work in works:
-        outcome: Future[Any] = Future()
-        try:
-            outcome.set_result(work())
-        except Exception as error:  # noqa: BLE001  told to whoever looks at the outcome
-            outcome.set_exception(error)
-        found.append(outcome)
-    return found
