@@ -86,7 +86,7 @@ class UnflushedFiles:
             spare = self._spare.pop() if self._spare else ""
         try:
             if not spare:
-                return write_beside(self._files, CHUNK.removeprefix("."), data)
+                return self._make(data)
             self._files.overwrite(spare, data)
         except OSError:
             if spare:
@@ -94,6 +94,9 @@ class UnflushedFiles:
             self.remove_spare()  # the disk may be full
             raise
         return spare
+
+    def _make(self, data: bytes) -> str:
+        return write_beside(self._files, CHUNK.removeprefix("."), data)
 
     def _remove(self, name: str) -> None:
         with contextlib.suppress(OSError):  # it goes with the next start
@@ -146,7 +149,7 @@ class UnflushedFiles:
 
     def _sync(self, one: _Written) -> None:
         if one.failed:
-            old, one.interim = one.interim, write_beside(self._files, CHUNK.removeprefix("."), one.data)
+            old, one.interim = one.interim, self._make(one.data)
             self._remove(old)  # or an older file that had its name, or nothing
         self._files.sync(one.interim)
 

@@ -235,12 +235,6 @@ class Reader {
     if (tag == 0xc2 || tag == 0xc3) return tag == 0xc3;
     bad("true or false");
   }
-  /// Whether there is nothing here; then that is over.
-  bool nil() {
-    if (peek() != 0xc0) return false;
-    ++at_;
-    return true;
-  }
   /// Leave out so many values, whatever they are.
   void skip(std::uint64_t values) {
     for (; values > 0; --values) {  // nested ones are counted, not recursed into
@@ -261,7 +255,6 @@ class Reader {
       else bad("a value");
     }
   }
-  [[nodiscard]] bool at_end() const { return at_ == data_.size(); }
 
  private:
   template <typename To, typename From>
@@ -354,6 +347,7 @@ inline std::string error_text(int number) { return std::generic_category().messa
 class Socket {
  public:
   static constexpr std::uint64_t most_bytes = std::uint64_t{1} << 30;  // of one message
+  static constexpr std::size_t read_bytes = std::size_t{1} << 16;      // at once, at least
 
   Socket() = default;
 
@@ -428,11 +422,12 @@ class Socket {
     if (start_ > 0 && start_ == input_.size()) {
       input_.clear();
       start_ = 0;
-    } else if (start_ > (std::size_t{1} << 16)) {
+    } else if (start_ > read_bytes) {
       input_.erase(0, std::exchange(start_, 0));
     }
     const auto before = input_.size();
-    input_.resize(before + std::max<std::size_t>(std::size_t{1} << 16, wanted_ - std::min(wanted_, before - start_)));
+    const auto missing = wanted_ - std::min(wanted_, before - start_);  // as the frame says: memory comes as bytes do
+    input_.resize(before + std::clamp<std::size_t>(missing, read_bytes, 16 * read_bytes));
     const auto got = ::recv(fd_.get(), &input_[before], input_.size() - before, 0);
     const int number = errno;
     input_.resize(before + static_cast<std::size_t>(std::max<ssize_t>(got, 0)));
@@ -1037,7 +1032,7 @@ class Client {
   void ask(std::uint64_t number, const std::string& message, std::string_view tag, double wait, std::string& reply) {
     const auto deadline = after(wait + options_.patience);
     double pause = wait + 1.0;
-    bool is_new = socket_.is_open();
+    bool may_be_back = true;  // the first time it is asked at once
     while (true) {
       try {
         if (!socket_.is_open()) connect();
@@ -1065,7 +1060,7 @@ class Client {
       } catch (const Unreachable& error) {
         socket_ = detail::Socket();
         if (error.code() == "no_answer" || error.code() == "no_permission" || Clock::now() >= deadline) throw;
-        if (!std::exchange(is_new, false)) ::poll(nullptr, 0, 20);  // nobody says when it listens again
+        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, 20);  // nobody says when it listens again
       }
     }
   }

@@ -45,7 +45,7 @@ class Limits:
     checkpoint_s
         How long a change is in memory alone, at most.
     loads, saves
-        Files read and written at a time.
+        Files that are being read and written, or wait for a thread that does.
     """
 
     budget_bytes: int
