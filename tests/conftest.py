@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
     pytest_collectreport,
     pytest_runtest_logreport,
@@ -50,3 +51,14 @@ def data_dir() -> Path:
     if not path:
         pytest.skip("SHMMAP_TEST_DATA is not set")
     return Path(path)
+
+
+@pytest.fixture(scope="session")
+def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the client in C++, compiled once for all processes of the tests; needs g++."""
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is missing")
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cpp"
+    folder.mkdir(exist_ok=True)
+    return compiled(folder)

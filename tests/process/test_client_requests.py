@@ -9,8 +9,10 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from shmmap.errors import (
     UnknownCell,
 )
 from shmmap.segment.attach import attach
+from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import DaemonProcess, open_files
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.patience import Patience
@@ -36,9 +39,47 @@ from tests.support.process_costs import descriptors
 from tests.support.served_cells import names
 
 Factory = Callable[..., DaemonProcess]
+Connect = Callable[..., Any]
+Late = Callable[[str, Callable[[], object], float], AbstractContextManager[Any]]
+
+BOTH = pytest.mark.parametrize("language", ["python", "c++"])
+"""For tests that the client in C++ has to pass, too."""
 
 
-def assert_bits(cell: shmmap.Cell, made: DividedMap) -> None:
+@pytest.fixture
+def connect(language: str, request: pytest.FixtureRequest) -> Connect:
+    """Return what makes a client in the language that the test is about."""
+    if language == "python":
+        return shmmap.connect
+    return partial(CppClient, request.getfixturevalue("cpp_program"))
+
+
+@pytest.fixture
+def late(connect: Connect, language: str, monkeypatch: pytest.MonkeyPatch) -> Late:
+    """Return what makes a client that attaches only after something was done, the first so many times."""
+
+    @contextmanager
+    def make(endpoint: str, act: Callable[[], object], times: float) -> Iterator[Any]:
+        if language == "c++":
+            client = connect(endpoint, environment={"SHMMAP_TEST_STOP": "client.answer"})
+            with client, client.program.acting_at_stops(act, times):
+                yield client
+            return
+        left = iter(range(int(min(times, 1000))))
+
+        def attach_late(*args: Any, **options: Any) -> Any:
+            if next(left, None) is not None:
+                act()
+            return attach(*args, **options)
+
+        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+        with connect(endpoint) as client:
+            yield client
+
+    return make
+
+
+def assert_bits(cell: Any, made: DividedMap) -> None:
     """The cell's columns are the file's, bit by bit, by an independent reader."""
     source = made.points(Path(cell.id).name)
     xyz = np.stack([source["x"], source["y"], source["z"]], axis=1)
@@ -89,8 +130,9 @@ def test_a_client_goes_by_its_script(daemon: Factory, divided_map: DividedMap, t
     assert done.stdout.split() == ["localize.py", "own", "localize.py"]
 
 
-def test_areas(daemon: Factory, divided_map: DividedMap) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint, name="areas") as client:
+@BOTH
+def test_areas(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
+    with connect(daemon(divided_map.root).endpoint, name="areas") as client:
         circle = client.area(shmmap.Circle(5.0, -7.0, 33.0))
         assert circle.complete
         assert names(circle) == divided_map.in_circle(5.0, -7.0, 33.0)
@@ -101,20 +143,22 @@ def test_areas(daemon: Factory, divided_map: DividedMap) -> None:
         assert names(square) == divided_map.in_square(5.0, -7.0, 33.0)
         assert names(client.area(shmmap.Box(1.0, 1.0, 2.0, 2.0))) == ["0_0.pcd"]
         assert client.around(0, 0, 50, z=(100.0, 200.0)).cells == (), "no point is as high"
-        assert circle.epoch == client.epoch == client.welcome.epoch
+        assert circle.epoch == client.epoch
         assert circle.map_version == client.map_version
 
 
-def test_cells_are_mapped_once(daemon: Factory, divided_map: DividedMap) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+@BOTH
+def test_cells_are_mapped_once(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
+    with connect(daemon(divided_map.root).endpoint) as client:
         first = client.around(0, 0, 30)
         again = client.around(0, 0, 30)
         assert first.cells == again.cells
         assert all(a is b for a, b in zip(first, again, strict=True))
 
 
-def test_differential(daemon: Factory, divided_map: DividedMap) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+@BOTH
+def test_differential(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
+    with connect(daemon(divided_map.root).endpoint) as client:
         held = {cell.id: cell for cell in client.around(-30, -30, 30)}
         for x in range(-30, 40, 7):
             before = set(held)
@@ -128,9 +172,10 @@ def test_differential(daemon: Factory, divided_map: DividedMap) -> None:
             assert set(held) == inside
 
 
-def test_differential_with_ids_by_hand(daemon: Factory, divided_map: DividedMap) -> None:
+@BOTH
+def test_differential_with_ids_by_hand(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
     area = shmmap.Circle(10, 10, 5)
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+    with connect(daemon(divided_map.root).endpoint) as client:
         (cell,) = client.area(area)
         gone = divided_map.id("-60_-60.pcd")
         answer = client.differential(area, ["nowhere", cell.id, gone])
@@ -140,8 +185,11 @@ def test_differential_with_ids_by_hand(daemon: Factory, divided_map: DividedMap)
         assert client.differential(area, [cell], by_name=True).cells == ()
 
 
-def test_selected_keeps_order_and_duplicates(daemon: Factory, divided_map: DividedMap) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+@BOTH
+def test_selected_keeps_order_and_duplicates(
+    daemon: Factory, divided_map: DividedMap, connect: Connect
+) -> None:
+    with connect(daemon(divided_map.root).endpoint) as client:
         wanted = ["20_20.pcd", divided_map.id("0_0.pcd"), "none.pcd", "20_20.pcd", "-20_0.pcd"]
         answer = client.selected(wanted)
         assert names(answer) == ["20_20.pcd", "0_0.pcd", "20_20.pcd", "-20_0.pcd"]
@@ -154,10 +202,11 @@ def test_selected_keeps_order_and_duplicates(daemon: Factory, divided_map: Divid
         assert names(client.selected("0_0.pcd")) == ["0_0.pcd"], "one id needs no list"
 
 
-def test_a_broken_cell_costs_only_itself(daemon: Factory, divided_map: DividedMap) -> None:
+@BOTH
+def test_a_broken_cell_costs_only_itself(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
     broken = divided_map.pcd_dir / "0_0.pcd"
     broken.write_bytes(broken.read_bytes()[:-100])
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+    with connect(daemon(divided_map.root).endpoint) as client:
         answer = client.around(0, 0, 30)
         assert set(names(answer)) == set(divided_map.in_circle(0, 0, 30)) - {"0_0.pcd"}
         (failure,) = answer.failed
@@ -166,8 +215,11 @@ def test_a_broken_cell_costs_only_itself(daemon: Factory, divided_map: DividedMa
         assert not answer.complete
 
 
-def test_without_waiting_the_rest_is_pending(daemon: Factory, divided_map: DividedMap) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+@BOTH
+def test_without_waiting_the_rest_is_pending(
+    daemon: Factory, divided_map: DividedMap, connect: Connect
+) -> None:
+    with connect(daemon(divided_map.root).endpoint) as client:
         answer = client.around(0, 0, 30, wait=None)
         assert set(names(answer)) | {Path(p.id).name for p in answer.pending} == set(
             divided_map.in_circle(0, 0, 30)
@@ -212,15 +264,17 @@ def test_metadata_and_what_changed_since(daemon: Factory, divided_map: DividedMa
         assert len(unknown) == len(divided_map.corners)
 
 
+@BOTH
 def test_a_reload_brings_a_new_version_and_the_old_one_stays_readable(
-    daemon: Factory, divided_map: DividedMap
+    daemon: Factory, divided_map: DividedMap, connect: Connect
 ) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+    one = daemon(divided_map.root)
+    with connect(one.endpoint) as client, shmmap.connect(one.endpoint) as admin:
         held = client.around(0, 0, 30)
         old = next(cell for cell in held if cell.id.endswith("/0_0.pcd"))
         copy = old.xyz.copy()
         divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(9), (0, 0), 321))
-        client.reload()
+        admin.reload()
         (new,) = answer = client.differential(shmmap.Circle(0, 0, 30), held)
         assert answer.removed == ()
         assert new.id == old.id
@@ -250,56 +304,53 @@ def test_show_stats_and_evict(daemon: Factory, divided_map: DividedMap) -> None:
         assert client.stats().sessions[0].cells == 0
 
 
+@BOTH
 def test_a_handle_that_went_stale_is_asked_for_again(
-    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+    daemon: Factory, divided_map: DividedMap, late: Late
 ) -> None:
     """Evict everything just before the first attach, through another client of the same daemon."""
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
-        evicted: list[int] = []
-
-        def attach_late(*args: Any, **options: Any) -> Any:
-            if not evicted:
-                evicted.append(other.evict().freed)
-            return attach(*args, **options)
-
-        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+    evicted: list[int] = []
+    with (
+        shmmap.connect(one.endpoint) as other,
+        late(one.endpoint, lambda: evicted.append(other.evict().freed), 1) as client,
+    ):
         answer = client.selected(["20_20.pcd", "0_0.pcd", "20_20.pcd"])
-        assert evicted
+        assert evicted == [2]
         assert names(answer) == ["20_20.pcd", "0_0.pcd", "20_20.pcd"]
         assert answer.complete
         for cell in answer:
             assert_bits(cell, divided_map)
 
 
+@BOTH
 @pytest.mark.root
 @pytest.mark.parametrize("kind", ["file", "pipe", "directory"])
 def test_a_name_that_somebody_else_took_meanwhile(
-    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, kind: str
+    daemon: Factory, divided_map: DividedMap, late: Late, kind: str
 ) -> None:
     """In /dev/shm everybody may make files: only what belongs to the daemon's user is its segment."""
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
+    taken: list[Path] = []
+
+    def take() -> None:
+        place = Path(one.shm_dir, one.segments()[0])
+        forged = place.read_bytes()
+        other.evict()
+        taken.append(place)
+        if kind == "pipe":
+            os.mkfifo(place)
+        elif kind == "directory":
+            place.mkdir()
+        else:
+            place.write_bytes(forged[:4096] + bytes(len(forged) - 4096))
+        place.chmod(0o755)
+        os.chown(place, 12345, 12345)
+
+    with ExitStack() as ends:
+        other = ends.enter_context(shmmap.connect(one.endpoint))
         other.selected(["0_0.pcd", "20_20.pcd"])
-        taken: list[Path] = []
-
-        def attach_late(name: str, **options: Any) -> Any:
-            if not taken:
-                place = Path(f"{one.shm_dir}{name}")
-                forged = place.read_bytes()
-                other.evict()
-                taken.append(place)
-                if kind == "pipe":
-                    os.mkfifo(place)
-                elif kind == "directory":
-                    place.mkdir()
-                else:
-                    place.write_bytes(forged[:4096] + bytes(len(forged) - 4096))
-                place.chmod(0o755)
-                os.chown(place, 12345, 12345)
-            return attach(name, **options)
-
-        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+        client = ends.enter_context(late(one.endpoint, take, 1))
         answer = client.selected(["0_0.pcd", "20_20.pcd"])
         assert taken
         assert answer.complete
@@ -308,25 +359,24 @@ def test_a_name_that_somebody_else_took_meanwhile(
         taken[0].rmdir() if kind == "directory" else taken[0].unlink()
 
 
-def test_handles_that_stay_stale_end_as_pending(
-    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@BOTH
+def test_handles_that_stay_stale_end_as_pending(daemon: Factory, divided_map: DividedMap, late: Late) -> None:
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client, shmmap.connect(one.endpoint) as other:
-
-        def attach_late(*args: Any, **options: Any) -> Any:
-            other.evict()
-            return attach(*args, **options)
-
-        monkeypatch.setattr("shmmap.client.attaching.attach", attach_late)
+    with (
+        shmmap.connect(one.endpoint) as other,
+        late(one.endpoint, lambda: other.evict(), np.inf) as client,
+    ):
         answer = client.selected(["0_0.pcd"])
         assert (answer.cells, answer.failed) == ((), ())
         assert answer.pending == (shmmap.PendingLayer(divided_map.id("0_0.pcd"), "points"),)
 
 
 @pytest.mark.parametrize("wait", [-1.0, -6.0, np.inf, np.nan])
-def test_waits_that_make_no_sense(daemon: Factory, divided_map: DividedMap, wait: float) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+@BOTH
+def test_waits_that_make_no_sense(
+    daemon: Factory, divided_map: DividedMap, connect: Connect, wait: float
+) -> None:
+    with connect(daemon(divided_map.root).endpoint) as client:
         with pytest.raises(BadRequest, match="wait"):
             client.around(0, 0, 5, wait=wait)
         assert client.around(0, 0, 5).complete
@@ -348,11 +398,12 @@ def test_a_daemon_that_ends_between_its_answer_and_the_attaching(
             client.around(0, 0, 5, wait=None)
 
 
+@BOTH
 def test_views_and_client_survive_a_killed_and_restarted_daemon(
-    daemon: Factory, divided_map: DividedMap
+    daemon: Factory, divided_map: DividedMap, connect: Connect
 ) -> None:
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client:
+    with connect(one.endpoint) as client:
         held = client.around(0, 0, 30)
         epoch = client.epoch
         one.kill()
@@ -363,7 +414,9 @@ def test_views_and_client_survive_a_killed_and_restarted_daemon(
         assert client.epoch != epoch
         assert answer.epoch == client.epoch
         assert (answer.cells, answer.removed) == ((), ())
-        assert client.stats().sessions[0].session == client.welcome.session
+        with shmmap.connect(one.endpoint) as admin:
+            number = client.slot if isinstance(client, CppClient) else client.welcome.session
+            assert number in {session.session for session in admin.stats().sessions}
 
 
 def test_a_request_in_flight_at_a_killed_daemon_is_answered_by_the_next(
@@ -388,26 +441,32 @@ def test_a_request_in_flight_at_a_killed_daemon_is_answered_by_the_next(
         assert names(answer.result(60)) == divided_map.in_circle(0, 0, 30)
 
 
-def test_a_stopped_daemon_is_no_answer_and_goes_on_later(daemon: Factory, divided_map: DividedMap) -> None:
+@BOTH
+def test_a_stopped_daemon_is_no_answer_and_goes_on_later(
+    daemon: Factory, divided_map: DividedMap, connect: Connect
+) -> None:
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint, timeout=0.3) as client:
+    with connect(one.endpoint, timeout=0.3) as client:
         before = client.around(0, 0, 30, wait=30)
         one.send(signal.SIGSTOP)
         with pytest.raises(NoAnswer, match=r"no answer within 0\.3 s"):
-            client.stats()
+            client.around(0, 0, 30, wait=None)
         with pytest.raises(NoAnswer):
-            shmmap.connect(one.endpoint, connect_timeout=0.3)
+            connect(one.endpoint, connect_timeout=0.3)
         one.send(signal.SIGCONT)
         assert client.around(0, 0, 30, wait=30).cells == before.cells, (
             "late replies are not taken for this one"
         )
 
 
-def test_what_a_killed_daemon_leaves_is_a_stale_socket(daemon: Factory, divided_map: DividedMap) -> None:
+@BOTH
+def test_what_a_killed_daemon_leaves_is_a_stale_socket(
+    daemon: Factory, divided_map: DividedMap, connect: Connect
+) -> None:
     one = daemon(divided_map.root)
     one.kill()
     with pytest.raises(StaleSocket):
-        shmmap.connect(one.endpoint)
+        connect(one.endpoint)
 
 
 def test_another_major_version_is_refused(

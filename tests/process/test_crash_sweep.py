@@ -17,6 +17,7 @@ import shmmap
 from shmmap.errors import InternalError
 from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 from tests.process.conftest import DaemonFactory
+from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
@@ -160,9 +161,32 @@ held = client.around(0, 0, 30, wait=30.0).raise_for_failures()
 """
 
 
+def die_in_python(request: pytest.FixtureRequest, endpoint: str, crash: str) -> int:
+    """Run a client that is to die; returns its exit code."""
+    return subprocess.run(
+        [sys.executable, "-c", CLIENT, endpoint], env={**os.environ, CRASH: crash}, cwd=ROOT
+    ).returncode
+
+
+def die_in_cpp(request: pytest.FixtureRequest, endpoint: str, crash: str) -> int:
+    """Do the same in C++."""
+    client = CppClient(request.getfixturevalue("cpp_program"), endpoint, environment={CRASH: crash})
+    with pytest.raises((AssertionError, BrokenPipeError), match=r"ended with -9|Broken pipe"):
+        client.around(0, 0, 30, wait=30.0)
+    return client.program.close()
+
+
 @pytest.mark.parametrize("label", CLIENT_STEPS)
 @pytest.mark.parametrize("number", [1, 3])
-def test_client(daemon: DaemonFactory, divided_map: DividedMap, label: str, number: int) -> None:
+@pytest.mark.parametrize("die", [die_in_python, die_in_cpp])
+def test_client(
+    daemon: DaemonFactory,
+    divided_map: DividedMap,
+    label: str,
+    number: int,
+    die: Callable[[pytest.FixtureRequest, str, str], int],
+    request: pytest.FixtureRequest,
+) -> None:
     """What it had is free as soon as it is dead; another client notices nothing."""
     if label == "client.answer":
         number = 1
@@ -170,12 +194,7 @@ def test_client(daemon: DaemonFactory, divided_map: DividedMap, label: str, numb
     with shmmap.connect(one.endpoint) as other:
         near = divided_map.in_circle(0, 0, 30)
         held = whole(other, 0, 0, 5)
-        done = subprocess.run(
-            [sys.executable, "-c", CLIENT, one.endpoint],
-            env={**os.environ, CRASH: f"{label}:{number}"},
-            cwd=ROOT,
-        )
-        assert done.returncode == -9
+        assert die(request, one.endpoint, f"{label}:{number}") == -9
         assert other.evict().pinned == len(held)
         one.until_segments(len(held), lambda: other.stats())
         assert_right(whole(other, 0, 0, 30), divided_map, near)

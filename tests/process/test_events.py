@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -17,22 +18,26 @@ import zmq
 from shmmap import BadRequest, EventStream, Missed
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
+from tests.support.cpp_client import CppEventStream
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import unpack
 from tests.support.raw_client import RawClient
 
 Connect = Callable[..., RawClient]
-Listen = Callable[..., EventStream]
+Listen = Callable[..., Any]
 
 
-@pytest.fixture
-def listen(daemon: DaemonFactory) -> Iterator[Listen]:
-    """Open event streams, closed before the daemon is judged."""
-    opened: list[EventStream] = []
+@pytest.fixture(params=["python", "c++"])
+def listen(daemon: DaemonFactory, request: pytest.FixtureRequest) -> Iterator[Listen]:
+    """Open event streams, in Python and in C++, closed before the daemon is judged."""
+    opened: list[Any] = []
+    make: Callable[..., Any] = EventStream
+    if request.param == "c++":
+        make = partial(CppEventStream, request.getfixturevalue("cpp_program"))
 
-    def factory(to: DaemonProcess, **options: Any) -> EventStream:
-        stream = EventStream(to.endpoint, timeout=30.0, **options)
+    def factory(to: DaemonProcess, **options: Any) -> Any:
+        stream = make(to.endpoint, timeout=30.0, **options)
         opened.append(stream)
         return stream
 
@@ -41,7 +46,7 @@ def listen(daemon: DaemonFactory) -> Iterator[Listen]:
         stream.close()
 
 
-def until(stream: EventStream, last: Callable[[Any], bool]) -> list[Any]:
+def until(stream: Any, last: Callable[[Any], bool]) -> list[Any]:
     """Take events up to the one that ``last`` says yes to."""
     found: list[Any] = []
     while not found or not last(found[-1]):

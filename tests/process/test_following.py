@@ -7,6 +7,7 @@ What each step must bring is computed here from the files and their corners alon
 from __future__ import annotations
 
 import os
+import shutil
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.cpp_client import CppFollower
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.following_client import FollowingClient
 from tests.support.pcd_files import read_pcd, write_pcd
@@ -22,17 +24,23 @@ from tests.support.raw_client import RawClient
 
 Connect = Callable[..., RawClient]
 Pose = tuple[float, float]
+Follower = FollowingClient | CppFollower
 PROCESSES = 8
 
 
 @pytest.fixture
-def followers() -> Iterator[Callable[[str], list[FollowingClient]]]:
-    """Start eight clients, half of them with a window, half asking themselves."""
-    started: list[FollowingClient] = []
+def followers(request: pytest.FixtureRequest) -> Iterator[Callable[[str], list[Follower]]]:
+    """Start eight clients, half of them with a window; half of each are in C++, where there is g++."""
+    started: list[Follower] = []
+    program: Path | None = request.getfixturevalue("cpp_program") if shutil.which("g++") else None
 
-    def start(endpoint: str) -> list[FollowingClient]:
-        modes = ("differential", "window") * (PROCESSES // 2)
-        started.extend(FollowingClient(endpoint, mode) for mode in modes)
+    def start(endpoint: str) -> list[Follower]:
+        for number in range(PROCESSES):
+            mode = ("differential", "window")[number % 2]
+            if program is not None and number >= PROCESSES // 2:
+                started.append(CppFollower(program, endpoint, mode))
+            else:
+                started.append(FollowingClient(endpoint, mode))
         return started
 
     yield start
@@ -103,7 +111,7 @@ class Expected:
 
 
 def follow(
-    clients: list[FollowingClient],
+    clients: list[Follower],
     expected: Expected,
     poses: list[Pose],
     radius: float,
@@ -145,8 +153,8 @@ def start(
     daemon: DaemonFactory,
     connect: Connect,
     made: DividedMap,
-    followers: Callable[[str], list[FollowingClient]],
-) -> tuple[list[FollowingClient], Callable[[], None]]:
+    followers: Callable[[str], list[Follower]],
+) -> tuple[list[Follower], Callable[[], None]]:
     one = daemon(made.root)
     control = connect(one)
 
@@ -160,7 +168,7 @@ def test_on_a_generated_map(
     daemon: DaemonFactory,
     connect: Connect,
     tmp_path: Path,
-    followers: Callable[[str], list[FollowingClient]],
+    followers: Callable[[str], list[Follower]],
 ) -> None:
     made = make_map(tmp_path / "map", columns=14, rows=14, points=300)
     clients, reload = start(daemon, connect, made, followers)
@@ -172,7 +180,7 @@ def test_on_the_real_map(
     connect: Connect,
     tmp_path: Path,
     data_dir: Path,
-    followers: Callable[[str], list[FollowingClient]],
+    followers: Callable[[str], list[Follower]],
 ) -> None:
     """The recorded poses, radius 40 m."""
     source = read_pcd(data_dir / "kitti0005_map" / "map_static_v005.pcd")
@@ -189,7 +197,7 @@ def test_on_the_tiled_map(
     connect: Connect,
     tmp_path: Path,
     data_dir: Path,
-    followers: Callable[[str], list[FollowingClient]],
+    followers: Callable[[str], list[Follower]],
 ) -> None:
     """5 900 cells: the real map, ten by ten times at 220 m; a route across it, radius 150 m.
 

@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Where cells are wanted, and where the client is.  Metres in the frame of the map.
+
+#ifndef SHMMAP_AREAS_HPP
+#define SHMMAP_AREAS_HPP
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <variant>
+#include <vector>
+
+#include <shmmap/errors.hpp>
+
+namespace shmmap {
+
+/// Lowest and highest z of an area, metres; a cell whose bounds are not known yet belongs to it.
+struct ZRange {
+  double min = 0.0, max = 0.0;
+};
+
+/// Cells whose nearest point is within `radius` of (x, y).
+struct Circle {
+  double x = 0.0, y = 0.0, radius = 0.0;
+  std::optional<ZRange> z = std::nullopt;
+};
+
+/// Autoware's test: the cell's box grown by `radius` contains (x, y).
+struct Square {
+  double x = 0.0, y = 0.0, radius = 0.0;
+  std::optional<ZRange> z = std::nullopt;
+};
+
+/// Cells that touch the rectangle.
+struct Box {
+  double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
+  std::optional<ZRange> z = std::nullopt;
+};
+
+using Area = std::variant<Circle, Square, Box>;
+
+/// Where the client is and is going: it decides what stays in memory longest.  Metres, m/s, radians.
+struct Intent {
+  double x = 0.0, y = 0.0, vx = 0.0, vy = 0.0;
+  std::optional<double> heading = std::nullopt;
+  std::vector<std::array<double, 2>> route = {};
+};
+
+namespace detail {
+
+/// Sides of a rectangle.
+struct Sides {
+  double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
+};
+
+/// The smallest rectangle around an area; a square's has what Autoware's float messages make of it.
+inline Sides bounds(const Area& area) {
+  if (const auto* box = std::get_if<Box>(&area)) return {box->min_x, box->min_y, box->max_x, box->max_y};
+  const auto around = [](double x, double y, double radius) {
+    return Sides{x - radius, y - radius, x + radius, y + radius};
+  };
+  if (const auto* circle = std::get_if<Circle>(&area)) return around(circle->x, circle->y, circle->radius);
+  const auto& square = std::get<Square>(area);
+  const auto rounded = [](double value) { return static_cast<double>(static_cast<float>(value)); };
+  return around(rounded(square.x), rounded(square.y), rounded(square.radius));
+}
+
+inline double distance_to(const Sides& box, double x, double y) {
+  return std::hypot(std::max({box.min_x - x, x - box.max_x, 0.0}), std::max({box.min_y - y, y - box.max_y, 0.0}));
+}
+
+inline double farthest_in(const Sides& box, double x, double y) {
+  return std::hypot(std::max(std::abs(box.min_x - x), std::abs(box.max_x - x)),
+                    std::max(std::abs(box.min_y - y), std::abs(box.max_y - y)));
+}
+
+inline bool lies_in(const Sides& inner, const Sides& outer) {
+  return outer.min_x <= inner.min_x && outer.min_y <= inner.min_y && inner.max_x <= outer.max_x &&
+         inner.max_y <= outer.max_y;
+}
+
+/// Whether a circle lies wholly in an area, as far as one can be sure of it.
+inline bool contains_circle(const Area& area, double x, double y, double radius) {
+  if (const auto* circle = std::get_if<Circle>(&area))
+    return std::hypot(x - circle->x, y - circle->y) + radius <= circle->radius;
+  const Sides sides = bounds(area);
+  if (std::holds_alternative<Square>(area)) {  // by so much a box may be rounded away
+    const auto most = static_cast<float>(std::max({std::abs(sides.min_x), std::abs(sides.min_y),
+                                                   std::abs(sides.max_x), std::abs(sides.max_y)}));
+    radius += static_cast<double>(std::nextafter(most, std::numeric_limits<float>::infinity()) - most);
+  }
+  return lies_in({x - radius, y - radius, x + radius, y + radius}, sides);
+}
+
+/// Whether a cell's box belongs to an area: the daemon's own test.
+inline bool overlaps(const Area& area, const Sides& cell) {
+  if (const auto* circle = std::get_if<Circle>(&area)) {
+    const double dx = std::max({cell.min_x - circle->x, circle->x - cell.max_x, 0.0});
+    const double dy = std::max({cell.min_y - circle->y, circle->y - cell.max_y, 0.0});
+    return dx * dx + dy * dy <= circle->radius * circle->radius;
+  }
+  if (const auto* box = std::get_if<Box>(&area))
+    return cell.min_x <= box->max_x && cell.max_x >= box->min_x && cell.min_y <= box->max_y &&
+           cell.max_y >= box->min_y;
+  const auto& square = std::get<Square>(area);
+  const auto rounded = [](double value) { return static_cast<double>(static_cast<float>(value)); };
+  const double x = rounded(square.x), y = rounded(square.y), radius = rounded(square.radius);
+  return rounded(cell.min_x) - radius <= x && x <= rounded(cell.max_x) + radius &&
+         rounded(cell.min_y) - radius <= y && y <= rounded(cell.max_y) + radius;
+}
+
+inline void check_circle(double x, double y, double radius) {
+  if (!std::isfinite(x) || !std::isfinite(y) || !std::isfinite(radius) || radius < 0.0)
+    throw BadRequest("bad_request", "a circle has a finite centre, and a radius that is not below zero");
+}
+
+}  // namespace detail
+
+}  // namespace shmmap
+
+#endif  // SHMMAP_AREAS_HPP

@@ -1,0 +1,512 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A client of the daemon.
+
+#ifndef SHMMAP_CLIENT_HPP
+#define SHMMAP_CLIENT_HPP
+
+#include <fcntl.h>
+#include <poll.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <ctime>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include <shmmap/detail/messages.hpp>
+#include <shmmap/detail/socket.hpp>
+
+#ifndef SHMMAP_FAILPOINT
+#define SHMMAP_FAILPOINT(label)  // tests end the process here
+#endif
+
+namespace shmmap {
+
+namespace detail {
+class NothingNew;
+}
+
+/// How a client finds the daemon and what it says of itself.
+struct Options {
+  std::string endpoint = {};  ///< the socket's path; empty: the environment says, as for every client
+  std::string name = {};      ///< how the program is listed (`shmmap top`); at most 64 characters
+  std::string shm_dir = {};   ///< where this process finds segments; empty: `SHMMAP_SHM_DIR`, or as the daemon says
+  double patience = 5.0;      ///< seconds to wait for an answer, beyond those that the daemon may take
+};
+
+namespace detail {
+
+inline std::string short_text(double number) {
+  std::array<char, 32> text{};
+  std::snprintf(text.data(), text.size(), "%.3g", number);  // NOLINT(cppcoreguidelines-pro-type-vararg)
+  return text.data();
+}
+
+inline std::string variable(const char* name) {
+  const char* value = std::getenv(name);  // NOLINT(concurrency-mt-unsafe): nobody here changes it
+  return value != nullptr ? value : "";
+}
+
+/// The sockets to try, the first one first.
+inline std::vector<std::string> endpoints(std::string given) {
+  if (given.empty()) given = variable("SHMMAP_ENDPOINT");
+  if (given.compare(0, 6, "ipc://") == 0) given.erase(0, 6);
+  if (!given.empty()) return {given};
+  const std::string named = variable("SHMMAP_INSTANCE"), directory = variable("SHMMAP_RUNTIME_DIR");
+  const std::string file = "/" + (named.empty() ? "default" : named) + ".sock";
+  if (!directory.empty()) return {directory + file};
+  const std::string users = variable("XDG_RUNTIME_DIR");
+  if (users.empty()) return {"/run/shmmap" + file};
+  return {users + "/shmmap" + file, "/run/shmmap" + file};
+}
+
+}  // namespace detail
+
+/// One connection to the daemon, and one session.
+class Client {
+ public:
+  static constexpr double default_wait = 5.0;
+
+  /// Find the daemon and open a session; throws Unreachable, ProtocolMismatch, Refused.
+  explicit Client(Options options = {}) : options_(std::move(options)) {
+    if (options_.shm_dir.empty()) options_.shm_dir = detail::variable("SHMMAP_SHM_DIR");
+    const auto paths = detail::endpoints(options_.endpoint);
+    for (std::size_t at = 0; at < paths.size(); ++at) {
+      try {
+        path_ = paths[at];
+        connect();
+        return;
+      } catch (const Unreachable& error) {
+        if (at + 1 == paths.size() || error.code() == "no_answer") throw;
+      }
+    }
+  }
+  Client(Client&&) = default;
+  Client& operator=(Client&&) = default;
+  ~Client() {
+    try {
+      if (socket_.is_open()) socket_.send(begun("bye", next_request(), 0).data());
+    } catch (const std::exception&) {  // it is over anyway
+    }
+  }
+
+  /// All cells of an area, and what of them could not be had.  `wait`: seconds that the daemon may take to load
+  /// (at most 3600); none: what is in memory, the rest is `pending` and being loaded.
+  Answer area(const Area& area, const std::vector<std::string>& layers = {"points"},
+              std::optional<double> wait = default_wait, const std::optional<Intent>& intent = std::nullopt) {
+    return cells("area", wait, [&](detail::Writer& to) {
+      detail::write(to, area);
+      detail::write(to, layers);
+      detail::write(to, wait);
+      detail::write(to, intent);
+    }, 4);
+  }
+
+  /// What of an area the client does not hold, and what it holds in vain: apply removals before additions.
+  /// `packed` are versions alone, each of one layer of one cell.
+  Answer differential(const Area& area, const std::vector<Held>& held, const std::vector<std::uint64_t>& packed = {},
+                      const std::vector<std::string>& layers = {"points"},
+                      std::optional<double> wait = default_wait,
+                      const std::optional<Intent>& intent = std::nullopt) {
+    return cells("differential", wait, [&](detail::Writer& to) {
+      detail::write(to, area);
+      detail::write(to, layers);
+      to.array(held.size());
+      for (const Held& one : held) detail::write(to, one);
+      to.binary(packed.data(), packed.size() * sizeof(std::uint64_t));
+      detail::write(to, wait);
+      detail::write(to, intent);
+    }, 6);
+  }
+
+  /// Cells by id, in that order.
+  Answer selected(const std::vector<std::string>& ids, const std::vector<std::string>& layers = {"points"},
+                  std::optional<double> wait = default_wait, const std::optional<Intent>& intent = std::nullopt) {
+    return cells("selected", wait, [&](detail::Writer& to) {
+      detail::write(to, ids);
+      detail::write(to, layers);
+      detail::write(to, wait);
+      detail::write(to, intent);
+    }, 4);
+  }
+
+  /// The cells of the map (of an area of it), whether they are in memory or not.
+  MapListing metadata(const std::optional<Area>& area = std::nullopt) {
+    for (int round = 0; round < rounds; ++round)
+      if (auto listing = pages(area)) return std::move(*listing);
+    throw Unreachable("no_answer", path_ + ": the map changed each time before its list had come", "ask again");
+  }
+
+  /// Tell the daemon at once what was unmapped; each request does so before.
+  void release() {
+    tell_unmapped();
+    const auto number = next_request();
+    auto message = begun("release", number, 1);
+    message.binary("", 0);
+    std::string reply;
+    ask(number, message.data(), "released", 0.0, reply);
+  }
+
+  /// Counts the daemon's lives.
+  [[nodiscard]] std::uint64_t epoch() const noexcept { return welcome_.epoch; }
+  /// The session's number, as in `shmmap top`.
+  [[nodiscard]] std::uint64_t session() const noexcept { return welcome_.session; }
+  [[nodiscard]] const std::string& instance() const noexcept { return welcome_.instance; }
+  /// The frame of all coordinates.
+  [[nodiscard]] const std::string& frame_id() const noexcept { return welcome_.frame_id; }
+  /// The connection's descriptor, for event loops: readable when the daemon has ended.
+  [[nodiscard]] int fd() const noexcept { return socket_.fd(); }
+  /// Whether the connection stands, as far as the kernel knows; the next request makes another one.
+  [[nodiscard]] bool is_connected() const noexcept { return socket_.stands(); }
+  /// The daemon's socket.
+  [[nodiscard]] const std::string& path() const noexcept { return path_; }
+
+ private:
+  friend class Window;
+  friend class EventStream;
+  friend class detail::NothingNew;
+  using Clock = detail::Clock;
+
+  static constexpr double greeting_s = 1.0;
+  static constexpr int attempts = 8;
+  static constexpr int rounds = 5;  // a listing is begun again when the map has changed meanwhile
+  static constexpr std::uint64_t page_rows = 10'000;
+
+  static Clock::time_point after(double seconds) {
+    return Clock::now() + std::chrono::duration_cast<Clock::duration>(detail::Seconds(std::min(seconds, 1e6)));
+  }
+
+  std::uint64_t next_request() { return ++request_; }
+
+  static detail::Writer begun(std::string_view tag, std::uint64_t number, std::size_t elements) {
+    detail::Writer message;
+    message.array(2 + elements);
+    message.text(tag);
+    message.number(number);
+    return message;
+  }
+
+  // --- the connection ---
+
+  void connect() {
+    socket_ = detail::Socket(path_, detail::ready_of_dealer);
+    const auto number = next_request();
+    auto message = begun("hello", number, 4);
+    message.number(1);
+    message.number(4);
+    message.text(options_.name);
+    message.number(welcome_.session);
+    socket_.send(message.data());
+    std::string reply;
+    const auto until = after(greeting_s);
+    while (socket_.receive(reply, until)) {
+      detail::Reader reader(reply);
+      detail::Row row(reader);
+      if (const auto tag = row.get().text(); is_answer(row, number, tag)) {
+        if (tag == "error") detail::read_error(row);
+        if (tag != "welcome") throw ProtocolMismatch("protocol_mismatch", "hello was answered by " + std::string(tag));
+        welcome_ = detail::read_welcome(row);
+        ++handshakes_;
+        look_whose_segments();
+        return;
+      }
+      row.end();
+    }
+    socket_ = detail::Socket();
+    throw Unreachable("no_answer", path_ + ": the daemon does not answer", "it is stopped, hung or overloaded");
+  }
+
+  static bool is_answer(detail::Row& row, std::uint64_t number, std::string_view tag) {
+    const auto found = row.get().number();
+    return found == number || (found == 0 && tag == "error");
+  }
+
+  /// Send a request until it is answered; `reply` is what came.
+  void ask(std::uint64_t number, const std::string& message, std::string_view tag, double wait, std::string& reply) {
+    const auto deadline = after(wait + options_.patience);
+    double pause = wait + 1.0;
+    bool may_be_back = true;  // the first time it is asked at once
+    while (true) {
+      try {
+        if (!socket_.is_open()) connect();
+        socket_.send(message);
+        const auto until = std::min(deadline, after(pause));
+        pause *= 2.0;
+        while (socket_.receive(reply, until)) {
+          detail::Reader reader(reply);
+          detail::Row row(reader);
+          const auto kind = row.get().text();
+          if (!is_answer(row, number, kind)) {
+            row.end();
+            continue;
+          }
+          if (kind == tag) return;
+          if (kind != "error")
+            throw ProtocolMismatch("protocol_mismatch", std::string(tag) + " was answered by " + std::string(kind));
+          detail::read_error(row);
+        }
+        if (Clock::now() >= deadline)
+          throw Unreachable("no_answer", path_ + ": no answer within " + detail::short_text(wait + options_.patience) +
+                                             " s", "is the daemon stopped, hung or overloaded? see `shmmap health`");
+      } catch (const Refused& error) {
+        if (error.code() != "no_session" || Clock::now() >= deadline) throw;
+        socket_ = detail::Socket();  // hello on a new connection takes the session over
+      } catch (const Unreachable& error) {
+        socket_ = detail::Socket();
+        if (error.code() == "no_answer" || error.code() == "no_permission" || Clock::now() >= deadline) throw;
+        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, 20);  // nobody says when it listens again
+      }
+    }
+  }
+
+  /// All pages of the map's list; nothing if it changed between them.
+  std::optional<MapListing> pages(const std::optional<Area>& area) {
+    MapListing listing;
+    std::optional<std::uint64_t> start = 0;
+    for (bool first = true; start; first = false) {
+      const auto number = next_request();
+      auto message = begun("metadata", number, 4);
+      if (area) detail::write(message, *area);
+      else message.nil();
+      message.nil();
+      message.number(*start);
+      message.number(page_rows);
+      std::string reply;
+      ask(number, message.data(), "metadata_page", 0.0, reply);
+      detail::Reader reader(reply);
+      detail::Row row(reader);
+      row.get().skip(1);
+      row.get().skip(1);
+      const auto epoch = row.get().number(), map_version = row.get().number();
+      if (!first && (epoch != listing.epoch || map_version != listing.map_version)) return std::nullopt;
+      listing.epoch = epoch, listing.map_version = map_version;
+      start = detail::read_page(row, listing.cells);
+    }
+    for (auto& cell : listing.cells) cell.id = whole(cell.id);
+    return listing;
+  }
+
+  // --- cells ---
+
+  template <typename Write>
+  Answer cells(std::string_view tag, const std::optional<double>& wait, const Write& write, std::size_t elements) {
+    if (wait && !(*wait >= 0.0 && *wait <= 3600.0))
+      throw BadRequest("bad_request", "wait is 0 to 3600 seconds, not " + detail::short_text(*wait));
+    tell_unmapped();
+    const auto deadline = after(wait.value_or(0.0) + options_.patience);
+    auto found = one_reply(tag, wait.value_or(0.0), write, elements);
+    Answer answer = std::move(found.answer);
+    for (auto& [id, layer] : answer.pending) id = whole(id);
+    for (auto& failure : answer.failed)
+      if (failure.code != "unknown_cell") failure.id = whole(failure.id);
+    std::vector<CellPtr> places(found.handles.size());
+    std::vector<std::size_t> gone;
+    for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer);
+    for (int attempt = 0; !gone.empty() && attempt < attempts && Clock::now() < deadline; ++attempt)
+      ask_again(found.handles, places, gone, answer);
+    for (const auto at : gone) answer.pending.emplace_back(whole(found.handles[at].id), found.handles[at].layer);
+    for (auto& cell : places)
+      if (cell) answer.cells.push_back(std::move(cell));
+    return answer;
+  }
+
+  template <typename Write>
+  detail::Cells one_reply(std::string_view tag, double wait, const Write& write, std::size_t elements) {
+    const auto number = next_request();
+    auto message = begun(tag, number, elements);
+    write(message);
+    std::string reply;
+    ask(number, message.data(), "cells", wait, reply);
+    SHMMAP_FAILPOINT("client.answer");
+    detail::Reader reader(reply);
+    detail::Row row(reader);
+    row.get().skip(1);
+    row.get().skip(1);
+    return detail::read_cells(reader, row);
+  }
+
+  void take(const detail::Handle& handle, std::size_t at, std::vector<CellPtr>& places,
+            std::vector<std::size_t>& gone, Answer& answer) {
+    try {
+      places[at] = attached(handle);
+    } catch (const SegmentError& error) {  // one cell must not cost the others
+      if (error.code() == "stale_handle") gone.push_back(at);
+      else if (error.code() == "segment_corrupt")
+        answer.failed.push_back({whole(handle.id), handle.layer, "load_failed", error.what()});
+      else throw;
+    }
+  }
+
+  /// Ask anew for the handles whose segments were gone before they could be attached.
+  void ask_again(std::vector<detail::Handle>& handles, std::vector<CellPtr>& places, std::vector<std::size_t>& gone,
+                 Answer& answer) {
+    std::vector<std::string> ids, layers;
+    const auto add = [](std::vector<std::string>& to, const std::string& one) {
+      if (std::find(to.begin(), to.end(), one) == to.end()) to.push_back(one);
+    };
+    for (const auto at : gone) add(ids, handles[at].id), add(layers, handles[at].layer);
+    const std::optional<double> wait = options_.patience / 2.0;
+    auto found = one_reply("selected", *wait, [&](detail::Writer& to) {
+      detail::write(to, ids);
+      detail::write(to, layers);
+      detail::write(to, wait);
+    }, 3);
+    std::vector<std::size_t> still;
+    for (const auto at : std::exchange(gone, {})) {
+      const auto is_it = [&](const auto& one) { return one.id == handles[at].id && one.layer == handles[at].layer; };
+      if (const auto handle = std::find_if(found.handles.begin(), found.handles.end(), is_it);
+          handle != found.handles.end()) {
+        handles[at] = *handle;
+        take(handles[at], at, places, still, answer);
+        continue;
+      }
+      const auto& failed = found.answer.failed;
+      if (const auto failure = std::find_if(failed.begin(), failed.end(), is_it); failure != failed.end())
+        answer.failed.push_back({whole(failure->id), failure->layer, failure->code, failure->message});
+      else answer.pending.emplace_back(whole(handles[at].id), handles[at].layer);
+    }
+    gone = std::move(still);
+  }
+
+  std::string whole(const std::string& id) const {
+    return !id.empty() && id.front() == '/' ? id : welcome_.id_prefix + id;
+  }
+
+  [[nodiscard]] const std::string& shm_dir() const {
+    return options_.shm_dir.empty() ? welcome_.shm_dir : options_.shm_dir;
+  }
+
+  [[nodiscard]] std::string statistics_path() const { return shm_dir() + welcome_.segment_prefix + "statistics"; }
+
+  void look_whose_segments() {
+    struct stat status {};
+    const std::string path = statistics_path();
+    owner_ = ::lstat(path.c_str(), &status) == 0 ? std::optional<uid_t>(status.st_uid) : std::nullopt;
+  }
+
+  CellPtr attached(const detail::Handle& handle) {
+    auto& known = cells_[{handle.version, handle.layer}];
+    if (CellPtr there = known.lock()) return there;
+    CellPtr cell = attach(handle);
+    known = cell;
+    return cell;
+  }
+
+  [[nodiscard]] detail::Descriptor opened(const detail::Handle& handle, const std::string& path) const {
+    const auto until = Clock::now() + std::chrono::milliseconds(200);
+    while (true) {
+      detail::Descriptor fd(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK));  // NOLINT
+      if (fd.get() >= 0) return fd;
+      if (errno != EWOULDBLOCK || Clock::now() >= until) {
+        if (errno == ENOENT || errno == EWOULDBLOCK || errno == ELOOP) stale(handle);
+        throw SegmentError("segment_error", path + ": " + detail::error_text(errno));
+      }
+      const timespec pause{0, 200'000};
+      ::nanosleep(&pause, nullptr);  // the daemon looks at it in this moment, and says not when it is done
+    }
+  }
+
+  [[noreturn]] static void stale(const detail::Handle& handle) {
+    throw SegmentError("stale_handle", handle.segment + " (" + handle.id + ") is gone", "ask the daemon again");
+  }
+
+  CellPtr attach(const detail::Handle& handle) const {
+    using detail::read_at;
+    const auto fd = opened(handle, shm_dir() + welcome_.segment_prefix + handle.segment);
+    SHMMAP_FAILPOINT("client.open");
+    struct stat status {};
+    if (::fstat(fd.get(), &status) != 0) throw SegmentError("segment_error", detail::error_text(errno));
+    if (!S_ISREG(status.st_mode) || (owner_ && status.st_uid != *owner_)) stale(handle);
+    struct flock lock {};
+    lock.l_type = F_RDLCK;
+    lock.l_whence = SEEK_SET;
+    lock.l_start = static_cast<off_t>(welcome_.session);
+    lock.l_len = 1;
+    static_assert(sizeof(off_t) == 8, "compile with -D_FILE_OFFSET_BITS=64");
+    ::fcntl(fd.get(), F_OFD_SETLK, &lock);  // NOLINT: without it the segment is as safe, and its user unknown
+    SHMMAP_FAILPOINT("client.lock");
+    const auto size = static_cast<std::uint64_t>(status.st_size);
+    if (handle.offset > size || handle.bytes > size - handle.offset || size - handle.offset < 4096)
+      detail::corrupt(handle, "it has not the bytes of its handle");
+    const auto mapping = std::make_shared<const detail::Mapping>(fd.get(), static_cast<std::size_t>(size));
+    SHMMAP_FAILPOINT("client.map");
+    const unsigned char* segment = mapping->data() + handle.offset;
+    if (std::memcmp(segment, "SHMMAP\0\1", 8) != 0) detail::corrupt(handle, "it is no segment");
+    if (read_at<std::uint16_t>(segment, 8) != 1) detail::corrupt(handle, "it has another version");
+    if (read_at<std::uint32_t>(segment, 12) != 0x01020304U) detail::corrupt(handle, "it has another byte order");
+    const auto header_bytes = read_at<std::uint64_t>(segment, 16), total = read_at<std::uint64_t>(segment, 24);
+    if (header_bytes < 4096 || header_bytes > total || total > size - handle.offset)
+      detail::corrupt(handle, "its sizes are wrong");
+    const std::uint64_t end = header_bytes - 72;
+    if (detail::crc32(segment, static_cast<std::size_t>(end)) != read_at<std::uint32_t>(segment, end))
+      detail::corrupt(handle, "the header's checksum is wrong");
+    auto cell = std::make_shared<Cell>();
+    cell->id = whole(handle.id);
+    cell->layer = handle.layer;
+    cell->version = handle.version;
+    cell->min_x = handle.min_x, cell->min_y = handle.min_y, cell->max_x = handle.max_x, cell->max_y = handle.max_y;
+    cell->stale = handle.stale;
+    cell->rows = read_at<std::uint64_t>(segment, 32);
+    cell->source_points = read_at<std::uint64_t>(segment, 40);
+    cell->dropped_points = read_at<std::uint64_t>(segment, 48);
+    cell->z_min = read_at<double>(segment, 128);
+    cell->z_max = read_at<double>(segment, 136);
+    cell->frame_id = detail::text_in(segment, end, 200, handle);
+    Lattice lattice;
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+      cell->origin[axis] = read_at<double>(segment, 144 + 8 * axis);
+      lattice.leaf[axis] = read_at<double>(segment, 216 + 8 * axis);
+      lattice.first[axis] = read_at<std::int64_t>(segment, 240 + 8 * axis);
+      lattice.shape[axis] = read_at<std::uint64_t>(segment, 264 + 8 * axis);
+    }
+    if (lattice.leaf[0] != 0.0) cell->lattice = lattice;
+    detail::read_columns(*cell, handle, segment, header_bytes, total);
+    cell->mapping_ = mapping;
+    return cell;
+  }
+
+  /// Tell the daemon which versions nobody here maps any more: memory can be used again at once.
+  void tell_unmapped() {
+    std::vector<std::uint64_t> versions;
+    for (auto one = cells_.begin(); one != cells_.end();) {
+      if (one->second.expired()) {
+        versions.push_back(one->first.first);
+        one = cells_.erase(one);
+      } else {
+        ++one;
+      }
+    }
+    if (versions.empty() || !socket_.is_open()) return;
+    auto message = begun("release", next_request(), 1);
+    message.binary(versions.data(), versions.size() * sizeof(std::uint64_t));
+    try {
+      socket_.send(message.data());  // its answer is that to an id for which nobody waits
+    } catch (const Unreachable&) {
+      socket_ = detail::Socket();
+    }
+  }
+
+  Options options_;
+  std::string path_;
+  detail::Socket socket_;
+  detail::Welcome welcome_;
+  std::uint64_t request_ = 0, handshakes_ = 0;
+  std::optional<uid_t> owner_;
+  std::map<std::pair<std::uint64_t, std::string>, std::weak_ptr<const Cell>> cells_;
+};
+
+}  // namespace shmmap
+
+#endif  // SHMMAP_CLIENT_HPP

@@ -1,0 +1,210 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// One connection: ZMTP 3.0 over a Unix socket, which needs no library.
+
+#ifndef SHMMAP_DETAIL_SOCKET_HPP
+#define SHMMAP_DETAIL_SOCKET_HPP
+
+#include <poll.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <string>
+#include <string_view>
+#include <system_error>
+#include <utility>
+
+#include <shmmap/errors.hpp>
+
+namespace shmmap::detail {
+
+using Clock = std::chrono::steady_clock;
+using Seconds = std::chrono::duration<double>;
+
+/// A file descriptor that is closed with its owner.
+class Descriptor {
+ public:
+  explicit Descriptor(int fd = -1) noexcept : fd_(fd) {}
+  Descriptor(Descriptor&& other) noexcept : fd_(std::exchange(other.fd_, -1)) {}
+  Descriptor& operator=(Descriptor&& other) noexcept {
+    std::swap(fd_, other.fd_);
+    return *this;
+  }
+  Descriptor(const Descriptor&) = delete;
+  Descriptor& operator=(const Descriptor&) = delete;
+  ~Descriptor() {
+    if (fd_ >= 0) ::close(fd_);
+  }
+  [[nodiscard]] int get() const noexcept { return fd_; }
+
+ private:
+  int fd_;
+};
+
+inline std::string error_text(int number) { return std::generic_category().message(number); }
+
+/// One connection that speaks ZMTP 3.0 with the NULL mechanism, as PROTOCOL.md has it.
+class Socket {
+ public:
+  static constexpr std::uint64_t most_bytes = std::uint64_t{1} << 30;  // of one message
+  static constexpr std::size_t read_bytes = std::size_t{1} << 16;      // at once, at least
+
+  Socket() = default;
+
+  /// Connect and send what comes first; throws Unreachable.
+  Socket(const std::string& path, std::string_view ready) : path_(path) {
+    sockaddr_un address{};
+    if (path.size() >= sizeof address.sun_path)
+      throw Unreachable("no_socket", path + ": a socket's path has at most 107 bytes", "choose a shorter one");
+    address.sun_family = AF_UNIX;
+    std::memcpy(static_cast<void*>(address.sun_path), path.data(), path.size());
+    fd_ = Descriptor(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0));
+    if (fd_.get() < 0) throw Unreachable("no_socket", "no socket: " + error_text(errno));
+    if (::connect(fd_.get(), reinterpret_cast<const sockaddr*>(&address), sizeof address) != 0) refused(errno);
+    std::string greeting("\xff\0\0\0\0\0\0\0\0\x7f\x03\0NULL", 16);
+    greeting.resize(64);
+    output_ = greeting.append(ready);
+  }
+
+  [[nodiscard]] int fd() const noexcept { return fd_.get(); }
+  [[nodiscard]] bool is_open() const noexcept { return fd_.get() >= 0; }
+  /// Whether the other end is still there, as far as the kernel knows.
+  [[nodiscard]] bool stands() const noexcept {
+    pollfd one{fd_.get(), POLLRDHUP, 0};
+    return is_open() && ::poll(&one, 1, 0) == 0;
+  }
+
+  /// Have a message sent.
+  void send(std::string_view body) {
+    if (body.size() < 256) {
+      output_.append({'\0', static_cast<char>(static_cast<unsigned char>(body.size()))});
+    } else {
+      output_.push_back('\x02');
+      for (unsigned shift = 64; shift > 0; shift -= 8)
+        output_.push_back(static_cast<char>(static_cast<unsigned char>(body.size() >> (shift - 8))));
+    }
+    output_.append(body);
+    write_some();
+  }
+
+  /// The next message; nothing if there is none until then.  Throws Unreachable when the connection is over.
+  bool receive(std::string& message, Clock::time_point until) {
+    while (true) {
+      write_some();
+      while (parse(message)) {
+        if (complete_) return true;
+      }
+      if (!read_some() && !wait(until)) return false;
+    }
+  }
+
+ private:
+  [[noreturn]] void refused(int number) const {
+    switch (number) {
+      case ENOENT:
+      case ENOTDIR: throw Unreachable("no_socket", path_ + ": no daemon was started there");
+      case ECONNREFUSED: throw Unreachable("stale_socket", path_ + ": the daemon that listened there has ended");
+      case EACCES: throw Unreachable("no_permission", path_ + ": this user may not ask that daemon");
+      case EAGAIN: throw Unreachable("no_answer", path_ + ": the daemon takes nobody just now");
+      default: throw Unreachable("no_socket", path_ + ": " + error_text(number));
+    }
+  }
+  [[noreturn]] void lost(const std::string& why) const { throw Unreachable("connection_lost", path_ + ": " + why); }
+
+  void write_some() {
+    while (!output_.empty()) {
+      const auto sent = ::send(fd_.get(), output_.data(), output_.size(), MSG_NOSIGNAL);
+      if (sent < 0) {
+        if (errno == EINTR) continue;
+        if (errno == EAGAIN) return;
+        lost("the connection is over: " + error_text(errno));
+      }
+      output_.erase(0, static_cast<std::size_t>(sent));
+    }
+  }
+
+  bool read_some() {
+    if (start_ > 0 && start_ == input_.size()) {
+      input_.clear();
+      start_ = 0;
+    } else if (start_ > read_bytes) {
+      input_.erase(0, std::exchange(start_, 0));
+    }
+    const auto before = input_.size();
+    const auto missing = wanted_ - std::min(wanted_, before - start_);  // as the frame says: memory comes as bytes do
+    input_.resize(before + std::clamp<std::size_t>(missing, read_bytes, 16 * read_bytes));
+    const auto got = ::recv(fd_.get(), &input_[before], input_.size() - before, 0);
+    const int number = errno;
+    input_.resize(before + static_cast<std::size_t>(std::max<ssize_t>(got, 0)));
+    if (got > 0) return true;
+    if (got == 0) lost("the daemon has closed the connection");
+    if (number != EAGAIN && number != EINTR) lost("the connection is over: " + error_text(number));
+    return false;
+  }
+
+  bool wait(Clock::time_point until) const {
+    const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - Clock::now()).count() + 1;
+    if (until <= Clock::now()) return false;
+    pollfd one{fd_.get(), static_cast<short>(POLLIN | (output_.empty() ? 0 : POLLOUT)), 0};
+    ::poll(&one, 1, static_cast<int>(std::min<long long>(left, 1 << 30)));
+    return true;
+  }
+
+  /// Take the next frame out of what has come; `complete_` says whether it was a message, and not a command.
+  bool parse(std::string& message) {
+    const std::string_view input = std::string_view(input_).substr(start_);
+    complete_ = false;
+    wanted_ = 0;
+    if (!greeted_) {
+      if (input.size() < 64) return false;
+      if (input[0] != '\xff' || input[9] != '\x7f' || input[10] < 3 ||
+          input.substr(12, 20) != std::string_view("NULL\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0", 20))
+        throw ProtocolMismatch("protocol_mismatch", path_ + ": what listens there is no daemon of shmmap");
+      greeted_ = true;
+      start_ += 64;
+      return true;
+    }
+    if (input.size() < 2) return false;
+    const unsigned flags = static_cast<unsigned char>(input[0]);
+    const std::size_t head = (flags & 2U) != 0 ? 9 : 2;
+    if (input.size() < head) return false;
+    std::uint64_t size = 0;
+    for (const char one : input.substr(1, head - 1)) size = (size << 8) | static_cast<unsigned char>(one);
+    if ((flags & ~6U) != 0 || size > most_bytes) lost("what came is no message of a daemon");
+    if (input.size() - head < size) {
+      wanted_ = head + static_cast<std::size_t>(size);
+      return false;
+    }
+    const auto body = input.substr(head, static_cast<std::size_t>(size));
+    start_ += head + body.size();
+    if ((flags & 4U) == 0) {
+      message.assign(body);
+      complete_ = true;
+    } else if (body.size() >= 7 && body.substr(0, 5) == "\4PING") {
+      const auto context = body.substr(7, 16);
+      output_.append({'\4', static_cast<char>(5 + context.size())}).append("\4PONG").append(context);
+    }
+    return true;
+  }
+
+  std::string path_, input_, output_;
+  std::size_t start_ = 0, wanted_ = 0;
+  bool greeted_ = false, complete_ = false;
+  Descriptor fd_;
+};
+
+inline constexpr std::string_view ready_of_dealer{
+    "\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06" "DEALER", 30};
+inline constexpr std::string_view ready_of_subscriber{  // to everything
+    "\x04\x19\x05READY\x0bSocket-Type\0\0\0\x03" "SUB" "\0\x01\x01", 30};
+
+}  // namespace shmmap::detail
+
+#endif  // SHMMAP_DETAIL_SOCKET_HPP

@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What can go wrong.
+
+#ifndef SHMMAP_ERRORS_HPP
+#define SHMMAP_ERRORS_HPP
+
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+namespace shmmap {
+
+/// What went wrong: `what()`; `code()` is the name that it has in the protocol and in Python, `hint()` says
+/// what to do, if that is known.
+class Error : public std::runtime_error {
+ public:
+  Error(std::string code, const std::string& message, std::string hint = "")
+      : std::runtime_error(hint.empty() ? message : message + " (" + hint + ")"),
+        code_(std::move(code)),
+        hint_(std::move(hint)) {}
+  [[nodiscard]] const std::string& code() const noexcept { return code_; }
+  [[nodiscard]] const std::string& hint() const noexcept { return hint_; }
+
+ private:
+  std::string code_, hint_;
+};
+
+/// The request cannot be answered, however often it is sent.
+struct BadRequest : Error { using Error::Error; };
+/// There is no such column.
+struct NoColumn : BadRequest { using BadRequest::BadRequest; };
+/// Nobody answers: `no_socket`, `no_permission`, `stale_socket`, `connection_lost` or `no_answer`.
+struct Unreachable : Error { using Error::Error; };
+/// The daemon speaks another version, or no shmmap at all.
+struct ProtocolMismatch : Error { using Error::Error; };
+/// The daemon refused: any other code.
+struct Refused : Error { using Error::Error; };
+/// A segment is not what its handle says: `segment_corrupt`, or `stale_handle` where it is gone.
+struct SegmentError : Error { using Error::Error; };
+
+}  // namespace shmmap
+
+#endif  // SHMMAP_ERRORS_HPP
