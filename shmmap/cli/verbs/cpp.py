@@ -22,8 +22,8 @@ To compile with the header, in one of these ways:
   g++ -std=c++17 $(shmmap cpp --includes) PROGRAM.cpp
   PKG_CONFIG_PATH="$(shmmap cpp --pkgconfigdir)" pkg-config --cflags shmmap
   cmake -Dshmmap_DIR="$(shmmap cpp --cmakedir)" ...
-CMakeLists.txt then has find_package(shmmap REQUIRED) and target_link_libraries(PROGRAM PRIVATE shmmap::shmmap).
-There is nothing to link.  Exit code: 0."""
+In CMakeLists.txt: find_package(shmmap REQUIRED), target_link_libraries(PROGRAM PRIVATE shmmap::shmmap).
+Exit code: 0."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     root = prefix()
     includes = f"-I{root / 'include'}"
     if args.includes:
-        print_line(shlex.quote(includes))  # for a shell that reads it; as it stands without special characters
+        print_line(shlex.quote(includes))  # as pybind11 does: for a shell or a Makefile
     elif args.cmakedir:
         print_line(str(root / "share" / "cmake" / "shmmap"))
     elif args.pkgconfigdir:

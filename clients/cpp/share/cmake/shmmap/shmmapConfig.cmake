@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 #
-# What find_package(shmmap) finds: the target shmmap::shmmap, a header and the C++ standard that it needs.
-# It asks where it lies itself: ../../../include has the header, wherever all of it was moved to.
+# What find_package(shmmap) finds: the target shmmap::shmmap, headers and the C++ standard that they need.
+# They are in ../../../include from here, wherever all of it was moved to.
 
 get_filename_component(_shmmap_prefix "${CMAKE_CURRENT_LIST_DIR}/../../.." ABSOLUTE)
 if(NOT EXISTS "${_shmmap_prefix}/include/shmmap/shmmap.hpp")
