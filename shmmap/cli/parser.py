@@ -39,6 +39,7 @@ VERBS: Final = {
     "doctor": "doctor",
     "config": "config",
     "unit": "unit",
+    "cpp": "cpp",
     "health": "health",
     "version": "version",
 }

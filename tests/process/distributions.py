@@ -29,7 +29,13 @@ SOURCE = (
     ".ci/",
 )  # folders of the source distribution
 TOP = {"README.md", "CHANGELOG.md", "LICENSE", "pyproject.toml", ".gitignore"}
-WHEEL = {"shmmap/": "shmmap/", "clients/shmmap_clients/": "shmmap_clients/", "systemd/": "shmmap/_systemd/"}
+WHEEL = {
+    "shmmap/": "shmmap/",
+    "clients/shmmap_clients/": "shmmap_clients/",
+    "clients/cpp/include/": "shmmap/_cpp/include/",
+    "clients/cpp/share/": "shmmap/_cpp/share/",
+    "systemd/": "shmmap/_systemd/",
+}
 ABOUT = {"METADATA", "WHEEL", "RECORD", "entry_points.txt", "licenses/LICENSE"}
 # named one by one, so that the lists above cannot lose them together with the tree
 NEEDED = {
@@ -39,6 +45,10 @@ NEEDED = {
     "shmmap/CONTAINERS.md",
     "shmmap/protocol/PROTOCOL.md",
     "shmmap/segment/LAYOUT.md",
+    "shmmap/_cpp/include/shmmap/shmmap.hpp",
+    "shmmap/_cpp/share/cmake/shmmap/shmmapConfig.cmake",
+    "shmmap/_cpp/share/cmake/shmmap/shmmapConfigVersion.cmake",
+    "shmmap/_cpp/share/pkgconfig/shmmap.pc",
     "shmmap/_systemd/README.md",
     "shmmap/_systemd/shmmap.toml",
     "shmmap/_systemd/system/shmmapd.service",

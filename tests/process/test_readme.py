@@ -8,6 +8,7 @@ The program of LAYERS.md runs beside the same daemon.  The lines that make a vir
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from collections.abc import Iterator
 
@@ -21,7 +22,7 @@ README = read_page("README.md")
 
 
 def test_it_is_short() -> None:
-    assert len(README.text.encode()) < 5000
+    assert len(README.text.encode()) < 6000
 
 
 def test_two_lines_do_everything() -> None:
@@ -33,7 +34,7 @@ def test_two_lines_do_everything() -> None:
 
 
 def test_every_block_is_tested() -> None:
-    assert set(README.blocks) == {"clone", "server", "points", "window"}
+    assert set(README.blocks) == {"clone", "server", "points", "window", "cpp", "cpp-run"}
     assert README.fences == len(README.blocks) + 2  # the two lines have no name
 
 
@@ -90,6 +91,17 @@ def test_following_a_vehicle(user: Terminal) -> None:
     assert numbers is not None
     assert int(numbers[1]) > 50
     assert int(numbers[2]) > 10_000
+
+
+def test_from_cpp(user: Terminal) -> None:
+    """The program is part of an example; it counts the points that the three lines of Python count."""
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is missing")
+    build, run = README.commands("cpp-run")
+    user.run(f"ln -s '{ROOT}/clients'")  # the reader is in the clone
+    user.run(build)
+    python = user.python(README.blocks["points"])
+    assert user.run(run).startswith(python.replace("\n", " in "))
 
 
 def test_a_layer(user: Terminal) -> None:

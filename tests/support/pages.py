@@ -37,7 +37,7 @@ class Page:
     @property
     def fences(self) -> int:
         """How many blocks of commands or programs there are, with a name or without."""
-        return len(re.findall(r"^```(?:sh|python)$", self.text, re.MULTILINE))
+        return len(re.findall(r"^```(?:sh|python|cpp)$", self.text, re.MULTILINE))
 
     @property
     def links(self) -> list[str]:

@@ -17,7 +17,7 @@ from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
 
 CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evict"]
 CONTRACT += ["pin", "unpin", "stop"]
-CONTRACT += ["config", "unit", "doctor"]
+CONTRACT += ["config", "unit", "doctor", "cpp"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
 CONTRACT += ["divide", "merge", "prepare", "live"]
 CONTRACT += ["top", "tail", "map", "metrics"]

@@ -251,4 +251,4 @@ def test_a_wheel_ships_them() -> None:
     """The wheel includes them where `shipped_directory` looks first (``.ci/run`` installs one and prints)."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
-    assert included == {"systemd": "shmmap/_systemd"}
+    assert included["systemd"] == "shmmap/_systemd"
