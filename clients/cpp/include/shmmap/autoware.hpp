@@ -58,8 +58,8 @@ class HeldCells {
   HeldCells(LoaderOptions options, std::string layer) : options_(std::move(options)), layer_(std::move(layer)) {}
 
   /// What `cached` lacks of an area, each cell as `make` makes it out of the mapped one, and what it has in vain;
-  /// nothing where something is missing and nothing else has come.  Cells are let go of as soon as they are made:
-  /// an area may be larger than the daemon's memory.
+  /// no value, and nothing forgotten, where something is missing and no other cell has come.  Cells are let go of
+  /// as soon as they are made: an area may be larger than the daemon's memory.
   template <typename Make, typename Made = std::invoke_result_t<const Make&, const Cell&>>
   std::optional<Difference<Made>> difference(const Area& area, const std::vector<std::string>& cached,
                                              const Make& make) {
@@ -109,14 +109,13 @@ class HeldCells {
       }
       if (!covered && trouble.empty()) trouble = "not all of the map is known yet";
       if (missing.size() > 1) trouble += "; cells missing in all: " + std::to_string(missing.size());
-      if (!trouble.empty()) say(trouble);
     } catch (const std::exception& error) {  // what came before it counts
       client_.reset();
       covered = false;
       trouble = error.what();
-      say(trouble);
-      if (found.added.empty()) return std::nullopt;
     }
+    if (!trouble.empty()) say(trouble);
+    if (!trouble.empty() && found.added.empty()) return std::nullopt;
     std::set<std::string> seen;
     for (const auto& id : cached) {
       // what was not handed out here was not asked for: it is replaced, or nothing of the area
@@ -125,7 +124,6 @@ class HeldCells {
         found.removed.push_back(id);
     }
     versions_ = std::move(held);
-    if (!trouble.empty() && found.added.empty() && found.removed.empty()) return std::nullopt;
     return found;
   }
 
