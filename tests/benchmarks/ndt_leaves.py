@@ -19,8 +19,8 @@ import tempfile
 from pathlib import Path
 
 from shmmap.dividing.divide import divide
-from shmmap.testing import DaemonProcess
 from tests.benchmarks.street_data import street
+from tests.support.daemon_process import DaemonProcess
 from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 
 LIMIT_MS = 0.5
