@@ -357,3 +357,12 @@ def test_leaves_are_those_of_the_layer(
     assert names(node.ask("grids", 0, 0, 0), "remove") == sorted(
         set(divided_map.corners) - set(divided_map.in_square(0, 0, 0))
     )
+
+
+def test_a_voxel_without_an_inverse(node: CppClient) -> None:
+    """Autoware keeps it, with -1 points; coordinates count from the cell's origin."""
+    assert node.ask("refused") == [
+        ["7 1001 2 3 1001 2 3 0 1 2 3 2 4 5 3 5 6"],
+        ["-1 1004 5 6 1004 5 6 0 0 0 0 0 0 0 0 0 0"],
+    ]
+    assert node.ask("crooked") == [["segment_corrupt"]]

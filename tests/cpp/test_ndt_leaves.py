@@ -11,12 +11,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shmmap.dividing.divide import divide
 from tests.benchmarks.layer_build import cells_of, city
 from tests.cpp.conftest import DaemonFactory
-from tests.support.divided_map import DividedMap
+from tests.support.divided_map import DividedMap, make_map
 from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 
 
@@ -59,10 +60,27 @@ def test_a_town(program: Path, daemon: DaemonFactory, tmp_path: Path, leaf: floa
     assert sum(cell["ours"] for cell in cells) > 500
 
 
+def test_messages_are_what_pcl_reads_from_the_files(
+    program: Path, daemon: DaemonFactory, tmp_path: Path
+) -> None:
+    """Fields, layout and points to the byte, as Autoware's loader reads its files with PCL."""
+    made = make_map(tmp_path / "map")
+    points = made.points("0_0.pcd")
+    ring = np.arange(len(points["x"])).astype(np.uint16)
+    time = np.linspace(0, 0.1, len(ring))
+    made.write_cell("0_0.pcd", (0, 0), {**points, "ring": ring, "time": time})
+    one = daemon(made.root)
+    with PclLeaves(program, one.endpoint, 2.0) as pcl:
+        cells = pcl.clouds()
+    assert [cell["id"] for cell in cells] == sorted(map(made.id, made.corners))
+    assert {(cell["points"], cell["fields"], cell["layout"], cell["data"]) for cell in cells} == {(500, 1, 1, 1)}
+
+
 def test_a_street(program: Path, daemon: DaemonFactory, data_dir: Path, tmp_path: Path) -> None:
     divide([data_dir / "kitti0005_map" / "map_static_v005.pcd"], tmp_path / "map")
     one = daemon(tmp_path / "map")
     with PclLeaves(program, one.endpoint, 2.0) as pcl:
-        cells = pcl.compare()
-    check(cells)
-    assert len(cells) == 59
+        check(cells := pcl.compare())
+        clouds = pcl.clouds()
+    assert len(cells) == len(clouds) == 59
+    assert all(cloud["fields"] and cloud["layout"] and cloud["data"] for cloud in clouds)

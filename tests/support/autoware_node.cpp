@@ -7,6 +7,8 @@
 //   const X Y RADIUS                  as `update`, by a function that returns a pointer to const
 //   grids X Y RADIUS                  as `update`, with voxels; `leaves` prints what is held
 //   forget                            the node begins anew, as on a rebuild
+//   refused                           leaves of a cell that has a voxel without an inverse covariance
+//   crooked                           of one whose columns do not belong together
 //
 // The answer ends with a line "end".  With SHMMAP_GENERATED the types are ROS 2's, else they are written out here.
 
@@ -141,6 +143,40 @@ void print_leaves() {
   }
 }
 
+/// A cell of two voxels, made by hand.
+shmmap::Cell two_voxels(const std::array<double, 6>& mean, const std::array<double, 12>& inverse,
+                        const std::array<std::uint32_t, 2>& count) {
+  shmmap::Cell cell;
+  cell.id = "made by hand";
+  cell.origin = {1000.0, 0.0, 0.0};
+  cell.columns.push_back({"mean", "<f8", "m", {2, 3}, mean.data(), 48, 0});
+  cell.columns.push_back({"inverse_covariance", "<f8", "1/m^2", {2, 6}, inverse.data(), 96, 0});
+  cell.columns.push_back({"count", "<u4", "", {2}, count.data(), 8, 0});
+  return cell;
+}
+
+void print_made(bool crooked) {
+  const std::array<double, 6> mean{1, 2, 3, 4, 5, 6};
+  const std::array<double, 12> inverse{1, 2, 3, 4, 5, 6};
+  const std::array<std::uint32_t, 2> count{7, 8};
+  auto cell = two_voxels(mean, inverse, count);
+  if (crooked) {
+    cell.columns.back().shape = {1};
+    cell.columns.back().nbytes = 4;
+  }
+  try {
+    for (auto& leaf : shmmap::ndt_leaves<Leaf>(cell)) {
+      std::cout << leaf.nr_points_;
+      for (const double value : leaf.mean_.values) std::cout << " " << value;
+      for (const float value : leaf.centroid_.values) std::cout << " " << value;
+      for (const double value : leaf.icov_.values) std::cout << " " << value;
+      std::cout << "\n";
+    }
+  } catch (const shmmap::Error& error) {
+    std::cout << error.code() << "\n";
+  }
+}
+
 std::vector<std::string> split(const std::string& text, char at) {
   std::vector<std::string> parts;
   std::stringstream stream(text);
@@ -174,6 +210,8 @@ void obey(const std::vector<std::string>& words) {
     take_grids(request_for(words, keys(grids)));
   } else if (what == "leaves") {
     print_leaves();
+  } else if (what == "refused" || what == "crooked") {
+    print_made(what == "crooked");
   } else if (what == "forget") {
     ids.clear();
     grids.clear();

@@ -2,6 +2,7 @@
 // Leaves of the `ndt` layer beside leaves that PCL's voxel grid builds from the points of the same cells.
 // Usage: pcl_leaves ENDPOINT X Y RADIUS LEAF; each line of stdin is answered by lines of JSON.
 //   compare    a line for each cell: leaves of both, and the largest differences
+//   clouds     a line for each cell: whether its message is to the byte what PCL reads from its file
 //   time       one round: ms of processor time for the leaves of all cells; ms until a request for them, or for
 //              points, is answered; ms for PCL to read the points from the cells' files
 // The last line of an answer is empty.
@@ -86,6 +87,25 @@ void compare(const shmmap::Cell& points, const shmmap::Cell& ndt, float leaf) {
               ndt.id.c_str(), ours.size(), theirs, refused, counts, mean, centroid, inverse);
 }
 
+/// Autoware's loader reads a file by PCL, and passes on what comes of it.
+void compare(const plain::Cell& cell) {
+  const auto& ours = cell.pointcloud;
+  pcl::PCLPointCloud2 theirs;
+  if (pcl::io::loadPCDFile(cell.cell_id, theirs) != 0) throw std::runtime_error(cell.cell_id);
+  bool fields = ours.fields.size() == theirs.fields.size();
+  for (std::size_t at = 0; fields && at < ours.fields.size(); ++at) {
+    const auto& one = ours.fields[at];
+    const auto& other = theirs.fields[at];
+    fields = one.name == other.name && one.offset == other.offset && one.datatype == other.datatype &&
+             one.count == other.count;
+  }
+  const bool layout = ours.height == theirs.height && ours.width == theirs.width &&
+                      ours.point_step == theirs.point_step && ours.row_step == theirs.row_step &&
+                      ours.is_bigendian == (theirs.is_bigendian != 0) && ours.is_dense == (theirs.is_dense != 0);
+  std::printf("{\"id\": \"%s\", \"points\": %u, \"fields\": %d, \"layout\": %d, \"data\": %d}\n",
+              cell.cell_id.c_str(), ours.width, fields, layout, ours.data == theirs.data);
+}
+
 double now(clockid_t clock) {
   timespec time{};
   clock_gettime(clock, &time);
@@ -117,6 +137,9 @@ int main(int count, char** words) {
   for (std::string what; std::getline(std::cin, what);) {
     if (what == "compare") {
       for (std::size_t at = 0; at < ndt.size(); ++at) compare(*points.at(at), *ndt[at], leaf);
+    } else if (what == "clouds") {
+      const auto response = loader(request);
+      for (const auto& cell : response->new_pointcloud_with_ids) compare(cell);
     } else {
       std::size_t rows = 0, bytes = 0, grids = 0;
       double begin = now(CLOCK_THREAD_CPUTIME_ID);

@@ -57,6 +57,10 @@ class PclLeaves:
         """Leaves of each cell, and how far they are apart."""
         return self._ask("compare")
 
+    def clouds(self) -> list[dict[str, Any]]:
+        """Whether each cell's message is what PCL reads from its file."""
+        return self._ask("clouds")
+
     def time(self) -> dict[str, Any]:
         """One round of measurements."""
         (found,) = self._ask("time")
