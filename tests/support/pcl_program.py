@@ -16,6 +16,7 @@ def built_pcl_program(
     *,
     optimize: str = "-O3",
     oldest: tuple[int, int] = (1, 0),
+    options: Sequence[str] = (),
 ) -> Path | None:
     """Compile a program, linked with these of PCL's libraries; None where it cannot be, or PCL is too old."""
     found = {tuple(map(int, path.name[4:].split("."))): path for path in Path("/usr/include").glob("pcl-*")}
@@ -24,7 +25,8 @@ def built_pcl_program(
         return None
     program = folder / source.stem
     # not -march=native: Eigen would align otherwise than in Debian's libraries, and crash
-    command = ["g++", optimize, "-msse4.2", "-std=c++17", f"-I{found[newest]}", "-I/usr/include/eigen3"]
+    command = ["g++", optimize, "-msse4.2", "-std=c++17", f"-isystem{found[newest]}"]
+    command += ["-isystem/usr/include/eigen3", *options]
     linked = [f"-lpcl_{name}" for name in libraries]
     subprocess.run([*command, source, "-o", program, *linked, "-lboost_system"], check=True)
     return program

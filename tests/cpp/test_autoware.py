@@ -1,0 +1,368 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`PcdLoader` and `NdtLeaves` in a node that does what Autoware's scan matcher does with them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import shmmap
+from tests.cpp.conftest import DaemonFactory
+from tests.support.autoware_node import TYPES, compiled_node
+from tests.support.cpp_client import CppClient
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, make_map, random_points
+
+EVERYTHING = (0.0, 0.0, 500.0)
+FIELDS = "x:0:7:1 y:4:7:1 z:8:7:1 intensity:12:7:1 "
+NAMES = {"f4": 7, "f8": 8, "i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6}
+
+
+@pytest.fixture(scope="module", params=TYPES)
+def node_program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the compiled node."""
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is missing")
+    program = compiled_node(request.param, tmp_path_factory.mktemp("node"))
+    if program is None:
+        pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")
+    return program
+
+
+@pytest.fixture
+def node(node_program: Path, daemon: DaemonFactory) -> Iterator[CppClient]:
+    """Return a node that has no loader yet; nothing in it may leak or go wrong."""
+    one = CppClient(node_program)
+    yield one
+    assert one.close() == 0
+
+
+def of(answer: list[list[str]], kind: str) -> list[list[str]]:
+    """What stands on the lines of a kind."""
+    return [line[1:] for line in answer if line[0] == kind]
+
+
+def names(answer: list[list[str]], kind: str) -> list[str]:
+    """Base names of the ids on the lines of a kind."""
+    return [Path(line[0]).name for line in of(answer, kind)]
+
+
+def data_of(path: Path) -> bytes:
+    """The points of a binary PCD file, which Autoware's loader passes on as they are."""
+    return path.read_bytes().split(b"DATA binary\n", 1)[1]
+
+
+def record_of(cell: shmmap.Cell) -> NDArray[Any]:
+    """A cell's points as a message has them: x, y, z in 32 bits, then every other column."""
+    xyz = cell.xyz.astype(np.float32)
+    columns = {name: xyz[:, axis] for axis, name in enumerate("xyz")}
+    columns.update({name: cell[name] for name in cell.columns if name != "xyz"})
+    record = np.zeros(len(xyz), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        record[name] = values
+    return record
+
+
+def test_cells_are_those_of_autoware_s_loader(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+) -> None:
+    """To the byte: fields, points, boxes; in the order of ids."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    answer = node.ask("update", 5, 5, 30)
+    assert answer[0] == ["header", "map", "0", "0"]
+    wanted = divided_map.in_square(5, 5, 30)
+    assert len(wanted) == 16
+    expected = []
+    for name in wanted:
+        x0, y0, x1, y1 = (f"{side:g}" for side in divided_map.box(name))
+        crc = zlib.crc32(data_of(divided_map.pcd_dir / name))
+        layout = "1 500 16 8000 01"
+        expected.append([divided_map.id(name), f"{x0} {y0} {x1} {y1}", layout, FIELDS, str(crc)])
+    assert of(answer, "cell") == expected
+    assert of(answer, "remove") == []
+
+
+def test_fields_of_every_kind(daemon: DaemonFactory, node: CppClient, tmp_path: Path) -> None:
+    """Coordinates of 64 bits are rounded, integers of 64 bits left out: neither PCL nor ROS has them."""
+    made = make_map(tmp_path / "map", columns=2, rows=1)
+    rng = np.random.default_rng(2)
+    kinds = {kind: rng.integers(0, 100, 3000).astype(kind) for kind in NAMES}
+    xyz = random_points(rng, (0, 0), 3000)
+    double = {axis: xyz[axis].astype(np.float64) + 1e-9 for axis in "xyz"}
+    made.write_cell("0_0.pcd", (0, 0), {**double, **kinds, "long": np.arange(3000, dtype=np.uint64)})
+    made.write_cell("-20_0.pcd", (-20, 0), {axis: xyz[axis][:1] - 20 for axis in "xyz"})
+    one = daemon(made.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    small, large = of(node.ask("update", *EVERYTHING), "cell")
+    assert small[2:4] == ["1 1 12 12 01", "x:0:7:1 y:4:7:1 z:8:7:1 "]
+    with shmmap.connect(one.endpoint) as python:
+        cells = {cell.id: cell for cell in python.around(0, 0, radius=500).raise_for_failures()}
+    record = record_of(cells[large[0]])
+    assert record.dtype.names is not None
+    kept = [name for name in record.dtype.names if name != "long"]
+    packed = np.zeros(3000, [(name, record.dtype[name]) for name in kept])
+    offsets = ""
+    for name in kept:
+        packed[name] = record[name]
+        dtype, offset = packed.dtype.fields[name][:2]  # type: ignore[index]
+        offsets += f"{name}:{offset}:{NAMES[dtype.str[1:]]}:1 "
+    step = packed.dtype.itemsize
+    assert large[2:] == [f"1 3000 {step} {3000 * step} 01", offsets, str(zlib.crc32(packed.tobytes()))]
+
+
+def test_real_maps_too(daemon: DaemonFactory, node: CppClient, data_dir: Path) -> None:
+    one = daemon(data_dir / "kitti0005_map" / "map_static_v005.pcd")
+    node.ask("loader", one.endpoint, 120, 5)
+    answer = of(node.ask("update", 0, 0, 1e6), "cell")
+    with shmmap.connect(one.endpoint) as python:
+        cells = python.around(0.0, 0.0, radius=1e6, wait=120.0).raise_for_failures()
+        expected = [[cell.id, str(zlib.crc32(record_of(cell).tobytes()))] for cell in cells]
+    assert [[line[0], line[4]] for line in answer] == expected
+    assert sum(len(cell.xyz) for cell in cells) > 1e6
+
+
+def test_along_a_drive_the_node_holds_what_autoware_s_area_has(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    held: set[str] = set()
+    for x in range(-70, 71, 10):
+        answer = node.ask("update" if x % 20 else "const", x, 3, 25)
+        added, removed = names(answer, "cell"), names(answer, "remove")
+        assert not set(added) & set(removed)
+        assert not set(added) & held
+        assert set(removed) <= held
+        held = held | set(added) - set(removed)
+        held -= set(removed)
+        assert sorted(held) == sorted(divided_map.in_square(x, 3, 25))
+
+
+def test_a_changed_cell_comes_again(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+    """Under its id, which is not removed: Autoware adds first and removes after."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    before = {line[0]: line[4] for line in of(node.ask("update", *EVERYTHING), "cell")}
+    divided_map.change("0_0.pcd", seed=7)
+    with shmmap.connect(one.endpoint) as python:
+        python.reload()
+    ((kind, *_), cell) = node.ask("update", *EVERYTHING)
+    assert kind == "header"
+    assert cell[1] == divided_map.id("0_0.pcd")
+    assert cell[5] == str(zlib.crc32(data_of(divided_map.pcd_dir / "0_0.pcd"))) != before[cell[1]]
+    assert node.ask("update", *EVERYTHING) == [["header", "map", "0", "0"]]
+
+
+def test_ids_that_were_not_handed_out_here(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+) -> None:
+    """Those of the area come again, as nobody knows what they name; the others are removed, each once."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    inside, outside = divided_map.id("0_0.pcd"), divided_map.id("-60_-60.pcd")
+    held = ["nobody.pcd", outside, inside, "/nowhere/0_0.pcd", "nobody.pcd", "40_40.pcd", inside]
+    answer = node.ask("ask", 10, 10, 0, ";".join(held))
+    assert [line[0] for line in of(answer, "cell")] == [inside]
+    assert [line[0] for line in of(answer, "remove")] == [
+        "nobody.pcd",
+        outside,
+        "/nowhere/0_0.pcd",
+        "40_40.pcd",
+    ]
+    # now it was handed out here
+    answer = node.ask("ask", 10, 10, 0, ";".join(held))
+    assert of(answer, "cell") == []
+    assert inside not in [line[0] for line in of(answer, "remove")]
+
+
+def test_a_node_that_begins_anew_gets_everything(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    first = node.ask("update", *EVERYTHING)
+    node.ask("forget")
+    assert node.ask("update", *EVERYTHING) == first
+    assert len(of(first, "cell")) == 36
+
+
+@pytest.mark.parametrize("kill", [False, True])
+def test_a_daemon_that_begins_anew(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap, *, kill: bool
+) -> None:
+    """Versions are the same in its next life: only what has changed comes, and what is gone is removed."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 30)
+    node.ask("update", *EVERYTHING)
+    if kill:
+        one.kill()
+    else:
+        one.stop()
+    one.start()
+    assert node.ask("update", *EVERYTHING) == [["header", "map", "0", "0"]]
+    one.stop()
+    divided_map.change("0_0.pcd", seed=3)
+    divided_map.remove_cell("20_20.pcd")
+    divided_map.write_cell("80_80.pcd", (80, 80), divided_map.points("40_40.pcd"))
+    divided_map.write_metadata()
+    one.start()
+    answer = node.ask("update", *EVERYTHING)
+    assert names(answer, "cell") == ["0_0.pcd", "80_80.pcd"]
+    assert names(answer, "remove") == ["20_20.pcd"]
+
+
+def warm(one: DaemonProcess) -> None:
+    """Have all cells in memory."""
+    with shmmap.connect(one.endpoint) as python:
+        python.around(0, 0, radius=500, layers=["points", "ndt(leaf=2.0)"], wait=60).raise_for_failures()
+
+
+def test_without_a_daemon(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+    """It is nullptr and a message, at the start as later; what the node holds stays known."""
+    one = daemon(divided_map.root)
+    one.stop()
+    node.ask("loader", one.endpoint, 0.2, 5)
+    for command, nothing in (("update", "nullptr"), ("grids", "nothing")):
+        told, answer = node.ask(command, *EVERYTHING)
+        assert told[0] == "log"
+        assert one.endpoint in told[1]
+        assert answer == [nothing]
+    one.start()
+    warm(one)
+    assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
+    one.stop()
+    told, answer = node.ask("update", *EVERYTHING)
+    assert (told[0], answer) == ("log", ["nullptr"])
+    divided_map.change("0_0.pcd", seed=3)
+    one.start()
+    warm(one)
+    assert names(node.ask("update", *EVERYTHING), "cell") == ["0_0.pcd"]
+
+
+def test_what_is_refused(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    (told, nothing) = node.ask("update", 0, 0, -1)
+    assert (told[0], nothing) == ("log", ["nullptr"])
+    (told, nothing) = node.ask("update", "nan", 0, 10)
+    assert (told[0], nothing) == ("log", ["nullptr"])
+    assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
+
+
+def test_cells_that_are_damaged(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+    """One costs no other; where nothing else is new, nothing could be fetched."""
+    good = (divided_map.pcd_dir / "0_0.pcd").read_bytes()
+    for name in ("0_0.pcd", "20_20.pcd"):
+        (divided_map.pcd_dir / name).write_bytes(good[:300])
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    answer = node.ask("update", *EVERYTHING)
+    (((message,),), cells) = of(answer, "log"), of(answer, "cell")
+    assert len(cells) == 34
+    assert "0_0.pcd" in message
+    assert "load_failed" in message
+    assert message.endswith("cells missing in all: 2")
+    assert [line[0] for line in node.ask("update", *EVERYTHING)] == ["log", "nullptr"]
+    (divided_map.pcd_dir / "20_20.pcd").write_bytes(data_as(divided_map, "20_20.pcd"))
+    with shmmap.connect(one.endpoint) as python:
+        python.reload()
+    answer = node.ask("update", *EVERYTHING)
+    assert names(answer, "cell") == ["20_20.pcd"]
+    assert of(answer, "log")
+
+
+def data_as(made: DividedMap, name: str) -> bytes:
+    """A good file for a cell that was damaged."""
+    made.change(name, seed=5)
+    return (made.pcd_dir / name).read_bytes()
+
+
+def test_what_is_not_loaded_in_time(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, "--workers", "1")
+    with shmmap.connect(one.endpoint) as python:
+        python.around(0, 0, radius=5)
+    (loader,) = one.stop_loaders()
+    node.ask("loader", one.endpoint, 0.3, 30)
+    answer = node.ask("update", 0, 0, 15)
+    assert len(of(answer, "cell")) == 4
+    assert of(answer, "log") == []
+    answer = node.ask("update", 20, 0, 15)  # two are new, two are known
+    ((message,),) = of(answer, "log")
+    assert "it is still being loaded" in message
+    assert answer[-1] == ["nullptr"]
+    (others,) = node.ask("update", 0, 0, 5)  # it holds what it held
+    assert others[0] == "header"
+    os.kill(loader, signal.SIGCONT)
+    warm(one)
+    answer = node.ask("update", 20, 0, 15)
+    assert (len(of(answer, "cell")), len(of(answer, "remove"))) == (2, 2)
+
+
+def test_an_area_larger_than_the_daemon_s_memory(
+    daemon: DaemonFactory, node: CppClient, tmp_path: Path
+) -> None:
+    """Cells are let go of as they are copied: there is room for the next ones."""
+    made = make_map(tmp_path / "map", points=20_000)
+    one = daemon(made.root, "--budget", "6M")
+    node.ask("loader", one.endpoint, 60, 5)
+    answer = node.ask("update", *EVERYTHING)
+    assert of(answer, "log") == []
+    assert len(of(answer, "cell")) == 36
+    for line in of(answer, "cell"):
+        assert line[4] == str(zlib.crc32(data_of(Path(line[0]))))
+
+
+def leaves_of(cell: shmmap.Cell) -> list[str]:
+    """What the node prints of a cell's leaves."""
+    record = np.zeros(
+        len(cell["count"]),
+        [("nr_points", "<i4"), ("mean", "<f8", 3), ("centroid", "<f4", 4), ("icov", "<f8", (3, 3))],
+    )
+    record["nr_points"] = cell["count"]
+    record["mean"] = cell["mean"]
+    record["centroid"][:, :3] = cell["mean"]
+    record["icov"] = cell["inverse_covariance"][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return [cell.id, str(len(record)), str(zlib.crc32(record.tobytes()))]
+
+
+def test_leaves_are_those_of_the_layer(
+    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    answer = node.ask("grids", 0, 0, 15)
+    assert len(of(answer, "grid")) == 4
+    answer = node.ask("grids", 20, 0, 15)
+    assert (len(of(answer, "grid")), len(of(answer, "remove"))) == (2, 2)
+    divided_map.change("0_0.pcd", seed=9, count=3000)
+    with shmmap.connect(one.endpoint) as python:
+        python.reload()
+        answer = node.ask("grids", *EVERYTHING)
+        assert len(of(answer, "grid")) == 36 - 4 + 1
+        assert "0_0.pcd" in names(answer, "grid")
+        cells = python.around(0, 0, radius=500, layers=["ndt(leaf=2.0)"], wait=60).raise_for_failures()
+        assert node.ask("leaves") == [leaves_of(cell) for cell in cells]
+    assert names(node.ask("grids", 0, 0, 0), "remove") == sorted(
+        set(divided_map.corners) - set(divided_map.in_square(0, 0, 0))
+    )
+
+
+def test_a_voxel_without_an_inverse(node: CppClient) -> None:
+    """Autoware keeps it, with -1 points; coordinates count from the cell's origin."""
+    assert node.ask("refused") == [
+        ["7 1001 2 3 1001 2 3 0 1 2 3 2 4 5 3 5 6"],
+        ["-1 1004 5 6 1004 5 6 0 0 0 0 0 0 0 0 0 0"],
+    ]
+    assert node.ask("crooked") == [["segment_corrupt"]]
