@@ -109,7 +109,8 @@ class Warm:
         held = [h for h in inside if h not in held] + outside[:NEW]
         assert len(held) == HELD
         rows = [[h.id.removeprefix(self.client.id_prefix), h.version] for h in held]
-        versions = pack_versions([h.version for h in held])
+        self.held = [h.version for h in held]
+        versions = pack_versions(self.held)
         self.requests = {
             "named": pack(["differential", 1, area, ["points"], rows, b"", 10.0]),
             "packed": pack(["differential", 1, area, ["points"], [], versions, 10.0]),

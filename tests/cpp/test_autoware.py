@@ -287,9 +287,7 @@ def data_as(made: DividedMap, name: str) -> bytes:
     return (made.pcd_dir / name).read_bytes()
 
 
-def test_what_is_not_loaded_in_time(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
-) -> None:
+def test_what_is_not_loaded_in_time(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root, "--workers", "1")
     with shmmap.connect(one.endpoint) as python:
         python.around(0, 0, radius=5)

@@ -55,6 +55,7 @@ class Socket {
  public:
   static constexpr std::uint64_t most_bytes = std::uint64_t{1} << 30;  // of one message
   static constexpr std::size_t read_bytes = std::size_t{1} << 16;      // at once, at least
+  static constexpr std::size_t keep_bytes = std::size_t{1} << 20;      // of room that is not needed just now
 
   Socket() = default;
 
@@ -101,7 +102,8 @@ class Socket {
       while (parse(message)) {
         if (complete_) return true;
       }
-      if (!read_some() && !wait(until)) return false;
+      if (!wait(until)) return false;
+      read_some();
     }
   }
 
@@ -130,36 +132,35 @@ class Socket {
     }
   }
 
-  bool read_some() {
-    if (start_ > 0 && start_ == input_.size()) {
-      input_.clear();
-      start_ = 0;
+  /// Read what has come, behind what is not taken yet; nothing may have.
+  void read_some() {
+    if (start_ == end_) {
+      start_ = end_ = 0;
+      if (input_.size() > keep_bytes) input_ = {};
     } else if (start_ > read_bytes) {
-      input_.erase(0, std::exchange(start_, 0));
+      input_.erase(0, start_);
+      end_ -= std::exchange(start_, 0);
     }
-    const auto before = input_.size();
-    const auto missing = wanted_ - std::min(wanted_, before - start_);  // as the frame says: memory comes as bytes do
-    input_.resize(before + std::clamp<std::size_t>(missing, read_bytes, 16 * read_bytes));
-    const auto got = ::recv(fd_.get(), &input_[before], input_.size() - before, 0);
-    const int number = errno;
-    input_.resize(before + static_cast<std::size_t>(std::max<ssize_t>(got, 0)));
-    if (got > 0) return true;
-    if (got == 0) lost("the daemon has closed the connection");
-    if (number != EAGAIN && number != EINTR) lost("the connection is over: " + error_text(number));
-    return false;
+    const auto missing = wanted_ - std::min(wanted_, end_ - start_);  // as the frame says: memory comes as bytes do
+    const auto room = std::clamp<std::size_t>(missing, read_bytes, 16 * read_bytes);
+    if (input_.size() < end_ + room) input_.resize(end_ + room);
+    const auto got = ::recv(fd_.get(), &input_[end_], input_.size() - end_, 0);
+    if (got > 0) end_ += static_cast<std::size_t>(got);
+    else if (got == 0) lost("the daemon has closed the connection");
+    else if (errno != EAGAIN && errno != EINTR) lost("the connection is over: " + error_text(errno));
   }
 
+  /// Wait until there is something to be read or written; false when that time is over.
   bool wait(Clock::time_point until) const {
     const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - Clock::now()).count() + 1;
-    if (until <= Clock::now()) return false;
     pollfd one{fd_.get(), static_cast<short>(POLLIN | (output_.empty() ? 0 : POLLOUT)), 0};
-    ::poll(&one, 1, static_cast<int>(std::min<long long>(left, 1 << 30)));
-    return true;
+    const auto ready = ::poll(&one, 1, static_cast<int>(std::clamp<long long>(left, 0, 1 << 30)));
+    return ready > 0 || Clock::now() < until;
   }
 
   /// Take the next frame out of what has come; `complete_` says whether it was a message, and not a command.
   bool parse(std::string& message) {
-    const std::string_view input = std::string_view(input_).substr(start_);
+    const auto input = std::string_view(input_).substr(start_, end_ - start_);
     complete_ = false;
     wanted_ = 0;
     if (!greeted_) {
@@ -195,7 +196,7 @@ class Socket {
   }
 
   std::string path_, input_, output_;
-  std::size_t start_ = 0, wanted_ = 0;
+  std::size_t start_ = 0, end_ = 0, wanted_ = 0;  // of `input_`: what is not taken; of its next frame
   bool greeted_ = false, complete_ = false;
   Descriptor fd_;
 };
