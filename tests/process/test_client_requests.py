@@ -26,7 +26,9 @@ from shmmap.errors import (
     BadRequest,
     LoadFailed,
     NoAnswer,
+    NoSocket,
     ProtocolMismatch,
+    SegmentError,
     StaleSocket,
     UnknownCell,
 )
@@ -369,6 +371,43 @@ def test_handles_that_stay_stale_end_as_pending(daemon: Factory, divided_map: Di
         answer = client.selected(["0_0.pcd"])
         assert (answer.cells, answer.failed) == ((), ())
         assert answer.pending == (shmmap.PendingLayer(divided_map.id("0_0.pcd"), "points"),)
+
+
+@BOTH
+def test_segments_that_are_elsewhere_are_no_passing_problem(
+    daemon: Factory,
+    divided_map: DividedMap,
+    connect: Connect,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in a container that has the socket, and not the directory of the segments."""
+    one = daemon(divided_map.root)
+    monkeypatch.setenv("SHMMAP_SHM_DIR", str(tmp_path))
+    with connect(one.endpoint) as client, pytest.raises(SegmentError, match=r"are not in .*SHMMAP_SHM_DIR"):
+        client.around(0, 0, 5, wait=30.0)
+
+
+@BOTH
+def test_of_several_sockets_the_telling_one_is_named(
+    daemon: Factory,
+    divided_map: DividedMap,
+    connect: Connect,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one = daemon(divided_map.root)
+    for name in ("SHMMAP_ENDPOINT", "SHMMAP_RUNTIME_DIR", "SHMMAP_INSTANCE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("SHMMAP_INSTANCE", "nobody")
+    (tmp_path / "shmmap").mkdir()
+    with pytest.raises(NoSocket, match=r"nobody\.sock: there is no socket"):
+        connect("")
+    one.kill()
+    Path(one.endpoint).rename(tmp_path / "shmmap" / "nobody.sock")
+    with pytest.raises(StaleSocket, match=f"{tmp_path}.*is gone"):
+        connect("")
 
 
 @pytest.mark.parametrize("wait", [-1.0, -6.0, np.inf, np.nan])

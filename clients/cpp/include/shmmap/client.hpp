@@ -82,16 +82,18 @@ class Client {
   /// Find the daemon and open a session; throws Unreachable, ProtocolMismatch, Refused.
   explicit Client(Options options = {}) : options_(std::move(options)) {
     if (options_.shm_dir.empty()) options_.shm_dir = detail::variable("SHMMAP_SHM_DIR");
-    const auto paths = detail::endpoints(options_.endpoint);
-    for (std::size_t at = 0; at < paths.size(); ++at) {
+    std::optional<Unreachable> telling;  // of several refusals the first one where there is something at all
+    for (const auto& path : detail::endpoints(options_.endpoint)) {
       try {
-        path_ = paths[at];
+        path_ = path;
         connect();
         return;
       } catch (const Unreachable& error) {
-        if (at + 1 == paths.size() || error.code() == "no_answer") throw;
+        if (error.code() == "no_answer") throw;  // it is there: the next one might serve another map
+        if (!telling || telling->code() == "no_socket") telling = error;
       }
     }
+    throw *telling;
   }
   Client(Client&&) = default;
   Client& operator=(Client&&) = default;
@@ -314,8 +316,10 @@ class Client {
     std::vector<CellPtr> places(found.handles.size());
     std::vector<std::size_t> gone;
     for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer);
-    for (int attempt = 0; !gone.empty() && attempt < attempts && Clock::now() < deadline; ++attempt)
+    for (int attempt = 0; !gone.empty() && attempt < attempts && Clock::now() < deadline; ++attempt) {
       ask_again(found.handles, places, gone, answer);
+      if (!gone.empty()) check_visible();  // not at first: a daemon that ends takes all its segments away
+    }
     for (const auto at : gone) answer.pending.emplace_back(whole(found.handles[at].id), found.handles[at].layer);
     for (auto& cell : places)
       if (cell) answer.cells.push_back(std::move(cell));
@@ -389,6 +393,14 @@ class Client {
   }
 
   [[nodiscard]] std::string statistics_path() const { return shm_dir() + welcome_.segment_prefix + "statistics"; }
+
+  /// Refuse a directory without the daemon's statistics: in a container it may be another one.
+  void check_visible() const {
+    if (struct stat status {}; ::lstat(statistics_path().c_str(), &status) == 0 || !socket_.stands()) return;
+    throw SegmentError("segment_error", "the daemon's segments are not in " + shm_dir() + ", as this process sees it",
+                       "in a container mount the daemon's directory of segments, and name it with SHMMAP_SHM_DIR "
+                       "where its path differs");
+  }
 
   void look_whose_segments() {
     struct stat status {};

@@ -111,10 +111,17 @@ class Socket {
   [[noreturn]] void refused(int number) const {
     switch (number) {
       case ENOENT:
-      case ENOTDIR: throw Unreachable("no_socket", path_ + ": no daemon was started there");
-      case ECONNREFUSED: throw Unreachable("stale_socket", path_ + ": the daemon that listened there has ended");
-      case EACCES: throw Unreachable("no_permission", path_ + ": this user may not ask that daemon");
-      case EAGAIN: throw Unreachable("no_answer", path_ + ": the daemon takes nobody just now");
+      case ENOTDIR:
+        throw Unreachable("no_socket", path_ + ": there is no socket",
+                          "start a daemon with `shmmap serve MAP`, or say which: SHMMAP_ENDPOINT, or SHMMAP_INSTANCE "
+                          "with SHMMAP_RUNTIME_DIR");
+      case ECONNREFUSED:
+        throw Unreachable("stale_socket", path_ + ": the daemon that made this socket is gone", "start it again");
+      case EACCES:
+        throw Unreachable("no_permission", path_ + ": this user may not connect",
+                          "join the group that the daemon was started with (--group), then log in again");
+      case EAGAIN:
+        throw Unreachable("no_answer", path_ + ": the daemon accepts nobody just now", "it is hung or overloaded");
       default: throw Unreachable("no_socket", path_ + ": " + error_text(number));
     }
   }
