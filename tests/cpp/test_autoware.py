@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 import shmmap
 from tests.cpp.conftest import DaemonFactory
-from tests.support.autoware_node import TYPES, compiled_node
+from tests.support.autoware_node import NODE, TYPES, compiled_with
+from tests.support.built_once import built_once
 from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -32,7 +33,8 @@ def node_program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
     """Return the compiled node."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is missing")
-    program = compiled_node(request.param, tmp_path_factory.mktemp("node"))
+    types = request.param
+    program = built_once(tmp_path_factory, f"node-{types}", lambda folder: compiled_with(types, NODE, folder))
     if program is None:
         pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")
     return program
@@ -287,9 +289,7 @@ def data_as(made: DividedMap, name: str) -> bytes:
     return (made.pcd_dir / name).read_bytes()
 
 
-def test_what_is_not_loaded_in_time(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
-) -> None:
+def test_what_is_not_loaded_in_time(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root, "--workers", "1")
     with shmmap.connect(one.endpoint) as python:
         python.around(0, 0, radius=5)

@@ -17,6 +17,7 @@ import pytest
 from shmmap.dividing.divide import divide
 from tests.benchmarks.layer_build import cells_of, city
 from tests.cpp.conftest import DaemonFactory
+from tests.support.built_once import built_once
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 
@@ -24,7 +25,7 @@ from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the compiled program."""
-    program = build_pcl_leaves(tmp_path_factory.mktemp("pcl"), optimize="-O1")
+    program = built_once(tmp_path_factory, "leaves", lambda folder: build_pcl_leaves(folder, optimize="-O1"))
     if program is None:
         pytest.skip("g++ or libpcl-dev (1.12 or newer) is missing")
     return program
@@ -73,7 +74,8 @@ def test_messages_are_what_pcl_reads_from_the_files(
     with PclLeaves(program, one.endpoint, 2.0) as pcl:
         cells = pcl.clouds()
     assert [cell["id"] for cell in cells] == sorted(map(made.id, made.corners))
-    assert {(cell["points"], cell["fields"], cell["layout"], cell["data"]) for cell in cells} == {(500, 1, 1, 1)}
+    same = {(cell["points"], cell["fields"], cell["layout"], cell["data"]) for cell in cells}
+    assert same == {(500, 1, 1, 1)}
 
 
 def test_a_street(program: Path, daemon: DaemonFactory, data_dir: Path, tmp_path: Path) -> None:
