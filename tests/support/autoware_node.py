@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,12 +22,12 @@ def compiled_with(types: str, source: Path, folder: Path) -> Path | None:
 
     Every warning is an error; the sanitizers of addresses and of undefined behaviour are part of it.
     """
-    options: Sequence[str] | None = ()
+    options: list[str] = []
     if types == "generated":
-        options = generated_messages(folder)
-        if options is None:
+        found = generated_messages(folder)
+        if found is None:
             return None
-        options = ["-DSHMMAP_GENERATED", *options]
+        options = ["-DSHMMAP_GENERATED", *found]
     program = folder / source.stem
     checks = ["-std=c++17", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", *FLAGS]
     subprocess.run(["g++", *checks, *options, str(source), "-o", str(program), "-pthread"], check=True)

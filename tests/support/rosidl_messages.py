@@ -60,7 +60,8 @@ for package in json.loads((folder / "packages.json").read_text()):
     arguments = folder / f"{package}.json"
     arguments.write_text(json.dumps({
         "package_name": package, "output_dir": str(folder / "include" / package),
-        "template_dir": str(resources), "idl_tuples": tuples, "ros_interface_dependencies": [], "target_dependencies": [],
+        "template_dir": str(resources), "idl_tuples": tuples,
+        "ros_interface_dependencies": [], "target_dependencies": [],
     }))
     generate_cpp(str(arguments))
 """
