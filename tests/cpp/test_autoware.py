@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,8 +20,8 @@ import shmmap
 from tests.cpp.conftest import DaemonFactory
 from tests.support.autoware_node import NODE, TYPES, compiled_with
 from tests.support.built_once import built_once
-from tests.support.cpp_client import CppClient
-from tests.support.daemon_process import DaemonProcess
+from tests.support.cpp_client import FLAGS, CppClient
+from tests.support.daemon_process import DaemonProcess, stop
 from tests.support.divided_map import DividedMap, make_map, random_points
 
 EVERYTHING = (0.0, 0.0, 500.0)
@@ -251,6 +252,19 @@ def test_without_a_daemon(daemon: DaemonFactory, node: CppClient, divided_map: D
     assert names(node.ask("update", *EVERYTHING), "cell") == ["0_0.pcd"]
 
 
+def test_a_daemon_that_hangs(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    stop(one.pid)
+    node.ask("loader", one.endpoint, 0.2, 0.2)
+    told, answer = node.ask("update", *EVERYTHING)
+    assert told[0] == "log"
+    assert "does not answer" in told[1]
+    assert answer == ["nullptr"]
+    one.send(signal.SIGCONT)
+    node.ask("loader", one.endpoint, 60, 30)
+    assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
+
+
 def test_what_is_refused(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
@@ -366,3 +380,13 @@ def test_a_voxel_without_an_inverse(node: CppClient) -> None:
         ["-1 1004 5 6 1004 5 6 0 0 0 0 0 0 0 0 0 0"],
     ]
     assert node.ask("crooked") == [["segment_corrupt"]]
+
+
+@pytest.mark.parametrize(
+    ("compiler", "standard"), [("g++", "c++20"), ("clang++", "c++17"), ("clang++", "c++20")]
+)
+def test_other_compilers(compiler: str, standard: str) -> None:
+    """They find nothing to warn of, either."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is missing")
+    subprocess.run([compiler, f"-std={standard}", "-fsyntax-only", *FLAGS, str(NODE)], check=True)

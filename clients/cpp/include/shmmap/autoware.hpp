@@ -42,6 +42,8 @@ struct LoaderOptions {
   std::function<void(const std::string&)> log = {};
 };
 
+namespace detail {
+
 /// What changes for a node that holds cells.
 template <typename Made>
 struct Difference {
@@ -49,8 +51,6 @@ struct Difference {
   std::vector<std::string> removed;   ///< in the order in which they were held; never one of `added`
   std::string frame_id;
 };
-
-namespace detail {
 
 /// Remembers the versions of the cells that somebody holds by id, and asks for what he lacks.
 class HeldCells {
