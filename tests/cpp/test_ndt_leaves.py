@@ -74,8 +74,9 @@ def test_messages_are_what_pcl_reads_from_the_files(
     with PclLeaves(program, one.endpoint, 2.0) as pcl:
         cells = pcl.clouds()
     assert [cell["id"] for cell in cells] == sorted(map(made.id, made.corners))
-    same = {(cell["points"], cell["fields"], cell["layout"], cell["data"]) for cell in cells}
-    assert same == {(500, 1, 1, 1)}
+    assert {(cell["points"], cell["fields"], cell["layout"], cell["data"]) for cell in cells} == {
+        (500, 1, 1, 1)
+    }
 
 
 def test_a_street(program: Path, daemon: DaemonFactory, data_dir: Path, tmp_path: Path) -> None:
