@@ -40,10 +40,12 @@ def main() -> None:
         if program is None:
             sys.exit("not measured: g++ or libpcl-dev is missing")
         divide([map_file], Path(folder) / "map")
-        with DaemonProcess(Path(folder) / "map") as daemon:
-            with PclLeaves(program, daemon.endpoint, LEAF_M) as leaves:
-                leaves.time()  # memory that no program has yet
-                rows = [leaves.time() for _ in range(args.rounds)]
+        with (
+            DaemonProcess(Path(folder) / "map") as daemon,
+            PclLeaves(program, daemon.endpoint, LEAF_M) as leaves,
+        ):
+            leaves.time()  # memory that no program has yet
+            rows = [leaves.time() for _ in range(args.rounds)]
     first = rows[0]
     print(
         f"load {os.getloadavg()[0]:.1f}; {first['cells']} cells, {first['leaves']:,} leaves of"
@@ -55,7 +57,7 @@ def main() -> None:
         return f"{statistics.median(times):.2f} ms ({min(times):.2f})"
 
     def ratio(ours: str, theirs: str) -> float:
-        return statistics.median(row[ours] / row[theirs] for row in rows)
+        return float(statistics.median(row[ours] / row[theirs] for row in rows))
 
     took = statistics.median(row["ours_ms"] for row in rows)
     holds = took <= LIMIT_MS

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,9 +18,10 @@ from numpy.typing import NDArray
 
 import shmmap
 from tests.cpp.conftest import DaemonFactory
-from tests.support.autoware_node import TYPES, compiled_node
-from tests.support.cpp_client import CppClient
-from tests.support.daemon_process import DaemonProcess
+from tests.support.autoware_node import NODE, TYPES, AutowareNode, compiled_with
+from tests.support.built_once import built_once
+from tests.support.cpp_client import FLAGS
+from tests.support.daemon_process import DaemonProcess, stop
 from tests.support.divided_map import DividedMap, make_map, random_points
 
 EVERYTHING = (0.0, 0.0, 500.0)
@@ -32,16 +34,17 @@ def node_program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
     """Return the compiled node."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is missing")
-    program = compiled_node(request.param, tmp_path_factory.mktemp("node"))
+    types = request.param
+    program = built_once(tmp_path_factory, f"node-{types}", lambda folder: compiled_with(types, NODE, folder))
     if program is None:
         pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")
     return program
 
 
 @pytest.fixture
-def node(node_program: Path, daemon: DaemonFactory) -> Iterator[CppClient]:
+def node(node_program: Path, daemon: DaemonFactory) -> Iterator[AutowareNode]:
     """Return a node that has no loader yet; nothing in it may leak or go wrong."""
-    one = CppClient(node_program)
+    one = AutowareNode(node_program)
     yield one
     assert one.close() == 0
 
@@ -73,7 +76,7 @@ def record_of(cell: shmmap.Cell) -> NDArray[Any]:
 
 
 def test_cells_are_those_of_autoware_s_loader(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
     """To the byte: fields, points, boxes; in the order of ids."""
     one = daemon(divided_map.root)
@@ -92,7 +95,7 @@ def test_cells_are_those_of_autoware_s_loader(
     assert of(answer, "remove") == []
 
 
-def test_fields_of_every_kind(daemon: DaemonFactory, node: CppClient, tmp_path: Path) -> None:
+def test_fields_of_every_kind(daemon: DaemonFactory, node: AutowareNode, tmp_path: Path) -> None:
     """Coordinates of 64 bits are rounded, integers of 64 bits left out: neither PCL nor ROS has them."""
     made = make_map(tmp_path / "map", columns=2, rows=1)
     rng = np.random.default_rng(2)
@@ -120,7 +123,7 @@ def test_fields_of_every_kind(daemon: DaemonFactory, node: CppClient, tmp_path: 
     assert large[2:] == [f"1 3000 {step} {3000 * step} 01", offsets, str(zlib.crc32(packed.tobytes()))]
 
 
-def test_real_maps_too(daemon: DaemonFactory, node: CppClient, data_dir: Path) -> None:
+def test_real_maps_too(daemon: DaemonFactory, node: AutowareNode, data_dir: Path) -> None:
     one = daemon(data_dir / "kitti0005_map" / "map_static_v005.pcd")
     node.ask("loader", one.endpoint, 120, 5)
     answer = of(node.ask("update", 0, 0, 1e6), "cell")
@@ -132,7 +135,7 @@ def test_real_maps_too(daemon: DaemonFactory, node: CppClient, data_dir: Path) -
 
 
 def test_along_a_drive_the_node_holds_what_autoware_s_area_has(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
@@ -148,7 +151,9 @@ def test_along_a_drive_the_node_holds_what_autoware_s_area_has(
         assert sorted(held) == sorted(divided_map.in_square(x, 3, 25))
 
 
-def test_a_changed_cell_comes_again(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+def test_a_changed_cell_comes_again(
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
+) -> None:
     """Under its id, which is not removed: Autoware adds first and removes after."""
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
@@ -164,7 +169,7 @@ def test_a_changed_cell_comes_again(daemon: DaemonFactory, node: CppClient, divi
 
 
 def test_ids_that_were_not_handed_out_here(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
     """Those of the area come again, as nobody knows what they name; the others are removed, each once."""
     one = daemon(divided_map.root)
@@ -186,7 +191,7 @@ def test_ids_that_were_not_handed_out_here(
 
 
 def test_a_node_that_begins_anew_gets_everything(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
@@ -198,7 +203,7 @@ def test_a_node_that_begins_anew_gets_everything(
 
 @pytest.mark.parametrize("kill", [False, True])
 def test_a_daemon_that_begins_anew(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap, *, kill: bool
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap, *, kill: bool
 ) -> None:
     """Versions are the same in its next life: only what has changed comes, and what is gone is removed."""
     one = daemon(divided_map.root)
@@ -227,7 +232,7 @@ def warm(one: DaemonProcess) -> None:
         python.around(0, 0, radius=500, layers=["points", "ndt(leaf=2.0)"], wait=60).raise_for_failures()
 
 
-def test_without_a_daemon(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+def test_without_a_daemon(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
     """It is nullptr and a message, at the start as later; what the node holds stays known."""
     one = daemon(divided_map.root)
     one.stop()
@@ -249,7 +254,20 @@ def test_without_a_daemon(daemon: DaemonFactory, node: CppClient, divided_map: D
     assert names(node.ask("update", *EVERYTHING), "cell") == ["0_0.pcd"]
 
 
-def test_what_is_refused(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+def test_a_daemon_that_hangs(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    stop(one.pid)
+    node.ask("loader", one.endpoint, 0.2, 0.2)
+    told, answer = node.ask("update", *EVERYTHING)
+    assert told[0] == "log"
+    assert "does not answer" in told[1]
+    assert answer == ["nullptr"]
+    one.send(signal.SIGCONT)
+    node.ask("loader", one.endpoint, 60, 30)
+    assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
+
+
+def test_what_is_refused(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
     (told, nothing) = node.ask("update", 0, 0, -1)
@@ -259,7 +277,7 @@ def test_what_is_refused(daemon: DaemonFactory, node: CppClient, divided_map: Di
     assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
 
 
-def test_cells_that_are_damaged(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+def test_cells_that_are_damaged(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
     """One costs no other; where nothing else is new, nothing could be fetched."""
     good = (divided_map.pcd_dir / "0_0.pcd").read_bytes()
     for name in ("0_0.pcd", "20_20.pcd"):
@@ -287,7 +305,9 @@ def data_as(made: DividedMap, name: str) -> bytes:
     return (made.pcd_dir / name).read_bytes()
 
 
-def test_what_is_not_loaded_in_time(daemon: DaemonFactory, node: CppClient, divided_map: DividedMap) -> None:
+def test_what_is_not_loaded_in_time(
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
+) -> None:
     one = daemon(divided_map.root, "--workers", "1")
     with shmmap.connect(one.endpoint) as python:
         python.around(0, 0, radius=5)
@@ -309,7 +329,7 @@ def test_what_is_not_loaded_in_time(daemon: DaemonFactory, node: CppClient, divi
 
 
 def test_an_area_larger_than_the_daemon_s_memory(
-    daemon: DaemonFactory, node: CppClient, tmp_path: Path
+    daemon: DaemonFactory, node: AutowareNode, tmp_path: Path
 ) -> None:
     """Cells are let go of as they are copied: there is room for the next ones."""
     made = make_map(tmp_path / "map", points=20_000)
@@ -336,7 +356,7 @@ def leaves_of(cell: shmmap.Cell) -> list[str]:
 
 
 def test_leaves_are_those_of_the_layer(
-    daemon: DaemonFactory, node: CppClient, divided_map: DividedMap
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
@@ -357,10 +377,20 @@ def test_leaves_are_those_of_the_layer(
     )
 
 
-def test_a_voxel_without_an_inverse(node: CppClient) -> None:
+def test_a_voxel_without_an_inverse(node: AutowareNode) -> None:
     """Autoware keeps it, with -1 points; coordinates count from the cell's origin."""
     assert node.ask("refused") == [
         ["7 1001 2 3 1001 2 3 0 1 2 3 2 4 5 3 5 6"],
         ["-1 1004 5 6 1004 5 6 0 0 0 0 0 0 0 0 0 0"],
     ]
     assert node.ask("crooked") == [["segment_corrupt"]]
+
+
+@pytest.mark.parametrize(
+    ("compiler", "standard"), [("g++", "c++20"), ("clang++", "c++17"), ("clang++", "c++20")]
+)
+def test_other_compilers(compiler: str, standard: str) -> None:
+    """They find nothing to warn of, either."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is missing")
+    subprocess.run([compiler, f"-std={standard}", "-fsyntax-only", *FLAGS, str(NODE)], check=True)

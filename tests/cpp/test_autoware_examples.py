@@ -14,10 +14,9 @@ import pytest
 
 import shmmap
 from tests.cpp.conftest import DaemonFactory
-from tests.support.autoware_node import TYPES, compiled_here
+from tests.support.autoware_node import TYPES, compiled_with
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap
-from tests.support.rosidl_messages import generated_messages
 
 CPP = ROOT / "clients" / "cpp"
 EXAMPLES = CPP / "examples"
@@ -88,14 +87,9 @@ def test_requesters_of_the_service(
     """Each gets everything once, whoever asks at the same time; two of one name share what they hold."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is missing")
-    options: list[str] | None = []
-    if types == "generated":
-        options = generated_messages(tmp_path)
-        if options is None:
-            pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")
-        options = ["-DSHMMAP_GENERATED", *options]
-    source = ROOT / "tests" / "support" / "requesters.cpp"
-    program = compiled_here(source, tmp_path / "requesters", options)
+    program = compiled_with(types, ROOT / "tests" / "support" / "requesters.cpp", tmp_path)
+    if program is None:
+        pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")
     one = daemon(divided_map.root)
     lines = run(program, one.endpoint, 0, 0, 100, 6)
     assert lines == ["36 map 0 map "] * 6 + ["3"]

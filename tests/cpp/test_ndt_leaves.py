@@ -17,6 +17,7 @@ import pytest
 from shmmap.dividing.divide import divide
 from tests.benchmarks.layer_build import cells_of, city
 from tests.cpp.conftest import DaemonFactory
+from tests.support.built_once import built_once
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 
@@ -24,7 +25,7 @@ from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the compiled program."""
-    program = build_pcl_leaves(tmp_path_factory.mktemp("pcl"), optimize="-O1")
+    program = built_once(tmp_path_factory, "leaves", lambda folder: build_pcl_leaves(folder, optimize="-O1"))
     if program is None:
         pytest.skip("g++ or libpcl-dev (1.12 or newer) is missing")
     return program

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// What Autoware's scan matcher does with its `PcdLoaderFunction`, a line at a time; words are separated by tabs.
+// What Autoware's scan matcher does with its `PcdLoaderFunction`, a line at a time; words are separated by
+// tabs.
 //
 //   loader ENDPOINT WAIT PATIENCE     a new PcdLoader, a new NdtLeaves, and a node that holds nothing
 //   update X Y RADIUS                 as the node's `update_ndt`: ids held, then add, then remove
@@ -10,7 +11,8 @@
 //   refused                           leaves of a cell that has a voxel without an inverse covariance
 //   crooked                           of one whose columns do not belong together
 //
-// The answer ends with a line "end".  With SHMMAP_GENERATED the types are ROS 2's, else they are written out here.
+// The answer ends with a line "end".  With SHMMAP_GENERATED the types are ROS 2's, else they are written out
+// here.
 
 #include <cstdio>
 #include <iostream>
@@ -76,7 +78,8 @@ void make(const std::vector<std::string>& words) {
   grids.clear();
 }
 
-std::shared_ptr<Request> request_for(const std::vector<std::string>& words, const std::vector<std::string>& held) {
+std::shared_ptr<Request> request_for(const std::vector<std::string>& words,
+                                     const std::vector<std::string>& held) {
   auto request = std::make_shared<Request>();
   request->area.center_x = std::stof(words.at(1));
   request->area.center_y = std::stof(words.at(2));
@@ -87,15 +90,18 @@ std::shared_ptr<Request> request_for(const std::vector<std::string>& words, cons
 
 void print(const Response& response) {
   const auto& header = response.header;
-  std::cout << "header\t" << header.frame_id << "\t" << header.stamp.sec << "\t" << header.stamp.nanosec << "\n";
+  std::cout << "header\t" << header.frame_id << "\t" << header.stamp.sec << "\t" << header.stamp.nanosec
+            << "\n";
   for (const auto& cell : response.new_pointcloud_with_ids) {
-    const auto &cloud = cell.pointcloud;
-    const auto &box = cell.metadata;
+    const auto& cloud = cell.pointcloud;
+    const auto& box = cell.metadata;
     std::cout << "cell\t" << cell.cell_id << "\t" << box.min_x << " " << box.min_y << " " << box.max_x << " "
               << box.max_y << "\t" << cloud.height << " " << cloud.width << " " << cloud.point_step << " "
-              << cloud.row_step << " " << cloud.is_bigendian << cloud.is_dense << cloud.header.frame_id << "\t";
+              << cloud.row_step << " " << cloud.is_bigendian << cloud.is_dense << cloud.header.frame_id
+              << "\t";
     for (const auto& field : cloud.fields)
-      std::cout << field.name << ":" << field.offset << ":" << unsigned{field.datatype} << ":" << field.count << " ";
+      std::cout << field.name << ":" << field.offset << ":" << unsigned{field.datatype} << ":" << field.count
+                << " ";
     std::cout << "\t" << shmmap::detail::crc32(cloud.data.data(), cloud.data.size()) << "\n";
   }
   for (const auto& id : response.ids_to_remove) std::cout << "remove\t" << id << "\n";
@@ -188,8 +194,10 @@ template <typename Keys>
 std::vector<std::string> keys(const Keys& from) {
   std::vector<std::string> found;
   for (const auto& one : from) {
-    if constexpr (std::is_same_v<Keys, std::set<std::string>>) found.push_back(one);
-    else found.push_back(one.first);
+    if constexpr (std::is_same_v<Keys, std::set<std::string>>)
+      found.push_back(one);
+    else
+      found.push_back(one.first);
   }
   return found;
 }
@@ -204,8 +212,10 @@ void obey(const std::vector<std::string>& words) {
     take(loader_of_const(request_for(words, keys(ids))));
   } else if (what == "ask") {
     const auto response = loader(request_for(words, split(words.at(4), ';')));
-    if (response) print(*response);
-    else std::cout << "nullptr\n";
+    if (response)
+      print(*response);
+    else
+      std::cout << "nullptr\n";
   } else if (what == "grids") {
     take_grids(request_for(words, keys(grids)));
   } else if (what == "leaves") {

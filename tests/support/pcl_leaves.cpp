@@ -3,7 +3,8 @@
 // Usage: pcl_leaves ENDPOINT X Y RADIUS LEAF; each line of stdin is answered by lines of JSON.
 //   compare    a line for each cell: leaves of both, and the largest differences
 //   clouds     a line for each cell: whether its message is to the byte what PCL reads from its file
-//   time       one round: ms of processor time for the leaves of all cells; ms until a request for them, or for
+//   time       one round: ms of processor time for the leaves of all cells; ms until a request for them, or
+//   for
 //              points, is answered; ms for PCL to read the points from the cells' files
 // The last line of an answer is empty.
 
@@ -43,7 +44,8 @@ Cloud::Ptr cloud_of(const shmmap::Cell& cell) {
   const auto xyz = cell.column<float>("xyz");
   auto cloud = pcl::make_shared<Cloud>();
   cloud->reserve(xyz.rows());
-  for (std::size_t row = 0; row < xyz.rows(); ++row) cloud->emplace_back(xyz[row][0], xyz[row][1], xyz[row][2]);
+  for (std::size_t row = 0; row < xyz.rows(); ++row)
+    cloud->emplace_back(xyz[row][0], xyz[row][1], xyz[row][2]);
   return cloud;
 }
 
@@ -70,21 +72,26 @@ void compare(const shmmap::Cell& points, const shmmap::Cell& ndt, float leaf) {
   std::size_t theirs = 0, counts = 0, refused = 0;
   double mean = 0, centroid = 0, inverse = 0;
   for (auto& [index, one] : grid.getLeaves()) {
-    if (one.nr_points == -1) ++refused;
-    else if (one.nr_points < 6) continue;
+    if (one.nr_points == -1)
+      ++refused;
+    else if (one.nr_points < 6)
+      continue;
     if (theirs < ours.size() && one.nr_points != -1) {
       const Leaf& mine = ours[theirs];
       const Eigen::Matrix3d expected = inverse_of(one.cov_, one.nr_points);
       counts += mine.nr_points_ != one.nr_points;
       mean = std::max(mean, (mine.mean_ - one.mean_).cwiseAbs().maxCoeff());
-      centroid = std::max(centroid, static_cast<double>((mine.centroid_.head<3>() - one.centroid.head<3>()).norm()));
-      inverse = std::max(inverse, (mine.icov_ - expected).cwiseAbs().maxCoeff() / expected.cwiseAbs().maxCoeff());
+      centroid =
+          std::max(centroid, static_cast<double>((mine.centroid_.head<3>() - one.centroid.head<3>()).norm()));
+      inverse =
+          std::max(inverse, (mine.icov_ - expected).cwiseAbs().maxCoeff() / expected.cwiseAbs().maxCoeff());
     }
     ++theirs;
   }
-  std::printf("{\"id\": \"%s\", \"ours\": %zu, \"theirs\": %zu, \"refused\": %zu, \"counts\": %zu, \"mean\": %.3g, "
-              "\"centroid\": %.3g, \"inverse\": %.3g}\n",
-              ndt.id.c_str(), ours.size(), theirs, refused, counts, mean, centroid, inverse);
+  std::printf(
+      "{\"id\": \"%s\", \"ours\": %zu, \"theirs\": %zu, \"refused\": %zu, \"counts\": %zu, \"mean\": %.3g, "
+      "\"centroid\": %.3g, \"inverse\": %.3g}\n",
+      ndt.id.c_str(), ours.size(), theirs, refused, counts, mean, centroid, inverse);
 }
 
 /// Autoware's loader reads a file by PCL, and passes on what comes of it.
@@ -101,7 +108,8 @@ void compare(const plain::Cell& cell) {
   }
   const bool layout = ours.height == theirs.height && ours.width == theirs.width &&
                       ours.point_step == theirs.point_step && ours.row_step == theirs.row_step &&
-                      ours.is_bigendian == (theirs.is_bigendian != 0) && ours.is_dense == (theirs.is_dense != 0);
+                      ours.is_bigendian == (theirs.is_bigendian != 0) &&
+                      ours.is_dense == (theirs.is_dense != 0);
   std::printf("{\"id\": \"%s\", \"points\": %u, \"fields\": %d, \"layout\": %d, \"data\": %d}\n",
               cell.cell_id.c_str(), ours.width, fields, layout, ours.data == theirs.data);
 }
@@ -174,7 +182,8 @@ int main(int count, char** words) {
           if (pcl::io::loadPCDFile(points[at]->id, read[at]) != 0) return 1;
         std::printf(", \"files_ms\": %.6f", now(CLOCK_MONOTONIC) - begin);
       }
-      for (const auto& cell : ndt) bytes += static_cast<std::size_t>(cell->rows) * (3 + 6) * 8 + cell->rows * 4;
+      for (const auto& cell : ndt)
+        bytes += static_cast<std::size_t>(cell->rows) * (3 + 6) * 8 + cell->rows * 4;
       std::printf(", \"bytes\": %zu}\n", bytes);
     }
     std::cout << std::endl;

@@ -18,7 +18,7 @@ _LIBRARIES = ("io", "filters", "search", "kdtree", "common")
 
 
 def build_pcl_leaves(folder: Path, *, optimize: str = "-O2") -> Path | None:
-    """Compile the program; None where it cannot be, or where PCL is older than the covariances it is asked for."""
+    """Compile the program; None where it cannot be, or where PCL is older than its right covariances."""
     source = Path(__file__).with_name("pcl_leaves.cpp")
     options = [f"-I{INCLUDE}", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
     return built_pcl_program(source, folder, _LIBRARIES, optimize=optimize, oldest=(1, 12), options=options)

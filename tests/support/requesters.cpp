@@ -2,7 +2,8 @@
 // The part of the example `autoware_node.cpp` that needs no rclcpp: several requesters of one service.
 // Usage: requesters X Y RADIUS COUNT
 //
-// Each of COUNT requesters asks twice at the same time as the others, the second time with the ids that it got.
+// Each of COUNT requesters asks twice at the same time as the others, the second time with the ids that it
+// got.
 
 #define SHMMAP_WITHOUT_RCLCPP
 #include <cstdio>
@@ -41,7 +42,8 @@ int main(int count, char** words) {
   for (int number = 0; number < threads; ++number) {
     running.emplace_back([&, number] {
       RequestId id;
-      id.writer_guid[15] = static_cast<std::int8_t>(number / 2);  // two at a time have one name: a loader shared
+      id.writer_guid[15] =
+          static_cast<std::int8_t>(number / 2);  // two at a time have one name: a loader shared
       const auto name = shmmap_example::requester_of(id);
       Service::Request request;
       request.area.center_x = std::stof(words[1]);
@@ -51,8 +53,8 @@ int main(int count, char** words) {
         Service::Response response;
         requesters.answer(name, request, response);
         for (const auto& cell : response.new_pointcloud_with_ids) request.cached_ids.push_back(cell.cell_id);
-        told[static_cast<std::size_t>(number)] += std::to_string(response.new_pointcloud_with_ids.size()) + " " +
-                                                  response.header.frame_id + " ";
+        told[static_cast<std::size_t>(number)] +=
+            std::to_string(response.new_pointcloud_with_ids.size()) + " " + response.header.frame_id + " ";
       }
     });
   }

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// NOT BUILT HERE: this project has no ROS 2 to build it with.  Its tests compile and run all but the node at the
-// end, with message types from ROS 2's generator.
+// NOT BUILT HERE: this project has no ROS 2 to build it with.  Its tests compile and run all but the node at
+// the end, with message types from ROS 2's generator.
 //
-// Autoware's differential map service out of shared memory, for every RMW: an ordinary node on the machine where
-// the daemon runs.  Points are copied into messages once more and travel as any message does; a node that is
-// built with `shmmap/autoware.hpp` itself needs neither.
+// Autoware's differential map service out of shared memory, for every RMW: an ordinary node on the machine
+// where the daemon runs.  Points are copied into messages once more and travel as any message does; a node
+// that is built with `shmmap/autoware.hpp` itself needs neither.
 //
 //   find_package(autoware_map_msgs REQUIRED)
 //   find_package(rclcpp REQUIRED)
@@ -14,8 +14,9 @@
 //   ros2 run PACKAGE shmmap_map_loader --ros-args -r __ns:=/shmmap -p wait:=10.0
 //
 // It offers /shmmap/get_differential_pointcloud_map: remap a client's service to it (of the scan matcher, the
-// launch argument `client_map_loader`).  In the namespace /map it takes the place of Autoware's own loader, for
-// clients that ask for nothing else.  Parameters: `endpoint` (of the daemon; empty: as for every client), `wait`.
+// launch argument `client_map_loader`).  In the namespace /map it takes the place of Autoware's own loader,
+// for clients that ask for nothing else.  Parameters: `endpoint` (of the daemon; empty: as for every client),
+// `wait`.
 
 #include <cstdint>
 #include <functional>
@@ -34,8 +35,8 @@ class Requesters {
  public:
   using Loader = shmmap::PcdLoader<Service>;
 
-  /// At most so many are known; of more, the one that has not asked for the longest time is forgotten, and would
-  /// get again what it has.
+  /// At most so many are known; of more, the one that has not asked for the longest time is forgotten, and
+  /// would get again what it has.
   static constexpr std::size_t most = 256;
 
   explicit Requesters(shmmap::LoaderOptions options) : options_(std::move(options)) {}
@@ -101,11 +102,12 @@ class MapLoaderNode : public rclcpp::Node {
     const rmw_qos_profile_t qos = rclcpp::ServicesQoS().get_rmw_qos_profile();
 #endif
     service_ = create_service<Service>(
-      "get_differential_pointcloud_map",
-      [this](
-        const std::shared_ptr<rmw_request_id_t> id, const Service::Request::SharedPtr request,
-        Service::Response::SharedPtr response) { requesters_.answer(requester_of(*id), *request, *response); },
-      qos, group_);
+        "get_differential_pointcloud_map",
+        [this](const std::shared_ptr<rmw_request_id_t> id, const Service::Request::SharedPtr request,
+               Service::Response::SharedPtr response) {
+          requesters_.answer(requester_of(*id), *request, *response);
+        },
+        qos, group_);
   }
 
  private:

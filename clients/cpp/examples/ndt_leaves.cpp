@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// A scan matcher's map along a drive: voxels around the vehicle as leaves of Autoware's shape, computed once per
-// machine.  What comes is added first, and what is left behind removed after, as Autoware's map update does it.
+// A scan matcher's map along a drive: voxels around the vehicle as leaves of Autoware's shape, computed once
+// per machine.  What comes is added first, and what is left behind removed after, as Autoware's map update
+// does it.
 //
 //   cd clients/cpp
 //   g++ -O2 -Iinclude $(pkg-config --cflags eigen3) examples/ndt_leaves.cpp -o ndt_leaves

@@ -14,7 +14,8 @@
 
 using Cloud = pcl::PointCloud<pcl::PointXYZ>;
 
-/// Copy the points of all cells.  PCL's points have 16 bytes, those in shared memory 12: a cloud cannot be a view.
+/// Copy the points of all cells.  PCL's points have 16 bytes, those in shared memory 12: a cloud cannot be a
+/// view.
 Cloud::Ptr cloud_of(const std::vector<shmmap::CellPtr>& cells) {
   std::size_t points = 0;
   for (const auto& cell : cells) points += static_cast<std::size_t>(cell->rows);
@@ -23,7 +24,8 @@ Cloud::Ptr cloud_of(const std::vector<shmmap::CellPtr>& cells) {
   auto to = cloud->begin();
   for (const auto& cell : cells) {
     const auto xyz = cell->column<float>("xyz");
-    for (std::size_t row = 0; row < xyz.rows(); ++row, ++to) std::memcpy(to->data, xyz[row], 3 * sizeof(float));
+    for (std::size_t row = 0; row < xyz.rows(); ++row, ++to)
+      std::memcpy(to->data, xyz[row], 3 * sizeof(float));
     cloud->header.frame_id = cell->frame_id;
   }
   return cloud;
@@ -38,13 +40,18 @@ int main(int count, char** words) {
     shmmap::Client client;  // finds the daemon as `shmmap status` does
     const shmmap::Circle around{std::stod(words[1]), std::stod(words[2]), std::stod(words[3])};
     const auto answer = client.area(around);
-    for (const auto& failure : answer.failed) std::fprintf(stderr, "%s: %s\n", failure.id.c_str(), failure.message.c_str());
-    for (const auto& [id, layer] : answer.pending) std::fprintf(stderr, "%s: still being loaded\n", id.c_str());
+    for (const auto& failure : answer.failed)
+      std::fprintf(stderr, "%s: %s\n", failure.id.c_str(), failure.message.c_str());
+    for (const auto& [id, layer] : answer.pending)
+      std::fprintf(stderr, "%s: still being loaded\n", id.c_str());
     const auto cloud = cloud_of(answer.cells);
-    pcl::PointXYZ low, high;
-    pcl::getMinMax3D(*cloud, low, high);
-    std::printf("%zu cells, %zu points in frame %s\n", answer.cells.size(), cloud->size(), cloud->header.frame_id.c_str());
-    std::printf("from %.9g %.9g %.9g to %.9g %.9g %.9g\n", low.x, low.y, low.z, high.x, high.y, high.z);
+    std::printf("%zu cells, %zu points in frame %s\n", answer.cells.size(), cloud->size(),
+                cloud->header.frame_id.c_str());
+    if (!cloud->empty()) {
+      pcl::PointXYZ low, high;
+      pcl::getMinMax3D(*cloud, low, high);
+      std::printf("from %.9g %.9g %.9g to %.9g %.9g %.9g\n", low.x, low.y, low.z, high.x, high.y, high.z);
+    }
     return answer.failed.empty() && answer.pending.empty() ? 0 : 1;
   } catch (const std::exception& error) {
     std::fprintf(stderr, "pcl_cloud: %s\n", error.what());

@@ -6,16 +6,16 @@
 //     shmmap::PcdLoader<Service> loader;                  // is a `PcdLoaderFunction`
 //     auto response = loader(request);                    // cells to add, ids to remove; or nullptr
 //
-//     shmmap::NdtLeaves<Leaf> leaves(2.0);                // the same, but with voxels that are computed already
+//     shmmap::NdtLeaves<Leaf> leaves(2.0);                // the same with voxels, which are computed already
 //     if (auto found = leaves(request)) use(found->grids_to_add, found->ids_to_remove);
 //
 // Nothing of ROS, PCL or Eigen is included: messages and leaves are whatever has members of these names.
 //
-// Autoware's `cached_ids` say which cells a node has, and not in which version.  So these objects remember the
-// version of each cell that they handed out, and a cell that has changed in the map comes again under its id.
-// Hence: one object for each thing that keeps cells, and what it returns must be taken over as a whole.  Copies
-// share one memory and one connection.  They may be called from any thread, one call at a time (the second one
-// waits); a node of one thread needs no other.
+// Autoware's `cached_ids` say which cells a node has, and not in which version.  So these objects remember
+// the version of each cell that they handed out, and a cell that has changed in the map comes again under its
+// id.  Hence: one object for each thing that keeps cells, and what it returns must be taken over as a whole.
+// Copies share one memory and one connection.  A node's one thread may use them as well as several: a second
+// call waits for the first one to end.
 //
 // They never throw.  Cells are waited for, because a node that was given nothing, or a part, asks again only
 // 20 m further on: `LoaderOptions::wait` seconds for cells that are being loaded, or until there is a daemon;
@@ -42,6 +42,8 @@ struct LoaderOptions {
   std::function<void(const std::string&)> log = {};
 };
 
+namespace detail {
+
 /// What changes for a node that holds cells.
 template <typename Made>
 struct Difference {
@@ -50,16 +52,15 @@ struct Difference {
   std::string frame_id;
 };
 
-namespace detail {
-
 /// Remembers the versions of the cells that somebody holds by id, and asks for what he lacks.
 class HeldCells {
  public:
-  HeldCells(LoaderOptions options, std::string layer) : options_(std::move(options)), layer_(std::move(layer)) {}
+  HeldCells(LoaderOptions options, std::string layer)
+      : options_(std::move(options)), layer_(std::move(layer)) {}
 
-  /// What `cached` lacks of an area, each cell as `make` makes it out of the mapped one, and what it has in vain;
-  /// no value, and nothing forgotten, where something is missing and no other cell has come.  Cells are let go of
-  /// as soon as they are made: an area may be larger than the daemon's memory.
+  /// What `cached` lacks of an area, each cell as `make` makes it out of the mapped one, and what it has in
+  /// vain; no value, and nothing forgotten, where something is missing and no other cell has come.  Cells are
+  /// let go of as soon as they are made: an area may be larger than the daemon's memory.
   template <typename Make, typename Made = std::invoke_result_t<const Make&, const Cell&>>
   std::optional<Difference<Made>> difference(const Area& area, const std::vector<std::string>& cached,
                                              const Make& make) {
@@ -103,8 +104,9 @@ class HeldCells {
           no_room = no_room || failure.code == "over_budget" || failure.code == "no_space";
         }
         for (const auto& [id, layer] : answer.pending) lacks(id, id + ": it is still being loaded");
-        // room comes of what is let go here; only the map's list may take its time without the daemon waiting for it
-        again = (!covered || !answer.pending.empty() || (no_room && !answer.cells.empty())) && Clock::now() < until;
+        // room comes of what is let go here; and for a map that is not known yet no request waits
+        again = (!covered || !answer.pending.empty() || (no_room && !answer.cells.empty())) &&
+                Clock::now() < until;
         if (again && answer.cells.empty()) ::poll(nullptr, 0, 20);
       }
       if (!covered && trouble.empty()) trouble = "not all of the map is known yet";
@@ -211,8 +213,8 @@ inline void spread(const PointField& field, std::size_t first, std::size_t point
   }
 }
 
-/// The fields of a cell's points, x, y, z first, each beside the one before; `xyz32` keeps coordinates that the
-/// map has in 64 bits: PCL's points have 32.
+/// The fields of a cell's points, x, y, z first, each beside the one before; `xyz32` keeps coordinates that
+/// the map has in 64 bits: PCL's points have 32.
 inline std::vector<PointField> point_fields(const Cell& cell, std::vector<float>& xyz32) {
   std::vector<PointField> fields;
   std::size_t offset = 0;
@@ -233,7 +235,8 @@ inline std::vector<PointField> point_fields(const Cell& cell, std::vector<float>
       if (column.dtype == "<f8") {
         const auto values = cell.column<double>("xyz");
         xyz32.resize(values.size());
-        std::transform(values.begin(), values.end(), xyz32.begin(), [](double one) { return static_cast<float>(one); });
+        std::transform(values.begin(), values.end(), xyz32.begin(),
+                       [](double one) { return static_cast<float>(one); });
         from = xyz32.data();
       } else if (column.dtype != "<f4") {
         throw BadRequest("bad_request", cell.id + ": its coordinates are " + column.dtype);
@@ -266,8 +269,9 @@ void fill(Cloud& cloud, const Cell& cell) {
     step += field.bytes;
   }
   // x, y, z lie side by side there as here: they are copied as one
-  fields.erase(std::remove_if(fields.begin(), fields.end(), [](const auto& one) { return one.from == nullptr; }),
-               fields.end());
+  fields.erase(
+      std::remove_if(fields.begin(), fields.end(), [](const auto& one) { return one.from == nullptr; }),
+      fields.end());
   for (auto& field : fields)
     if (field.name == "x") field.bytes = 12;
   const auto points = static_cast<std::size_t>(cell.rows);
@@ -280,15 +284,16 @@ void fill(Cloud& cloud, const Cell& cell) {
   cloud.data.resize(points * step);
   constexpr std::size_t block = 1024;  // of points: they stay in the cache until all their fields are there
   for (std::size_t first = 0; first < points; first += block)
-    for (const auto& field : fields) spread(field, first, std::min(block, points - first), cloud.data.data(), step);
+    for (const auto& field : fields)
+      spread(field, first, std::min(block, points - first), cloud.data.data(), step);
 }
 
 }  // namespace detail
 
 /// Answers `GetDifferentialPointCloudMap` requests: what Autoware calls a `PcdLoaderFunction`.
 ///
-/// `Service` is `autoware_map_msgs::srv::GetDifferentialPointCloudMap`, or anything that has a `Request` and a
-/// `Response` of that shape.
+/// `Service` is `autoware_map_msgs::srv::GetDifferentialPointCloudMap`, or anything that has a `Request` and
+/// a `Response` of that shape.
 template <typename Service>
 class PcdLoader {
  public:
@@ -304,21 +309,23 @@ class PcdLoader {
   std::shared_ptr<Response> operator()(const RequestPointer& request) const noexcept {
     try {
       using CellMessage = typename decltype(Response::new_pointcloud_with_ids)::value_type;
-      auto found = cells_->difference(detail::area_of(*request), detail::ids_of(*request), [](const Cell& cell) {
-        CellMessage message;
-        message.cell_id = cell.id;
-        detail::fill(message.pointcloud, cell);
-        auto& box = message.metadata;
-        box.min_x = static_cast<decltype(box.min_x)>(cell.min_x);
-        box.min_y = static_cast<decltype(box.min_y)>(cell.min_y);
-        box.max_x = static_cast<decltype(box.max_x)>(cell.max_x);
-        box.max_y = static_cast<decltype(box.max_y)>(cell.max_y);
-        return message;
-      });
+      auto found =
+          cells_->difference(detail::area_of(*request), detail::ids_of(*request), [](const Cell& cell) {
+            CellMessage message;
+            message.cell_id = cell.id;
+            detail::fill(message.pointcloud, cell);
+            auto& box = message.metadata;
+            box.min_x = static_cast<decltype(box.min_x)>(cell.min_x);
+            box.min_y = static_cast<decltype(box.min_y)>(cell.min_y);
+            box.max_x = static_cast<decltype(box.max_x)>(cell.max_x);
+            box.max_y = static_cast<decltype(box.max_y)>(cell.max_y);
+            return message;
+          });
       if (!found) return nullptr;
       auto response = std::make_shared<Response>();
       response->header.frame_id = found->frame_id;
-      for (auto& [id, message] : found->added) response->new_pointcloud_with_ids.push_back(std::move(message));
+      for (auto& [id, message] : found->added)
+        response->new_pointcloud_with_ids.push_back(std::move(message));
       for (auto& id : found->removed) response->ids_to_remove.push_back(std::move(id));
       return response;
     } catch (const std::exception& error) {
@@ -333,19 +340,20 @@ class PcdLoader {
 
 // --- voxels ----------------------------------------------------------------------------------------------
 
-/// The voxels of a cell's `ndt` layer as Autoware's `MultiVoxelGridCovariance::Leaf`, or anything with members
-/// `nr_points_`, `mean_`, `centroid_` and `icov_` that are used as there.
+/// The voxels of a cell's `ndt` layer as Autoware's `MultiVoxelGridCovariance::Leaf`, or anything with
+/// members `nr_points_`, `mean_`, `centroid_` and `icov_` that are used as there.
 ///
 /// Voxels are in Autoware's order (x fastest, then y, then z), of at least 6 points each, unless the layer's
 /// `min_points` says otherwise.  One whose covariance has no inverse has zeros in `icov_` and -1 points.
-/// `centroid_` is `mean_` rounded to float32, where Autoware sums in float32: far from the map's origin its sum
-/// is centimetres off.  Covariances are not filled in: once there is an inverse, nothing reads them.
+/// `centroid_` is `mean_` rounded to float32, where Autoware sums in float32: far from the map's origin its
+/// sum is centimetres off.  Covariances are not filled in: once there is an inverse, nothing reads them.
 template <typename Leaf>
 std::vector<Leaf> ndt_leaves(const Cell& cell) {
   const auto mean = cell.column<double>("mean"), inverse = cell.column<double>("inverse_covariance");
   const auto count = cell.column<std::uint32_t>("count");
   const std::size_t rows = mean.rows();
-  if (inverse.rows() != rows || count.rows() != rows || (rows != 0 && (mean.width() != 3 || inverse.width() != 6)))
+  if (inverse.rows() != rows || count.rows() != rows ||
+      (rows != 0 && (mean.width() != 3 || inverse.width() != 6)))
     throw SegmentError("segment_corrupt", cell.id + " (" + cell.layer + "): its columns are no voxels");
   std::vector<Leaf> leaves(rows);
   for (std::size_t row = 0; row < rows; ++row) {
@@ -369,7 +377,7 @@ std::vector<Leaf> ndt_leaves(const Cell& cell) {
   return leaves;
 }
 
-/// Voxels where `PcdLoader` has points: the same requests, and cells that nobody has to make voxels of any more.
+/// Voxels where `PcdLoader` has points: the same requests, and nobody has to make voxels any more.
 template <typename Leaf>
 class NdtLeaves {
  public:
