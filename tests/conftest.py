@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.built_once import built_once
 from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
     pytest_collectreport,
@@ -58,7 +59,6 @@ def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the client in C++, compiled once for all processes of the tests; needs g++."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is missing")
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cpp"
-    folder.mkdir(exist_ok=True)
-    return compiled(folder)
+    program = built_once(tmp_path_factory, "cpp_client", compiled)
+    assert program is not None
+    return program

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
 import subprocess
@@ -31,6 +30,7 @@ from tests.support.daemon_process import ROOT
 __all__ = [
     "FLAGS",
     "INCLUDE",
+    "SOURCE",
     "CppCell",
     "CppClient",
     "CppEventStream",
@@ -49,19 +49,15 @@ _CELL_WORDS: Final = 9
 
 
 def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17") -> Path:
-    """Compile the client with the sanitizers of addresses and undefined behaviour, once for all who ask."""
+    """Compile the client with the sanitizers of addresses and of undefined behaviour."""
     program = folder / f"cpp_client.{compiler}.{standard}"
-    with open(f"{program}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not program.exists():
-            subprocess.run(
-                [
-                    compiler, f"-std={standard}", "-O1", "-g", "-fsanitize=address,undefined",
-                    "-fno-sanitize-recover=all", *FLAGS, str(SOURCE), "-o", f"{program}.new",
-                ],
-                check=True,
-            )  # fmt: skip
-            os.rename(f"{program}.new", program)
+    subprocess.run(
+        [
+            compiler, f"-std={standard}", "-Og", "-g1", "-fsanitize=address,undefined",
+            "-fno-sanitize-recover=all", *FLAGS, str(SOURCE), "-o", str(program),
+        ],
+        check=True,
+    )  # fmt: skip
     return program
 
 
