@@ -21,11 +21,11 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 import shmmap
-import shmmap.client.session
 from tests.benchmarks.warm_request import BLOCK, NEW, Warm, time_block
 from tests.support.cpp_client import INCLUDE
 from tests.support.daemon_process import DaemonProcess
@@ -79,14 +79,11 @@ def attach_in_python(client: shmmap.Client, area: shmmap.Box) -> float:
         nonlocal came
         came = time.perf_counter()
 
-    step, shmmap.client.session.step = shmmap.client.session.step, note
-    try:
+    with mock.patch("shmmap.client.session.step", note):
         cells = client.area(area, wait=120.0).raise_for_failures()
         for cell in cells:
             cell.xyz  # noqa: B018  made when it is first asked for
         took = (time.perf_counter() - came) * 1e6 / len(cells)
-    finally:
-        shmmap.client.session.step = step
     del cell, cells
     client.release()
     return took
