@@ -17,11 +17,13 @@
 #include <cstdio>
 #include <cstdlib>
 #include <ctime>
-#include <map>
+#include <functional>
 #include <memory>
+#include <mutex>
 #include <optional>
 #include <string>
 #include <string_view>
+#include <unordered_map>
 #include <utility>
 #include <vector>
 
@@ -36,7 +38,36 @@ namespace shmmap {
 
 namespace detail {
 class NothingNew;
-}
+
+using CellKey = std::pair<std::uint64_t, std::string>;  // version and layer, which name the bytes
+
+struct HashOfCellKey {
+  std::size_t operator()(const CellKey& key) const noexcept {
+    return static_cast<std::size_t>(key.first) ^ std::hash<std::string>()(key.second);
+  }
+};
+
+/// What was unmapped, by whatever thread, and the daemon was not told of yet.
+class Unmapped {
+ public:
+  void add(const CellKey& key) noexcept {
+    try {
+      const std::lock_guard<std::mutex> alone(mutex_);
+      keys_.push_back(key);
+    } catch (...) {  // NOLINT(bugprone-empty-catch): the daemon finds out by itself, a little later
+    }
+  }
+  std::vector<CellKey> take() {
+    const std::lock_guard<std::mutex> alone(mutex_);
+    return std::exchange(keys_, {});
+  }
+
+ private:
+  std::mutex mutex_;
+  std::vector<CellKey> keys_;
+};
+
+}  // namespace detail
 
 /// How a client finds the daemon and what it says of itself.
 struct Options {
@@ -464,7 +495,11 @@ class Client {
     const std::uint64_t end = header_bytes - 72;
     if (detail::crc32(segment, static_cast<std::size_t>(end)) != read_at<std::uint32_t>(segment, end))
       detail::corrupt(handle, "the header's checksum is wrong");
-    auto cell = std::make_shared<Cell>();
+    const std::shared_ptr<Cell> cell(
+        new Cell, [unmapped = unmapped_, key = detail::CellKey(handle.version, handle.layer)](Cell* one) {
+          delete one;
+          unmapped->add(key);
+        });
     cell->id = whole(handle.id);
     cell->layer = handle.layer;
     cell->version = handle.version;
@@ -492,13 +527,11 @@ class Client {
   /// Tell the daemon which versions nobody here maps any more: memory can be used again at once.
   void tell_unmapped() {
     std::vector<std::uint64_t> versions;
-    for (auto one = cells_.begin(); one != cells_.end();) {
-      if (one->second.expired()) {
-        versions.push_back(one->first.first);
-        one = cells_.erase(one);
-      } else {
-        ++one;
-      }
+    for (const auto& key : unmapped_->take()) {
+      const auto known = cells_.find(key);
+      if (known == cells_.end() || !known->second.expired()) continue;  // it was told, or is mapped again
+      versions.push_back(key.first);
+      cells_.erase(known);
     }
     if (versions.empty() || !socket_.is_open()) return;
     auto message = begun("release", next_request(), 1);
@@ -516,7 +549,8 @@ class Client {
   detail::Welcome welcome_;
   std::uint64_t request_ = 0, handshakes_ = 0;
   std::optional<uid_t> owner_;
-  std::map<std::pair<std::uint64_t, std::string>, std::weak_ptr<const Cell>> cells_;
+  std::unordered_map<detail::CellKey, std::weak_ptr<const Cell>, detail::HashOfCellKey> cells_;
+  std::shared_ptr<detail::Unmapped> unmapped_ = std::make_shared<detail::Unmapped>();
 };
 
 }  // namespace shmmap
