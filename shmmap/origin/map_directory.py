@@ -138,7 +138,10 @@ class MapDirectory:
             data = metadata_bytes(layout.metadata, most_bytes)
         files = scan(layout.roots, recursive=not self.strict)
         if not len(files.names):
-            raise MapMissing(f"there is no PCD file in {', '.join(layout.roots)}")
+            raise MapMissing(
+                f"there is no PCD file in {', '.join(layout.roots)}",
+                hint="a divided map is a directory of PCD files; `shmmap divide` makes one of other clouds",
+            )
         if layout.metadata is None:
             return _without_metadata(files)
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)

@@ -87,9 +87,14 @@ def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> Ma
     try:
         os.stat(path)
     except OSError as error:
-        raise MapMissing(f"there is no map at {path}: {str(error.strerror).lower()}") from error
+        raise MapMissing(
+            f"there is no map at {path}: {str(error.strerror).lower()}",
+            hint="name the directory of a divided map, or one cloud; `shmmap demo` needs no map",
+        ) from error
     if metadata is not None and not os.path.isfile(metadata):
-        raise MapMissing(f"there is no metadata file at {metadata}")
+        raise MapMissing(
+            f"there is no metadata file at {metadata}", hint="name the YAML file that lists the map's cells"
+        )
     if os.path.isfile(path) and path.lower().endswith((".yaml", ".yml")):
         metadata = metadata or path
         path = os.path.dirname(path)
@@ -98,7 +103,10 @@ def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> Ma
     if pcd_paths:
         roots = tuple(p for p in pcd_paths if os.path.exists(p))
         if not roots:
-            raise MapMissing(f"none of the PCD paths exists: {', '.join(pcd_paths)}")
+            raise MapMissing(
+                f"none of the PCD paths exists: {', '.join(pcd_paths)}",
+                hint="name files or directories of files",
+            )
         problems = tuple(f"invalid path: {p}" for p in pcd_paths if p not in roots)
     else:
         roots, problems = (root,), ()
