@@ -116,6 +116,7 @@ class Window {
     detail::check_circle(0.0, 0.0, options_.radius);
     if (!(options_.update_distance >= 0.0) || !(options_.refresh_interval > 0.0))
       throw BadRequest("bad_request", "a window's update_distance is not below zero, its refresh_interval above");
+    if (options_.layers.empty()) throw BadRequest("bad_request", "a window has at least one layer", "such as points");
     if (options_.z && !(options_.z->min <= options_.z->max))
       throw BadRequest("bad_request", "a window's lowest z lies above its highest");
   }
@@ -144,6 +145,13 @@ class Window {
   [[nodiscard]] std::vector<CellPtr> cells() const {
     std::vector<CellPtr> found;
     for (const auto& [key, cell] : cells_) found.push_back(cell);
+    return found;
+  }
+
+  /// Version of each (id, layer) in the window: remembering them keeps nothing mapped.
+  [[nodiscard]] std::map<LayerKey, std::uint64_t> versions() const {
+    std::map<LayerKey, std::uint64_t> found;
+    for (const auto& [key, cell] : cells_) found.emplace(key, cell->version);
     return found;
   }
 
@@ -270,10 +278,10 @@ class Window {
       return false;
     }
     const auto changes = nothing_new_.changes(client_);
-    const auto ask = [&](const std::vector<Held>& held, const std::vector<std::uint64_t>& packed) {
-      return client_.differential(area, held, packed, options_.layers, wait, pose);
+    const auto ask = [&](const std::vector<Held>& by_name, const std::vector<std::uint64_t>& by_version) {
+      return client_.differential(area, by_name, by_version, options_.layers, wait, pose);
     };
-    Answer answer = ask({}, versions());
+    Answer answer = ask({}, packed());
     if (answer.epoch != epoch_ && !cells_.empty()) {
       // Another life of the daemon cannot know what versions of an earlier one belonged to, and takes those that are
       // not current for strangers.  What was attached stays so while asking again.
@@ -304,7 +312,7 @@ class Window {
     return Circle{pose.x, pose.y, options_.radius, options_.z};
   }
 
-  [[nodiscard]] std::vector<std::uint64_t> versions() const {
+  [[nodiscard]] std::vector<std::uint64_t> packed() const {
     std::vector<std::uint64_t> found;
     found.reserve(cells_.size());
     for (const auto& [key, cell] : cells_) found.push_back(cell->version);
@@ -384,12 +392,11 @@ class Window {
 
   WindowUpdate changes_since_last() {
     WindowUpdate update;
-    std::map<LayerKey, std::uint64_t> seen;
+    auto seen = versions();
     for (const auto& [key, cell] : cells_) {
       const auto before = seen_.find(key);
       (before == seen_.end() ? update.added : before->second == cell->version ? update.kept : update.changed)
           .push_back(cell);
-      seen.emplace(key, cell->version);
     }
     for (const auto& [key, version] : seen_)
       if (seen.count(key) == 0 && (update.removed.empty() || update.removed.back() != key.first))
