@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells of the map as ``sensor_msgs/PointCloud2``, byte for byte as Autoware's map loader sends them.
+
+It reads a file by ``pcl::io::loadPCDFile`` and sends what is in it: each field with its own type, one after
+another without gaps, in the file's order. A map of x y z intensity has points of 16 bytes, one of x y z has
+points of 12. A cell's columns are the same fields. Autoware's nodes look x, y and z up by name and take only
+float32, so doubles, and coordinates with an origin of their own, are rounded to float32 here.
+
+Different from Autoware: points that are not finite are not in a cell; ``height`` is always 1; integers of 64
+bits, for which the message has no type, are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import Cell
+from shmmap_clients.ros_bridge.cdr import CdrWriter
+
+__all__ = ["CloudLayout", "cloud_layout", "fill_rows", "write_cloud", "write_cloud_head"]
+
+_DATATYPES: Final = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+"""By numpy's names; numbers as in ``sensor_msgs/PointField``."""
+_FLOAT32: Final = 7
+
+
+@dataclass(frozen=True, slots=True)
+class CloudLayout:
+    """How a point's bytes are divided.
+
+    Attributes
+    ----------
+    fields
+        Name, offset, type and count of each value.
+    columns
+        Name and offset of each of the cell's columns, of which ``xyz`` is three fields.
+    rows
+        The same for numpy: a record with a member for each column.
+    """
+
+    fields: tuple[tuple[str, int, int, int], ...]
+    columns: tuple[tuple[str, int], ...]
+    rows: np.dtype[Any]
+
+    @property
+    def point_step(self) -> int:
+        """Bytes of a point."""
+        return self.rows.itemsize
+
+
+def cloud_layout(columns: Mapping[str, NDArray[Any]]) -> CloudLayout:
+    """Return the layout for columns of these names and types, (N,) or (N, k)."""
+    fields: list[tuple[str, int, int, int]] = []
+    members: list[tuple[str, str, int]] = []
+    places: list[tuple[str, int]] = []
+    offset = 0
+    for name, values in columns.items():
+        kind, count = values.dtype.str[1:], int(np.prod(values.shape[1:]))
+        if name == "xyz":
+            fields += [(axis, offset + 4 * n, _FLOAT32, 1) for n, axis in enumerate("xyz")]
+            kind = "f4"
+        elif kind in _DATATYPES:
+            fields.append((name, offset, _DATATYPES[kind], count))
+        else:
+            continue
+        members.append((name, f"<{kind}", count))
+        places.append((name, offset))
+        offset += int(kind[1:]) * count
+    rows = np.dtype(
+        {
+            "names": [name for name, _, _ in members],
+            "formats": [kind if count == 1 else (kind, (count,)) for _, kind, count in members],
+            "offsets": [place for _, place in places],
+            "itemsize": offset,
+        }
+    )
+    return CloudLayout(tuple(fields), tuple(places), rows)
+
+
+def write_cloud(writer: CdrWriter, cell: Cell, layout: CloudLayout) -> None:
+    """Append a cell's points as a ``PointCloud2`` with an empty header, as Autoware has it inside a cell."""
+    write_cloud_head(writer, layout, cell.points)
+    nbytes = cell.points * layout.point_step
+    writer.uint32(nbytes)
+    if nbytes:
+        writer.blob(nbytes, partial(_fill, cell=cell, layout=layout))
+    writer.boolean(True)  # is_dense: every coordinate is finite
+
+
+def write_cloud_head(
+    writer: CdrWriter, layout: CloudLayout, points: int, frame_id: str = "", stamp_ns: int = 0
+) -> None:
+    """Append what stands in front of the points: header, size, fields."""
+    writer.int32(stamp_ns // 10**9)
+    writer.uint32(stamp_ns % 10**9)
+    writer.text(frame_id)
+    writer.uint32(1, points, len(layout.fields))
+    for name, offset, datatype, count in layout.fields:
+        writer.text(name)
+        writer.uint32(offset)
+        writer.uint8(datatype)
+        writer.uint32(count)
+    writer.boolean(False)  # is_bigendian
+    writer.uint32(layout.point_step, layout.point_step * points)
+
+
+def _fill(place: memoryview, cell: Cell, layout: CloudLayout) -> None:
+    fill_rows(place, cell.columns, cell.origin, layout)
+
+
+def fill_rows(
+    place: memoryview,
+    columns: Mapping[str, NDArray[Any]],
+    origin: tuple[float, float, float],
+    layout: CloudLayout,
+) -> None:
+    """Write points into ``place``: each value is copied once, from shared memory to where it is sent from.
+
+    A column that is missing, or of another shape, leaves zeros.
+    """
+    if all(member.base == np.float32 for member, *_ in (layout.rows.fields or {}).values()):
+        # all of one type: two dimensions are copied faster than records
+        flat = np.frombuffer(place, "<f4").reshape(-1, layout.point_step // 4)
+        for name, offset in layout.columns:
+            values = columns.get(name)
+            if values is None or values.shape[0] != len(flat):
+                continue
+            count = int(np.prod(values.shape[1:]))
+            _put(flat[:, offset // 4 : offset // 4 + count], name, values.reshape(len(flat), -1), origin)
+        return
+    rows = np.frombuffer(place, layout.rows)
+    for name, _ in layout.columns:
+        values = columns.get(name)
+        if values is not None and values.shape[0] == len(rows):
+            _put(rows[name], name, values.reshape(rows[name].shape), origin)
+
+
+def _put(target: NDArray[Any], name: str, values: NDArray[Any], origin: tuple[float, float, float]) -> None:
+    if name == "xyz" and any(origin):
+        np.add(values, np.asarray(origin), out=target, casting="unsafe", dtype=np.float64)
+    else:
+        target[...] = values
