@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-pytest.importorskip("cyclonedds", reason="needs the package cyclonedds, which has no wheels for this machine")
+pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo, MapMetaData
 from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
@@ -20,44 +20,13 @@ from shmmap_clients.ros_bridge.messages.standard import PointCloud2
 from tests.process.conftest import DaemonFactory
 from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment
 from tests.support.daemon_process import DaemonProcess
-from tests.support.dds_domain import dds_domain
 from tests.support.dds_programs import built_cyclone_peer, built_fast_peer
 from tests.support.divided_map import DividedMap
-from tests.support.ros_peer import RosPeer, ros_peer
+from tests.support.ros_maps import NAMES, asked, reload
+from tests.support.ros_peer import RosPeer
 from tests.support.ros_reply import Reply, expected, from_lines, from_message
 
-NAMES = {
-    "partial": "/map/get_partial_pointcloud_map",
-    "differential": "/map/get_differential_pointcloud_map",
-    "selected": "/map/get_selected_pointcloud_map",
-}
-KINDS = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 Ask = Callable[..., Reply]
-
-
-@pytest.fixture
-def domain() -> Iterator[int]:
-    with dds_domain() as number:
-        yield number
-
-
-@pytest.fixture
-def served(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
-    one: DaemonProcess = daemon(divided_map.root)
-    return one
-
-
-@pytest.fixture
-def bridge(served: DaemonProcess, domain: int) -> Iterator[BridgeProcess]:
-    with BridgeProcess(served, domain) as one:
-        yield one
-
-
-@pytest.fixture
-def peer(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[RosPeer]:
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    with ros_peer(domain) as one:
-        yield one
 
 
 @pytest.fixture(scope="module")
@@ -66,21 +35,8 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path | None]
     return {"cyclone": built_cyclone_peer(folder), "fast": built_fast_peer(folder)}
 
 
-def asked(peer: RosPeer, verb: str, *, area: Sequence[float] = (), ids: Sequence[str] = ()) -> Reply:
-    """Ask a service as a client of its own."""
-    client = peer.client(NAMES[verb], KINDS[verb])
-    fields: dict[str, object] = {"area": AreaInfo(*area)} if area else {}
-    if verb == "differential":
-        fields["cached_ids"] = list(ids)
-    elif verb == "selected":
-        fields["cell_ids"] = list(ids)
-    found = from_message(client.call(**fields))
-    client.close()
-    return found
-
-
 @pytest.fixture(params=["python", "cyclone", "fast"])
-def ask(request: pytest.FixtureRequest, domain: int, programs: dict[str, Path | None]) -> Ask:
+def ask(request: pytest.FixtureRequest, dds: int, programs: dict[str, Path | None]) -> Ask:
     """Ask a service by one of the peers."""
     if request.param == "python":
         peer = request.getfixturevalue("peer")
@@ -91,7 +47,7 @@ def ask(request: pytest.FixtureRequest, domain: int, programs: dict[str, Path | 
         pytest.skip(f"needs {packages[request.param]}")
 
     def run(verb: str, *, area: Sequence[float] = (), ids: Sequence[str] = ()) -> Reply:
-        words = [str(program), str(domain), verb, NAMES[verb], *(repr(float(one)) for one in area), *ids]
+        words = [str(program), str(dds), verb, NAMES[verb], *(repr(float(one)) for one in area), *ids]
         done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=bridge_environment())
         assert done.returncode == 0, done.stderr
         return from_lines(done.stdout)
@@ -128,7 +84,7 @@ def test_three_services_to_the_byte(ask: Ask, divided_map: DividedMap) -> None:
 def test_areas_that_make_no_sense_are_answered_as_autoware_does(
     peer: RosPeer, divided_map: DividedMap
 ) -> None:
-    everything = in_order(divided_map, lambda box: True)
+    everything = in_order(divided_map, lambda _: True)
     inside = in_order(
         divided_map, lambda box: box[0] + 5 <= 10 <= box[2] - 5 and box[1] + 5 <= 10 <= box[3] - 5
     )
@@ -149,19 +105,18 @@ def test_areas_that_make_no_sense_are_answered_as_autoware_does(
 
 
 def test_points_have_the_fields_of_the_file(
-    daemon: DaemonFactory, domain: int, peer: RosPeer, tmp_path: Path
+    daemon: DaemonFactory, dds: int, peer: RosPeer, tmp_path: Path
 ) -> None:
     """x y z alone are 12 bytes; other types stay as they are, without gaps."""
     town = DividedMap(tmp_path / "map")
     town.pcd_dir.mkdir(parents=True)
     random = np.random.default_rng(1)
-    xyz = random.uniform(0, 20, (100, 3)).astype("<f4")
-    town.write_cell("0_0.pcd", (0, 0), {"xyz": xyz})
-    ring = random.integers(0, 64, 100).astype("<u1")
-    mixed = {"xyz": xyz, "ring": ring, "intensity": random.uniform(0, 1, 100).astype("<f4")}
-    town.write_cell("20_0.pcd", (20, 0), mixed)
+    plain = {axis: random.uniform(0, 20, 100).astype("<f4") for axis in "xyz"}
+    town.write_cell("0_0.pcd", (0, 0), plain)
+    ring, intensity = random.integers(0, 64, 100).astype("u1"), random.uniform(0, 1, 100).astype("<f4")
+    town.write_cell("20_0.pcd", (20, 0), {**plain, "ring": ring, "intensity": intensity})
     town.write_metadata()
-    with BridgeProcess(daemon(town.root), domain):
+    with BridgeProcess(daemon(town.root), dds):
         found = asked(peer, "partial", area=(20, 10, 5))
     assert found == expected(town, ["0_0.pcd", "20_0.pcd"])
     assert [cell.shape[3] for cell in found.cells] == [12, 17]
@@ -175,7 +130,7 @@ def test_a_changed_cell_is_sent_again_to_who_has_the_old_one(
     ids = from_message(first.call(area=area, cached_ids=[])).ids
     assert from_message(second.call(area=area, cached_ids=ids[:1])).ids == ids[1:], "an id counts as current"
     divided_map.change(Path(ids[0]).name, seed=5)
-    served.reload()
+    reload(served)
     found = from_message(first.call(area=area, cached_ids=ids))
     assert (found.ids, found.removed) == (ids[:1], [])
     assert found.cells[0] == expected(divided_map, [Path(ids[0]).name]).cells[0]
@@ -208,17 +163,17 @@ def test_the_list_of_cells_is_latched_and_follows_the_map(
         assert (box.min_x, box.min_y, box.max_x, box.max_y) == divided_map.box(name)
     divided_map.remove_cell("0_0.pcd")
     divided_map.write_metadata()
-    served.reload()
+    reload(served)
     reader = peer.following("/map/pointcloud_map_metadata", MapMetaData)
     assert any(len(one.metadata_list) == len(told) - 1 for one in reader)
 
 
 def test_the_whole_map_is_one_cloud_where_it_is_asked_for(
-    served: DaemonProcess, domain: int, peer: RosPeer, divided_map: DividedMap
+    served: DaemonProcess, dds: int, peer: RosPeer, divided_map: DividedMap
 ) -> None:
-    with BridgeProcess(served, domain, "--whole-map"):
+    with BridgeProcess(served, dds, "--whole-map"):
         cloud = peer.latched("/map/pointcloud_map", PointCloud2)
-    cells = expected(divided_map, in_order(divided_map, lambda box: True)).cells
+    cells = expected(divided_map, in_order(divided_map, lambda _: True)).cells
     assert bytes(cloud.data) == b"".join(cell.data for cell in cells)
     assert (cloud.header.frame_id, cloud.point_step, cloud.width) == (
         "map",
@@ -226,7 +181,7 @@ def test_the_whole_map_is_one_cloud_where_it_is_asked_for(
         sum(c.shape[1] for c in cells),
     )
     size = len(cloud.data)
-    words = [*PROGRAM, "--endpoint", served.endpoint, "--domain", str(domain), "--whole-map"]
+    words = [*PROGRAM, "--endpoint", served.endpoint, "--domain", str(dds), "--whole-map"]
     done = subprocess.run(
         [*words, "--whole-map-limit", "0.0001"],
         capture_output=True,
@@ -274,7 +229,7 @@ def test_parameters_are_there_and_cannot_be_set(
     assert clients["get_parameters"].call(names=names[:1]).values[0].bool_value
 
 
-def test_other_names(served: DaemonProcess, domain: int, peer: RosPeer) -> None:
+def test_other_names(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
     options = [
         "--namespace",
         "/town",
@@ -285,7 +240,7 @@ def test_other_names(served: DaemonProcess, domain: int, peer: RosPeer) -> None:
         "--name",
         "selected=/by_id",
     ]
-    with BridgeProcess(served, domain, *options) as bridge:
+    with BridgeProcess(served, dds, *options) as bridge:
         assert peer.client("/town/near", PARTIAL).call(area=AreaInfo(0, 0, 5)).new_pointcloud_with_ids
         assert peer.client("/by_id", SELECTED).call(cell_ids=[]).new_pointcloud_with_ids == []
         assert peer.client("/town/loader/get_parameters", PARAMETER_SERVICES["get_parameters"]).call(names=[])

@@ -37,6 +37,7 @@ class BridgeProcess:
         self._status = Path(daemon.runtime_dir, f"{daemon.instance}.ros-bridge-{domain}.json")
         self._said: list[str] = []
         self._news = threading.Condition()
+        self._silent = False
         self.process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> BridgeProcess:
@@ -58,7 +59,7 @@ class BridgeProcess:
             text=True,
             env=bridge_environment(),
         )
-        before = len(self._said)
+        before, self._silent = len(self._said), False
         self._listener = threading.Thread(target=self._listen, args=(self.process,))
         self._listener.start()
         self.wait_said("ready:", since=before)
@@ -78,11 +79,10 @@ class BridgeProcess:
     def wait_said(self, text: str, *, since: int = 0, within_s: float = WITHIN_S) -> None:
         """Wait until it has said something."""
         with self._news:
-            heard = self._news.wait_for(
-                lambda: any(text in line for line in self._said[since:]) or not self._listener.is_alive(),
-                within_s,
+            self._news.wait_for(
+                lambda: any(text in line for line in self._said[since:]) or self._silent, within_s
             )
-        assert heard and any(text in line for line in self._said[since:]), "".join(self._said)
+            assert any(text in line for line in self._said[since:]), "".join(self._said)
 
     @property
     def status(self) -> dict[str, Any]:
@@ -123,4 +123,5 @@ class BridgeProcess:
                 self._news.notify_all()
         process.stderr.close()
         with self._news:
+            self._silent = True
             self._news.notify_all()

@@ -25,7 +25,7 @@ from tests.support.dds_domain import URI
 
 __all__ = ["RosClient", "RosPeer", "ros_peer", "service_qos"]
 
-WITHIN_S: Final = 5.0
+WITHIN_S: Final = 60.0
 
 
 def service_qos(user_data: str = "", *, latched: bool = False, depth: int = 10) -> Qos:
@@ -60,10 +60,14 @@ class RosPeer:
 
     def latched(self, name: str, kind: Any, *, within_s: float = WITHIN_S) -> Any:
         """The first message of a latched topic."""
+        return next(self.following(name, kind, within_s=within_s))
+
+    def following(self, name: str, kind: Any, *, within_s: float = WITHIN_S) -> Iterator[Any]:
+        """The messages of a latched topic, from the last one on."""
         reader = DataReader(
             self.participant, Topic(self.participant, f"rt{name}", kind), service_qos(latched=True, depth=1)
         )
-        return next(_messages(self.participant, reader, within_s))
+        return _messages(self.participant, reader, within_s)
 
 
 class RosClient:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the bridge tells ``shmmap doctor``: a small file beside the daemon's socket.
 
-Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. While a bridge runs it holds a lock on it (``flock``), so
+Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. While a bridge runs it holds a lock on it (fcntl(2)), so
 that nobody takes the word of one that was killed, and no second bridge answers the same requests. It is
 written in place by one call, with blanks to its former length, so that who reads it never sees half of it.
 
@@ -69,10 +69,10 @@ class StatusFile:
             except OSError:
                 return False  # not for this user, or there is no such directory
             try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 status = os.fstat(fd)
                 same = os.path.samestat(status, os.stat(path, follow_symlinks=False))
-            except BlockingIOError:
+            except (BlockingIOError, PermissionError):  # as POSIX lets a system choose
                 os.close(fd)
                 raise Busy(
                     f"another bridge of this daemon runs in this domain: it holds {path}",

@@ -4,7 +4,8 @@
 //   fast_peer DOMAIN VERB NAME ...      as cyclone_peer.c, and prints the same
 //
 // A fourth verb, `stranger`, speaks rmw_fastrtps_cpp's mapping: no clientid, no 16 bytes. It prints "matched" when
-// the service is there, and waits until its standard input ends.
+// the service is there, and waits until its standard input ends. A fifth, `raw`, sends differential requests as
+// they are given, each the hexadecimal digits of a sample with its encapsulation, until they are acknowledged.
 #include <unistd.h>
 
 #include <chrono>
@@ -183,7 +184,7 @@ int main(int argc, char **argv) {
   auto *factory = DomainParticipantFactory::get_instance();
   auto *participant = factory->create_participant(static_cast<uint32_t>(domain), qos);
   if (!participant) fail("join");
-  const std::string what = verb == "differential" ? "Differential" : verb == "selected" ? "Selected" : "Partial";
+  const std::string what = verb == "differential" || verb == "raw" ? "Differential" : verb == "selected" ? "Selected" : "Partial";
   const std::string type = "autoware_map_msgs::srv::dds_::Get" + what + "PointCloudMap_";
   TypeSupport request_type(new BytesType(type + "Request_")), reply_type(new BytesType(type + "Response_"));
   request_type.register_type(participant);
@@ -214,6 +215,16 @@ int main(int argc, char **argv) {
     if (n == 10000) fail("the service is not there");
     std::this_thread::sleep_for(std::chrono::milliseconds(2));
   }
+  if (verb == "raw") {
+    for (int n = 4; n < argc; n++) {
+      Bytes sample;
+      for (const char *at = argv[n]; at[0] && at[1]; at += 2)
+        sample.push_back(static_cast<uint8_t>(std::stoi(std::string(at, 2), nullptr, 16)));
+      if (!writer->write(&sample)) fail("write");
+      if (writer->wait_for_acknowledgments({10, 0}) != ReturnCode_t::RETCODE_OK) fail("not acknowledged");
+    }
+    std::puts("end");
+  }
   Writer request;
   const uint64_t guid = 0xfa57dd5000000000u | static_cast<uint32_t>(getpid());
   const int64_t seq = 78;
@@ -221,7 +232,8 @@ int main(int argc, char **argv) {
     request.number<uint64_t>(guid);
     request.number<int64_t>(seq);
   }
-  if (stranger) {
+  if (verb == "raw") {
+  } else if (stranger) {
     for (int n = 0; n < 3; n++) request.number<float>(0);
   } else if (verb == "selected") {
     request.texts(argv + 4, argv + argc);
@@ -230,14 +242,14 @@ int main(int argc, char **argv) {
     for (int n = 4; n < 7; n++) request.number<float>(std::strtof(argv[n], nullptr));
     if (verb == "differential") request.texts(argv + 7, argv + argc);
   }
-  if (!writer->write(&request.bytes)) fail("write");
+  if (verb != "raw" && !writer->write(&request.bytes)) fail("write");
   if (stranger) {
     std::puts("matched");
     std::fflush(stdout);
     while (std::getchar() != EOF) {
     }
   }
-  for (bool done = stranger; !done;) {
+  for (bool done = stranger || verb == "raw"; !done;) {
     if (!reader->wait_for_unread_message({60, 0})) fail("no reply");
     Bytes bytes;
     SampleInfo info;
