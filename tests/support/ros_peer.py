@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import os
 import secrets
@@ -44,6 +45,7 @@ class RosPeer:
     """A participant of a domain; use `ros_peer`."""
 
     def __init__(self, domain: int) -> None:
+        self._number = domain
         self._domain = Domain(domain, os.environ.get("CYCLONEDDS_URI", URI))
         self.participant = DomainParticipant(domain)
         self._ids = itertools.count(1)
@@ -52,6 +54,16 @@ class RosPeer:
         """Leave the domain."""
         self.participant.__del__()
         self._domain.__del__()
+
+    @contextmanager
+    def another(self) -> Iterator[RosPeer]:
+        """Another participant of the same process."""
+        one = copy.copy(self)
+        one.participant = DomainParticipant(self._number)
+        try:
+            yield one
+        finally:
+            one.participant.__del__()
 
     def client(self, name: str, kind: ServiceKind, *, client_id: str | None = None) -> RosClient:
         """A client of a service; with an empty ``client_id`` one of another rmw."""

@@ -88,6 +88,9 @@ class MapWorker(Worker):
 
     def answer(self, message: Any, request: Request) -> Answer:
         """Return a reply with cells."""
+        if self._client.disconnected_since is not None:
+            # a request for cells has longer than this to find out that the daemon is away
+            self._published &= not self._catalogue.refresh(self._client)
         return self._answers.answer(message, request.requester.name)
 
     def empty(self, message: Any) -> Content:

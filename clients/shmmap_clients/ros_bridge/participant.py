@@ -26,8 +26,8 @@ MOST_DOMAIN: Final = 232
 """Highest number of a domain: those above have no UDP ports."""
 
 _PATIENT: Final = (
-    "<CycloneDDS><Domain Id='any'><Internal><Watermarks><WhcHigh>2147483647 B</WhcHigh></Watermarks></Internal>"
-    "</Domain></CycloneDDS>"
+    "<CycloneDDS><Domain Id='any'><Internal><Watermarks><WhcHigh>2147483647 B</WhcHigh></Watermarks>"
+    "</Internal></Domain></CycloneDDS>"
 )
 _LOCALHOST: Final = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"

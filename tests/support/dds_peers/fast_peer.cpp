@@ -181,6 +181,7 @@ int main(int argc, char **argv) {
     peer.port = static_cast<uint32_t>(7400 + 250 * domain + 10) + 2 * n;
     qos.wire_protocol().builtin.initialPeersList.push_back(peer);
   }
+  qos.wire_protocol().builtin.discovery_config.leaseDuration_announcementperiod = {0, 100000000};
   auto *factory = DomainParticipantFactory::get_instance();
   auto *participant = factory->create_participant(static_cast<uint32_t>(domain), qos);
   if (!participant) fail("join");
@@ -198,6 +199,7 @@ int main(int argc, char **argv) {
   writer_qos.history().depth = 10;
   writer_qos.user_data().data_vec(user_data);
   writer_qos.endpoint().history_memory_policy = eprosima::fastrtps::rtps::DYNAMIC_RESERVE_MEMORY_MODE;
+  writer_qos.reliable_writer_qos().times.heartbeatPeriod = {0, 50000000};
   DataReaderQos reader_qos;
   reader_qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
   reader_qos.history().depth = 10;
