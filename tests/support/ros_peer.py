@@ -74,11 +74,12 @@ class RosPeer:
         """The first message of a latched topic."""
         return next(self.following(name, kind, within_s=within_s))
 
-    def following(self, name: str, kind: Any, *, within_s: float = WITHIN_S) -> Iterator[Any]:
-        """The messages of a latched topic, from the last one on."""
-        reader = DataReader(
-            self.participant, Topic(self.participant, f"rt{name}", kind), service_qos(latched=True, depth=1)
-        )
+    def following(
+        self, name: str, kind: Any, *, latched: bool = True, within_s: float = WITHIN_S
+    ) -> Iterator[Any]:
+        """The messages of a topic; of a latched one from the last one on."""
+        qos = service_qos(latched=latched, depth=1)
+        reader = DataReader(self.participant, Topic(self.participant, f"rt{name}", kind), qos)
         return _messages(self.participant, reader, within_s)
 
 
