@@ -42,7 +42,7 @@ def of_kind(one: DaemonProcess, scope: str) -> dict[str, set[Voxel]]:
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
         return {
-            kind: {tuple(voxel) for voxel in live.voxels(kind, scope=scope).indices.tolist()}  # type: ignore[misc]
+            kind: {tuple(voxel) for voxel in live.voxels(kind, scope=scope).indices.tolist()}
             for kind in SERVICES
         }
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo
 
@@ -25,7 +26,7 @@ KINDS = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 def asked(peer: RosPeer, verb: str, *, area: Sequence[float] = (), ids: Sequence[str] = ()) -> Reply:
     """Ask a service as a client of its own."""
     client = peer.client(NAMES[verb], KINDS[verb])
-    fields: dict[str, object] = {"area": AreaInfo(*area)} if area else {}
+    fields: dict[str, Any] = {"area": AreaInfo(*area)} if area else {}
     if verb == "differential":
         fields["cached_ids"] = list(ids)
     elif verb == "selected":

@@ -113,7 +113,7 @@ def expected(town: DividedMap, names: Iterable[str], removed: Iterable[str] = ()
         cells.append(
             CellReply(
                 town.id(name),
-                tuple(np.float32(town.box(name)).tolist()),
+                tuple(np.array(town.box(name), np.float32).tolist()),
                 (0, 0, ""),
                 (1, len(rows), 0, offset, offset * len(rows), 1),
                 tuple(fields),
