@@ -30,9 +30,12 @@ def sensible(area: Any) -> AutowareSquare | None:
 
 def touches(area: Any, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of ``boxes``, (N, 4) min_x min_y max_x max_y in metres, any ``AreaInfo`` touches; (N,)."""
-    x, y, radius = float(area.center_x), float(area.center_y), float(area.radius)
-    low, high = boxes[:, :2].astype(np.float32), boxes[:, 2:].astype(np.float32)
-    place = np.array([x, y])
-    low, high = low.astype(np.float64), high.astype(np.float64)
-    inside: NDArray[np.bool_] = np.all((low - radius <= place) & (place <= high + radius), axis=1)
+    place = np.array([area.center_x, area.center_y], np.float64)
+    radius = float(area.radius)
+    low, high = (boxes[:, part].astype(np.float32).astype(np.float64) for part in ([0, 1], [2, 3]))
+    with np.errstate(invalid="ignore"):
+        inside: NDArray[np.bool_] = np.all((low - radius <= place) & (place <= high + radius), axis=1)
+        # where x and radius are infinite and y is no number a corner is within the radius
+        for corner in (low, high, np.stack([low[:, 0], high[:, 1]], 1), np.stack([high[:, 0], low[:, 1]], 1)):
+            inside |= np.hypot(*(place - corner).T) <= radius
     return inside

@@ -42,8 +42,7 @@ def test_areas_touch_what_autoware_s_touch(
 ) -> None:
     area = SimpleNamespace(center_x=x, center_y=y, radius=radius)
     boxes = np.array([(a, b, a + 20.0, b + 20.0) for a, b in corners], float).reshape(-1, 4)
-    with np.errstate(invalid="ignore"):
-        found = touches(area, boxes)
+    found = touches(area, boxes)
     assert found.tolist() == [autoware_touches(x, y, radius, tuple(box)) for box in boxes.tolist()]
     square = sensible(area)
     assert (square is not None) == (all(map(math.isfinite, (x, y, radius))) and radius >= 0)
