@@ -97,6 +97,11 @@ class CdrWriter:
         for one in listed:
             self.text(one)
 
+    def prepared(self, data: bytes) -> None:
+        """Append bytes that were written before, by another writer, to stand at a multiple of four."""
+        self._now += b"\0" * (-self.size % 4)
+        self._now += data
+
     def blob(self, nbytes: int, fill: Fill) -> None:
         """Append so many bytes, which ``fill`` writes when it is called with their place."""
         self._small.append((self._start, self._now))

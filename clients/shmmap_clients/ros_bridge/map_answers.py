@@ -30,6 +30,8 @@ __all__ = ["MapAnswers", "write_cells"]
 
 _PAUSE_S: Final = 0.2
 _NAMED: Final = 3
+_KEPT_BYTES: Final = 64 << 20
+_KEPT_S: Final = 2.0
 
 Log = Callable[[str], None]
 
@@ -59,6 +61,8 @@ class MapAnswers:
         self._requesters = requesters
         self._wait_s = wait_s
         self._log = log
+        self._recent: list[Cell] = []  # the newest last
+        self._recent_until_s = 0.0
 
     def answer(self, message: Any, requester: str) -> tuple[Content, Callable[[], None]]:
         """Return a reply, and what to call when it was sent.
@@ -125,12 +129,32 @@ class MapAnswers:
         while not cells.covered and time.monotonic() + _PAUSE_S < until_s:
             time.sleep(_PAUSE_S)
             cells = ask(max(until_s - time.monotonic(), 0.0))
+        self._keep(cells)
         missing = [str(error) for error in cells.failed]
         missing += [f"{one.id}: not loaded after {self._wait_s:g} s" for one in cells.pending]
         if missing:
             more = f"; and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
             self._log(f"left out of an answer: {'; '.join(missing[:_NAMED])}{more}")
         return cells
+
+    def _keep(self, cells: CellSet) -> None:
+        """Hold on to cells for a moment: to map them takes as long as to send them, and others ask, too."""
+        room = _KEPT_BYTES
+        newest = {(cell.id, cell.version): cell for cell in (*self._recent, *cells)}
+        self._recent = []
+        for cell in reversed(newest.values()):
+            room -= cell.nbytes
+            if room < 0:
+                break
+            self._recent.append(cell)
+        self._recent.reverse()
+        self._recent_until_s = time.monotonic() + _KEPT_S
+
+    def let_go(self) -> None:
+        """Let go of cells that nobody has asked for lately."""
+        if self._recent and time.monotonic() >= self._recent_until_s:
+            self._recent.clear()
+            self._client.release()
 
     def _reply(self, message: Any, cells: Iterable[Cell], removed: Collection[str] | None = None) -> Content:
         writer = CdrWriter()

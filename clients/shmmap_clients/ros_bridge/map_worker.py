@@ -101,6 +101,7 @@ class MapWorker(Worker):
         """Publish again if the map has changed; forget clients that have gone."""
         if self.alive is not None:
             self._requesters.keep_only(self.alive)
+        self._answers.let_go()
         self._published &= not self._catalogue.refresh(self._client)
         if self._published:
             return
