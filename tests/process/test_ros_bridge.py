@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
+from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES
 from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo, MapMetaData
 from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
@@ -22,7 +24,8 @@ from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environm
 from tests.support.daemon_process import DaemonProcess
 from tests.support.dds_programs import built_cyclone_peer, built_fast_peer
 from tests.support.divided_map import DividedMap
-from tests.support.ros_maps import NAMES, asked, reload
+from tests.support.pages import read_page
+from tests.support.ros_maps import KINDS, NAMES, asked, reload
 from tests.support.ros_peer import RosPeer
 from tests.support.ros_reply import Reply, expected, from_lines, from_message
 
@@ -245,3 +248,21 @@ def test_other_names(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
         assert peer.client("/by_id", SELECTED).call(cell_ids=[]).new_pointcloud_with_ids == []
         assert peer.client("/town/loader/get_parameters", PARAMETER_SERVICES["get_parameters"]).call(names=[])
         assert bridge.status["node"] == "/town/loader"
+
+
+def test_the_page_is_true(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
+    """Its command starts a bridge, and every service and topic that it names is there."""
+    page = read_page("clients/shmmap_clients/ros_bridge/ROS_BRIDGE.md")
+    assert set(page.blocks) == {"bridge"}
+    (command,) = page.commands("bridge")
+    program, *words = command.split()
+    assert program == "shmmap-ros-bridge"
+    assert words == ["--domain", "0"], "replaced here by the test's own"
+    listed = set(re.findall(r"`(/map/get_\w+)`", page.text))
+    assert listed == set(NAMES.values())
+    with BridgeProcess(served, dds):
+        for verb, name in NAMES.items():
+            peer.client(name, KINDS[verb]).wait_for_service()
+        assert peer.latched("/map/pointcloud_map_metadata", MapMetaData)
+    for name in ("/map/pointcloud_map", *LIVE_SERVICES, "occupied_voxels", "free_voxels"):
+        assert f"{name}`" in page.text, name
