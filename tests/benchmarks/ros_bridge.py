@@ -160,9 +160,9 @@ def measure(arguments: argparse.Namespace, daemon: DaemonProcess, bridge: Bridge
                     "bridge": lambda area=area: asking.call(area=area),  # type: ignore[misc]
                     "handles": lambda square=square: client.area(square),  # type: ignore[misc]
                 }
-                count = 20 if size < 2e6 else 2
+                count, rounds = (20, arguments.rounds) if size < 2e6 else (2, max(arguments.rounds // 4, 3))
                 times: dict[str, list[list[float]]] = {}
-                for _ in range(arguments.rounds):
+                for _ in range(rounds):
                     for what, work in works.items():
                         times.setdefault(what, []).append(timed(work, count))
                 middle = {what: np.median(blocks, axis=1) for what, blocks in times.items()}

@@ -109,8 +109,14 @@ class CdrWriter:
         self._start = self.size + nbytes
         self._now = bytearray()
 
-    def content(self) -> Content:
+    def content(self, over: Content | None = None) -> Content:
         """Return the sample: encapsulation, message, and up to three bytes to a multiple of four.
+
+        Parameters
+        ----------
+        over
+            A sample that has been sent: its memory is used again, so that none has to be cleared first. What
+            is announced then has to be written whole.
 
         Raises
         ------
@@ -120,7 +126,12 @@ class CdrWriter:
         size = len(_ENCAPSULATION) + self.size
         if size > MOST_BYTES:
             raise ValueError(f"{size} bytes, of at most {MOST_BYTES}")
-        made = Content(size + -size % 4)
+        made = Content() if over is None else over
+        nbytes = size + -size % 4
+        if len(made) < nbytes:
+            made += bytes(nbytes - len(made))
+        del made[nbytes:]
+        made[size:] = bytes(nbytes - size)
         made[:4] = _ENCAPSULATION
         for start, data in [*self._small, (self._start, self._now)]:
             made[4 + start : 4 + start + len(data)] = data

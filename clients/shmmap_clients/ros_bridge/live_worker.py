@@ -11,6 +11,7 @@ from cyclonedds.pub import DataWriter
 
 from shmmap import LiveMap
 from shmmap_clients.ros_bridge.cdr import Content
+from shmmap_clients.ros_bridge.listening import Listening
 from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES, failed_reply, voxel_cloud, voxel_reply
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
 from shmmap_clients.ros_bridge.messages.wire import ready_made
@@ -29,6 +30,8 @@ class LiveWorker(Worker):
         The map, of a client that nobody else uses.
     clouds
         Writers of the two topics by kind of voxels, ``occupied`` and ``free``.
+    listening
+        Where requests come.
     every_s
         How often it is looked whether to publish.
     """
@@ -37,12 +40,13 @@ class LiveWorker(Worker):
         self,
         live: LiveMap,
         clouds: Mapping[str, DataWriter],
+        listening: Listening,
         *,
         every_s: float,
         stop: threading.Event,
         log: Callable[[str], None],
     ) -> None:
-        super().__init__(stop, every_s, log)
+        super().__init__(listening, stop, every_s, log)
         self._live = live
         self._clouds = clouds
         self._published: dict[str, tuple[int, frozenset[int]]] = {}

@@ -32,6 +32,7 @@ _PAUSE_S: Final = 0.2
 _NAMED: Final = 3
 _KEPT_BYTES: Final = 64 << 20
 _KEPT_S: Final = 2.0
+_REUSED_BYTES: Final = 16 << 20
 
 Log = Callable[[str], None]
 
@@ -63,9 +64,12 @@ class MapAnswers:
         self._log = log
         self._recent: list[Cell] = []  # the newest last
         self._recent_until_s = 0.0
+        self._sent: Content | None = None  # the reply before: its memory is used again
 
     def answer(self, message: Any, requester: str) -> tuple[Content, Callable[[], None]]:
         """Return a reply, and what to call when it was sent.
+
+        It has to be sent before the next one is asked for.
 
         Raises
         ------
@@ -166,7 +170,9 @@ class MapAnswers:
         write_cells(writer, cells)
         if isinstance(message, GetDifferentialRequest):
             writer.texts(removed or ())
-        return writer.content()
+        content = writer.content(self._sent)
+        self._sent = content if len(content) <= _REUSED_BYTES else None
+        return content
 
 
 def _nothing() -> None:

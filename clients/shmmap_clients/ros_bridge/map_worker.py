@@ -13,6 +13,7 @@ from cyclonedds.pub import DataWriter
 from shmmap import BadRequest, Client
 from shmmap_clients.ros_bridge.catalogue import Catalogue
 from shmmap_clients.ros_bridge.cdr import Content
+from shmmap_clients.ros_bridge.listening import Listening
 from shmmap_clients.ros_bridge.map_answers import MapAnswers
 from shmmap_clients.ros_bridge.messages.autoware import MapMetaData
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
@@ -36,6 +37,8 @@ class MapWorker(Worker):
         Of the daemon, used by nobody else.
     metadata, whole
         Writers of the two topics; ``whole`` is None where the whole map is not published.
+    listening
+        Where requests come.
     wait_s
         How long cells may take to load.
     whole_bytes
@@ -52,13 +55,14 @@ class MapWorker(Worker):
         client: Client,
         metadata: DataWriter,
         whole: DataWriter | None,
+        listening: Listening,
         *,
         wait_s: float,
         whole_bytes: int,
         stop: threading.Event,
         log: Callable[[str], None],
     ) -> None:
-        super().__init__(stop, _EVERY_S, log)
+        super().__init__(listening, stop, _EVERY_S, log)
         self._client = client
         self._metadata = metadata
         self._whole = whole

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, with the daemon's map behind it.
 
-Three threads: one takes requests and answers those about parameters, one answers with cells, and one with
-voxels where there is a live map. The first also looks every second which clients there are.
+Three threads: one answers with cells, one with voxels where there is a live map, and one what parameters
+there are. Each takes the requests itself. The last one also looks every second which clients there are.
 """
 
 from __future__ import annotations
@@ -17,24 +17,23 @@ from types import TracebackType
 from typing import Final, TypeVar
 
 import msgspec
-from cyclonedds.core import GuardCondition, WaitSet
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
-from cyclonedds.util import duration
 
 from shmmap import Client, LiveMap
 from shmmap_clients.ros_bridge import names
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES
+from shmmap_clients.ros_bridge.listening import Listening
 from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES
 from shmmap_clients.ros_bridge.live_worker import LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
 from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, MapMetaData
 from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
-from shmmap_clients.ros_bridge.messages.wire import Damaged, ServiceKind
+from shmmap_clients.ros_bridge.messages.wire import ServiceKind
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import close, endpoint_qos, open_participant
-from shmmap_clients.ros_bridge.service_server import Request, ServiceServer
+from shmmap_clients.ros_bridge.service_server import ServiceServer
 from shmmap_clients.ros_bridge.status_file import StatusFile
 from shmmap_clients.ros_bridge.strangers import Strangers
 from shmmap_clients.ros_bridge.worker import Worker
@@ -127,7 +126,6 @@ class RosBridge:
         self._stop = threading.Event()
         self._ids = 0
         self._id = secrets.token_bytes(12)
-        self._answers: dict[ServiceServer, Callable[[Request], None]] = {}
         self._strangers = Strangers(log)
         with contextlib.ExitStack() as undo:
             own = names.resolved(names.node_name(settings.node), settings.namespace)
@@ -141,6 +139,7 @@ class RosBridge:
                 client,
                 self._latched(services["metadata"], MapMetaData),
                 self._latched(services["whole"], PointCloud2) if settings.whole_map else None,
+                Listening(self._participant, log),
                 wait_s=settings.wait_s,
                 whole_bytes=settings.whole_bytes,
                 stop=self._stop,
@@ -149,15 +148,13 @@ class RosBridge:
             self._workers: list[Worker] = [self._map]
             self._map.begin()
             for what, kind in _KINDS.items():
-                self._add(services[what], kind, self._put_into(self._map))
+                self._add(services[what], kind, self._map.listening)
             if live is not None:
                 self._add_live(live, services["live"])
-            self._add_parameters(own, welcome.map_path)
-            self._waitset = WaitSet(self._participant)
-            self._wake = GuardCondition(self._participant)
-            self._waitset.attach(self._wake)
-            for server in self._answers:
-                self._waitset.attach(server.condition)
+            self._parameters = self._make_parameters(welcome.map_path)
+            self._listening = Listening(self._participant, log)
+            for name, kind in PARAMETER_SERVICES.items():
+                self._add(f"{own}/{name}", kind, self._listening)
             self._tell()
             self._undo = undo.pop_all()
 
@@ -172,7 +169,7 @@ class RosBridge:
     @property
     def services(self) -> list[str]:
         """Names of all services."""
-        return [server.name for server in self._answers]
+        return [server.name for server in self._servers]
 
     @property
     def status_path(self) -> str:
@@ -187,7 +184,7 @@ class RosBridge:
         """Serve until `stop` is called."""
         with ThreadPoolExecutor(1 + len(self._workers)) as threads:
             runs: list[Future[None]] = [
-                threads.submit(self._take_requests),
+                threads.submit(self._answer_parameters),
                 *(threads.submit(one.run) for one in self._workers),
             ]
             for one in runs:
@@ -196,9 +193,8 @@ class RosBridge:
                 self._stop.wait()
             finally:
                 self._stop.set()
-                self._wake.set(True)
-                for worker in self._workers:
-                    worker.waiting.wake()
+                for listening in self._all_listening:
+                    listening.wake()
         for one in runs:
             one.result()
 
@@ -208,18 +204,19 @@ class RosBridge:
 
     # --- what is served -----------------------------------------------------------------------------
 
-    def _add(self, name: str, kind: ServiceKind, answer: Callable[[Request], None]) -> None:
+    @property
+    def _all_listening(self) -> list[Listening]:
+        return [self._listening, *(worker.listening for worker in self._workers)]
+
+    @property
+    def _servers(self) -> list[ServiceServer]:
+        return [server for one in self._all_listening for server in one.servers]
+
+    def _add(self, name: str, kind: ServiceKind, listening: Listening) -> None:
         self._ids += 1
         number = self._id + self._ids.to_bytes(4, "big")
         service_id = ".".join(f"{one:x}" for one in number)  # as rmw_cyclonedds_cpp writes it
-        self._answers[ServiceServer(self._participant, name, kind, service_id)] = answer
-
-    def _put_into(self, worker: Worker) -> Callable[[Request], None]:
-        def put(request: Request) -> None:
-            if not worker.waiting.put(request):
-                self._log(f"{request.server.name}: too many requests wait: one is dropped")
-
-        return put
+        listening.add(ServiceServer(self._participant, name, kind, service_id))
 
     def _latched(self, name: str, kind: type) -> DataWriter:
         qos = endpoint_qos(depth=1, latched=True)
@@ -236,14 +233,19 @@ class RosBridge:
             for kind in ("occupied", "free")
         }
         worker = LiveWorker(
-            live, clouds, every_s=self._settings.voxels_every_s, stop=self._stop, log=self._log
+            live,
+            clouds,
+            Listening(self._participant, self._log),
+            every_s=self._settings.voxels_every_s,
+            stop=self._stop,
+            log=self._log,
         )
         self._workers.append(worker)
         for name, (kind, _, _) in LIVE_SERVICES.items():
-            self._add(f"{place}/{name}", kind, self._put_into(worker))
+            self._add(f"{place}/{name}", kind, worker.listening)
 
-    def _add_parameters(self, node: str, map_path: str) -> None:
-        parameters = Parameters(
+    def _make_parameters(self, map_path: str) -> Parameters:
+        return Parameters(
             {
                 "enable_whole_load": self._settings.whole_map,
                 "enable_downsampled_whole_load": False,
@@ -256,34 +258,24 @@ class RosBridge:
             {"pcd_paths_or_directory": "the map that shmmap serves"},
         )
 
-        def answer(request: Request) -> None:
-            server = request.server
-            fields = parameters.reply(server.name.rpartition("/")[2], request.message)
-            if server.present(request) and (why := server.reply_fields(request, **fields)):
-                self._log(f"{server.name}: an answer was not sent: {why}")
-
-        for name, kind in PARAMETER_SERVICES.items():
-            self._add(f"{node}/{name}", kind, answer)
-
     # --- requests -----------------------------------------------------------------------------------
 
-    def _take_requests(self) -> None:
+    def _answer_parameters(self) -> None:
         look_s = 0.0
         while not self._stop.is_set():
-            self._waitset.wait(duration(seconds=_LOOK_S))
-            for server, answer in self._answers.items():
-                for one in server.take():
-                    if isinstance(one, Damaged):
-                        self._log(f"{server.name}: a request was no message: {one.reason}")
-                    else:
-                        answer(one)
+            self._listening.wait(_LOOK_S)
+            for request in self._listening.take():
+                server = request.server
+                fields = self._parameters.reply(server.name.rpartition("/")[2], request.message)
+                if server.present(request) and (why := server.reply_fields(request, **fields)):
+                    self._log(f"{server.name}: an answer was not sent: {why}")
             if time.monotonic() >= look_s:
                 self._look()
                 look_s = time.monotonic() + _LOOK_S
 
     def _look(self) -> None:
         """See which clients there are."""
-        clients = [(server, one) for server in self._answers for one in server.requesters()]
+        clients = [(server, one) for server in self._servers for one in server.requesters()]
         self._map.alive = frozenset(one.name for _, one in clients)
         self._strangers.look(clients)
         self._tell(len({one.name for _, one in clients}))

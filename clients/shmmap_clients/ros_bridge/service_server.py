@@ -35,7 +35,8 @@ __all__ = ["Request", "Requester", "ServiceServer"]
 
 _KNOWN_WITHIN_S: Final = 0.1
 _LOOK_EVERY_S: Final = 0.01
-_AT_ONCE: Final = 10  # requests that a reader keeps
+_KEPT: Final = 1024
+"""Requests that a reader keeps until they are taken: of all clients together, so more than rclcpp's ten."""
 _CLIENT_ID: Final = re.compile(rb"(?:^|;)clientid=([^;]*);")
 _VENDORS: Final = {0x0101: "RTI Connext", 0x010F: "Fast DDS", 0x0110: "CycloneDDS", 0x0112: "RustDDS"}
 """By the first two bytes of an endpoint's key: there most implementations put their number (DDSI-RTPS)."""
@@ -98,9 +99,11 @@ class ServiceServer:
     def __init__(self, participant: DomainParticipant, name: str, kind: ServiceKind, service_id: str) -> None:
         self.name = name
         self.kind = kind
-        qos = endpoint_qos(f"serviceid={service_id};", depth=_AT_ONCE)
-        self._reader = DataReader(participant, Topic(participant, request_topic(name), kind.request), qos)
-        self._writer = DataWriter(participant, Topic(participant, reply_topic(name), kind.reply), qos)
+        belongs = f"serviceid={service_id};"
+        requests = Topic(participant, request_topic(name), kind.request)
+        replies = Topic(participant, reply_topic(name), kind.reply)
+        self._reader = DataReader(participant, requests, endpoint_qos(belongs, depth=_KEPT))
+        self._writer = DataWriter(participant, replies, endpoint_qos(belongs))
         self.condition = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
         self._lock = threading.Lock()  # one thread takes requests, another one replies
         self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
@@ -111,7 +114,7 @@ class ServiceServer:
 
     def take(self) -> Iterator[Request | Damaged]:
         """Take the requests that have come; of one that is no message of the service, why not."""
-        for one in self._reader.take(_AT_ONCE):
+        for one in self._reader.take(_KEPT):
             if not one.sample_info.valid_data:
                 continue
             if isinstance(one, Damaged):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter, OrderedDict
 from typing import Final
 
@@ -17,10 +16,9 @@ MOST_WAITING: Final = 1024
 
 
 class WaitingRequests:
-    """A queue between the thread that takes requests and one that answers them."""
+    """A queue, for one thread."""
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
         self._queue: OrderedDict[int, Request] = OrderedDict()
         self._of: Counter[str] = Counter()
         self._next = 0
@@ -31,31 +29,18 @@ class WaitingRequests:
     def put(self, request: Request) -> bool:
         """Append a request; False if there are too many.  Of one client's the oldest then makes room."""
         name = request.requester.name
-        with self._changed:
-            if self._of[name] >= MOST_OF_ONE:
-                oldest = next(number for number, one in self._queue.items() if one.requester.name == name)
-                self._forget(oldest)
-            if len(self._queue) >= MOST_WAITING:
-                return False
-            self._next += 1
-            self._queue[self._next] = request
-            self._of[name] += 1
-            self._changed.notify()
+        if self._of[name] >= MOST_OF_ONE:
+            self._forget(next(number for number, one in self._queue.items() if one.requester.name == name))
+        if len(self._queue) >= MOST_WAITING:
+            return False
+        self._next += 1
+        self._queue[self._next] = request
+        self._of[name] += 1
         return True
 
-    def get(self, timeout_s: float) -> Request | None:
-        """Take the next request; None when none has come in time, or `wake` was called."""
-        with self._changed:
-            if not self._queue:
-                self._changed.wait(timeout_s)
-            if not self._queue:
-                return None
-            return self._forget(next(iter(self._queue)))
-
-    def wake(self) -> None:
-        """Let whoever waits look at what else there is to do."""
-        with self._changed:
-            self._changed.notify_all()
+    def get(self) -> Request:
+        """Take the request that waits longest; there has to be one."""
+        return self._forget(next(iter(self._queue)))
 
     def _forget(self, number: int) -> Request:
         request = self._queue.pop(number)

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from shmmap import Busy, DaemonUnreachable, LiveInterrupted, NoSession, ShmmapError, StaleHandle
 from shmmap_clients.ros_bridge.cdr import Content
+from shmmap_clients.ros_bridge.listening import Listening
 from shmmap_clients.ros_bridge.service_server import Request
 from shmmap_clients.ros_bridge.waiting import WaitingRequests
 
@@ -31,21 +32,21 @@ class Worker:
 
     Parameters
     ----------
+    listening
+        Where requests come; to nobody else.
     stop
         Set when the program ends.
     every_s
         How often `tick` is called.
     log
         Told what goes wrong, and when it is right again.
-
-    Attributes
-    ----------
-    waiting
-        Where requests are put.
     """
 
-    def __init__(self, stop: threading.Event, every_s: float, log: Callable[[str], None]) -> None:
-        self.waiting = WaitingRequests()
+    def __init__(
+        self, listening: Listening, stop: threading.Event, every_s: float, log: Callable[[str], None]
+    ) -> None:
+        self.listening = listening
+        self._waiting = WaitingRequests()
         self._stop = stop
         self._every_s = every_s
         self._log = log
@@ -71,9 +72,13 @@ class Worker:
             if now_s >= next_s:
                 self._guarded_tick()
                 next_s = time.monotonic() + self._every_s
-            request = self.waiting.get(max(next_s - time.monotonic(), 0.0))
-            if request is not None:
-                self._serve(request)
+            if not self._waiting:
+                self.listening.wait(next_s - time.monotonic())
+            for one in self.listening.take():
+                if not self._waiting.put(one):
+                    self._log(f"{one.server.name}: too many requests wait: one is dropped")
+            if self._waiting:
+                self._serve(self._waiting.get())
 
     def _serve(self, request: Request) -> None:
         server = request.server

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
@@ -23,6 +23,7 @@ from shmmap_clients.ros_bridge.messages.wire import Damaged, ready_made
 from shmmap_clients.ros_bridge.point_cloud import cloud_layout, fill_rows, write_cloud_head
 
 TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
+SETTINGS = settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 U32 = st.integers(0, 2**32 - 1)
 
 
@@ -72,14 +73,21 @@ def write_cloud(writer: CdrWriter, columns: dict[str, Any], like: PointCloud2) -
     writer.boolean(True)
 
 
+@SETTINGS
 @given(clouds())
 def test_a_cloud_is_written_as_the_serializer_does(cloud: tuple[dict[str, Any], PointCloud2]) -> None:
     columns, message = cloud
     writer = CdrWriter()
     write_cloud(writer, columns, message)
-    assert bytes(writer.content()) == padded(message.serialize(use_version_2=False))
+    wanted = padded(message.serialize(use_version_2=False))
+    assert bytes(writer.content()) == wanted
+    for before in (0, 3, len(wanted), len(wanted) + 9):
+        used = Content(b"\xaa" * before)
+        assert writer.content(used) is used
+        assert bytes(used) == wanted, "nothing is left of the sample before"
 
 
+@SETTINGS
 @given(st.lists(st.tuples(TEXTS, clouds()), max_size=3), st.lists(TEXTS, max_size=3), U32)
 def test_a_reply_is_written_as_the_serializer_does(
     cells: list[tuple[str, tuple[dict[str, Any], PointCloud2]]], removed: list[str], client: int

@@ -91,11 +91,11 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
         assert waiting.put(request("flood", number))
         if number == 1:
             assert waiting.put(request("other"))
-    taken = [waiting.get(0.0) for _ in range(len(waiting))]
-    assert [(one.requester.name, one.message) for one in taken if one] == [
+    taken = [waiting.get() for _ in range(len(waiting))]
+    assert [(one.requester.name, one.message) for one in taken] == [
         ("other", 0), *(("flood", number) for number in range(3, MOST_OF_ONE + 3)),
     ]  # fmt: skip
-    assert waiting.get(0.0) is None
+    assert not waiting
     for number in range(MOST_WAITING):
         assert waiting.put(request(f"{number}"))
     assert not waiting.put(request("one too many"))
