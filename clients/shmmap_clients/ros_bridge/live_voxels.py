@@ -18,7 +18,7 @@ from shmmap_clients.rolling_map.voxel_parts import all_voxels
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 from shmmap_clients.ros_bridge.messages.bonxai import FREE, OCCUPIED
 from shmmap_clients.ros_bridge.messages.wire import ServiceKind
-from shmmap_clients.ros_bridge.point_cloud import cloud_layout, fill_rows, write_cloud_head
+from shmmap_clients.ros_bridge.point_cloud import cloud_layout, write_cloud
 
 __all__ = ["LIVE_SERVICES", "failed_reply", "voxel_cloud", "voxel_reply"]
 
@@ -104,12 +104,6 @@ def voxel_cloud(live: LiveMap, kind: str) -> Content:
         The daemon does not answer, or has no memory for a list.
     """
     xyz = all_voxels(live, kind)
-    layout = cloud_layout({"xyz": xyz})
-    writer = CdrWriter()
-    write_cloud_head(writer, layout, len(xyz), live.frame_id, time.time_ns())
-    nbytes = len(xyz) * layout.point_step
-    writer.uint32(nbytes)
-    if nbytes:
-        writer.blob(nbytes, lambda place: fill_rows(place, {"xyz": xyz}, (0.0, 0.0, 0.0), layout))
-    writer.boolean(True)
+    columns, writer = {"xyz": xyz}, CdrWriter()
+    write_cloud(writer, columns, (0.0, 0.0, 0.0), cloud_layout(columns), live.frame_id, time.time_ns())
     return writer.content()

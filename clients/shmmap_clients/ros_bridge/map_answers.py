@@ -15,7 +15,7 @@ being there twice; and a cell whose file has changed since the client got it is 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from typing import Any, Final
 
 from shmmap import Cell, CellSet, Client
@@ -24,15 +24,15 @@ from shmmap_clients.ros_bridge.catalogue import Catalogue
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 from shmmap_clients.ros_bridge.messages.autoware import GetDifferentialRequest, GetPartialRequest
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
+from shmmap_clients.ros_bridge.recent_cells import RecentCells
 from shmmap_clients.ros_bridge.requesters import Requesters
 
-__all__ = ["MapAnswers", "write_cells"]
+__all__ = ["MapAnswers"]
 
 _PAUSE_S: Final = 0.2
 _NAMED: Final = 3
-_KEPT_BYTES: Final = 64 << 20
-_KEPT_S: Final = 2.0
 _REUSED_BYTES: Final = 16 << 20
+_LAYOUTS: Final = 64
 
 Log = Callable[[str], None]
 
@@ -62,8 +62,8 @@ class MapAnswers:
         self._requesters = requesters
         self._wait_s = wait_s
         self._log = log
-        self._recent: list[Cell] = []  # the newest last
-        self._recent_until_s = 0.0
+        self._recent = RecentCells()
+        self._layouts: dict[Hashable, CloudLayout] = {}
         self._sent: Content | None = None  # the reply before: its memory is used again
 
     def answer(self, message: Any, requester: str) -> tuple[Content, Callable[[], None]]:
@@ -133,7 +133,6 @@ class MapAnswers:
         while not cells.covered and time.monotonic() + _PAUSE_S < until_s:
             time.sleep(_PAUSE_S)
             cells = ask(max(until_s - time.monotonic(), 0.0))
-        self._keep(cells)
         missing = [str(error) for error in cells.failed]
         missing += [f"{one.id}: not loaded after {self._wait_s:g} s" for one in cells.pending]
         if missing:
@@ -141,23 +140,9 @@ class MapAnswers:
             self._log(f"left out of an answer: {'; '.join(missing[:_NAMED])}{more}")
         return cells
 
-    def _keep(self, cells: CellSet) -> None:
-        """Hold on to cells for a moment: to map them takes as long as to send them, and others ask, too."""
-        room = _KEPT_BYTES
-        newest = {(cell.id, cell.version): cell for cell in (*self._recent, *cells)}
-        self._recent = []
-        for cell in reversed(newest.values()):
-            room -= cell.nbytes
-            if room < 0:
-                break
-            self._recent.append(cell)
-        self._recent.reverse()
-        self._recent_until_s = time.monotonic() + _KEPT_S
-
     def let_go(self) -> None:
         """Let go of cells that nobody has asked for lately."""
-        if self._recent and time.monotonic() >= self._recent_until_s:
-            self._recent.clear()
+        if self._recent.let_go():
             self._client.release()
 
     def _reply(self, message: Any, cells: Iterable[Cell], removed: Collection[str] | None = None) -> Content:
@@ -167,29 +152,28 @@ class MapAnswers:
         writer.int32(0)
         writer.uint32(0)
         writer.text(self._client.welcome.frame_id)
-        write_cells(writer, cells)
+        self._write_cells(writer, self._recent.kept(cells))
         if isinstance(message, GetDifferentialRequest):
             writer.texts(removed or ())
         content = writer.content(self._sent)
         self._sent = content if len(content) <= _REUSED_BYTES else None
         return content
 
+    def _write_cells(self, writer: CdrWriter, cells: Sequence[Cell]) -> None:
+        """Append cells with their points, a sequence of ``autoware_map_msgs/PointCloudMapCellWithID``."""
+        writer.uint32(len(cells))
+        for cell in cells:
+            columns = cell.columns
+            kind = tuple((name, one.dtype, one.shape[1:]) for name, one in columns.items())
+            layout = self._layouts.get(kind)
+            if layout is None:
+                if len(self._layouts) >= _LAYOUTS:
+                    self._layouts.clear()
+                layout = self._layouts[kind] = cloud_layout(columns)
+            writer.text(cell.id)
+            write_cloud(writer, columns, cell.origin, layout)
+            writer.float32(*cell.box)
+
 
 def _nothing() -> None:
     """Nothing has to be remembered of an answer that says all."""
-
-
-def write_cells(writer: CdrWriter, cells: Iterable[Cell]) -> None:
-    """Append cells with their points, a sequence of ``autoware_map_msgs/PointCloudMapCellWithID``."""
-    listed = list(cells)
-    layouts: dict[tuple[tuple[str, str], ...], CloudLayout] = {}
-    writer.uint32(len(listed))
-    for cell in listed:
-        columns = cell.columns
-        key = tuple((name, f"{one.dtype.str}{one.shape[1:]}") for name, one in columns.items())
-        layout = layouts.get(key)
-        if layout is None:
-            layout = layouts[key] = cloud_layout(columns)
-        writer.text(cell.id)
-        write_cloud(writer, cell, layout)
-        writer.float32(*cell.box)

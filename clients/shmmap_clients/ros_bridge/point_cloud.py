@@ -21,7 +21,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import Cell
 from shmmap_clients.ros_bridge.cdr import CdrWriter
 
 __all__ = ["CloudLayout", "cloud_layout", "fill_rows", "write_cloud", "write_cloud_head"]
@@ -81,13 +80,33 @@ def cloud_layout(columns: Mapping[str, NDArray[Any]]) -> CloudLayout:
     return CloudLayout(tuple(fields), tuple(places), offset, bytes(writer.content()[4:]))
 
 
-def write_cloud(writer: CdrWriter, cell: Cell, layout: CloudLayout) -> None:
-    """Append a cell's points as a ``PointCloud2`` with an empty header, as Autoware has it inside a cell."""
-    write_cloud_head(writer, layout, cell.points)
-    nbytes = cell.points * layout.point_step
+def write_cloud(
+    writer: CdrWriter,
+    columns: Mapping[str, NDArray[Any]],
+    origin: tuple[float, float, float],
+    layout: CloudLayout,
+    frame_id: str = "",
+    stamp_ns: int = 0,
+) -> None:
+    """Append a ``PointCloud2``; inside a cell Autoware's have an empty header.
+
+    Parameters
+    ----------
+    columns
+        As those of the layout, of equal lengths; they are read when the message is put together.
+    origin
+        What ``xyz`` is relative to, metres.
+    layout
+        How a point's bytes are divided.
+    frame_id, stamp_ns
+        For the header; nanoseconds since 1970.
+    """
+    points = len(columns["xyz"])
+    nbytes = points * layout.point_step
+    write_cloud_head(writer, layout, points, frame_id, stamp_ns)
     writer.uint32(nbytes)
     if nbytes:
-        writer.blob(nbytes, partial(_fill, cell=cell, layout=layout))
+        writer.blob(nbytes, partial(fill_rows, columns=columns, origin=origin, layout=layout))
     writer.boolean(True)  # is_dense: every coordinate is finite
 
 
@@ -101,10 +120,6 @@ def write_cloud_head(
     writer.uint32(1, points)  # height, width
     writer.prepared(layout.described)
     writer.uint32(layout.point_step * points)
-
-
-def _fill(place: memoryview, cell: Cell, layout: CloudLayout) -> None:
-    fill_rows(place, cell.columns, cell.origin, layout)
 
 
 def fill_rows(

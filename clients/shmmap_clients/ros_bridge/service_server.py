@@ -128,22 +128,26 @@ class ServiceServer:
     def requesters(self) -> list[Requester]:
         """All clients that there are now, whether they have asked or not."""
         handles = _unsigned(self._reader.get_matched_publications())
+        readers = _unsigned(self._writer.get_matched_subscriptions())
         with self._lock:
             for handle in self._requesters.keys() - handles:
                 del self._requesters[handle]
+            for handle in self._readers.keys() - readers:
+                del self._readers[handle]
         return [found for one in handles if (found := self._requester(one)) is not None]
 
     def present(self, request: Request) -> bool:
         """Whether the client can hear the reply; waits up to 100 ms for its reader to be found."""
-        until_s = time.monotonic() + _KNOWN_WITHIN_S
-        while True:
-            if self._requester(request.handle, anew=True) is None:
-                return False
-            if request.requester.stranger or self._hears(request.requester.name):
+        name = request.requester.name
+        with self._lock:
+            if request.requester.stranger or name in self._readers.values():
                 return True
-            if time.monotonic() >= until_s:
+        until_s = time.monotonic() + _KNOWN_WITHIN_S
+        while not self._hears(name):
+            if self.gone(request) or time.monotonic() >= until_s:
                 return False
             time.sleep(_LOOK_EVERY_S)
+        return True
 
     def gone(self, request: Request) -> bool:
         """Whether nobody waits for the reply any more."""
@@ -184,14 +188,14 @@ class ServiceServer:
             return one
 
     def _hears(self, client_id: str) -> bool:
+        """Look for a client's reader among those that are known now."""
         handles = _unsigned(self._writer.get_matched_subscriptions())
-        for handle in self._readers.keys() - handles:
-            del self._readers[handle]
-        for handle in handles - self._readers.keys():
-            found = self._writer.get_matched_subscription_data(handle)
-            if found is not None:
-                self._readers[handle] = _client_id(found)
-        return client_id in self._readers.values()
+        with self._lock:
+            for handle in handles - self._readers.keys():
+                found = self._writer.get_matched_subscription_data(handle)
+                if found is not None:
+                    self._readers[handle] = _client_id(found)
+            return client_id in self._readers.values()
 
 
 def _client_id(endpoint: Any) -> str:

@@ -82,13 +82,15 @@ class Worker:
 
     def _serve(self, request: Request) -> None:
         server = request.server
-        while not self._stop.is_set() and not server.gone(request):
+        while not self._stop.is_set():
             try:
                 content, done = self.answer(request.message, request)
                 self._back()
             except LATER as error:
                 self._gone(error)
                 self._stop.wait(_AGAIN_S)
+                if server.gone(request):
+                    return
                 continue
             except (ShmmapError, ValueError) as error:
                 self._log(f"{server.name}: answered with nothing: {error}")

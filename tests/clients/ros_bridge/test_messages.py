@@ -20,7 +20,7 @@ from shmmap_clients.ros_bridge.messages.bonxai import GetOccupiedResponse, Voxel
 from shmmap_clients.ros_bridge.messages.parameters import ParameterValue
 from shmmap_clients.ros_bridge.messages.standard import Header, PointCloud2, PointField, Time
 from shmmap_clients.ros_bridge.messages.wire import Damaged, ready_made
-from shmmap_clients.ros_bridge.point_cloud import cloud_layout, fill_rows, write_cloud_head
+from shmmap_clients.ros_bridge.point_cloud import cloud_layout, fill_rows, write_cloud
 
 TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
 SETTINGS = settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
@@ -62,15 +62,10 @@ def clouds(draw: st.DrawFn) -> tuple[dict[str, Any], PointCloud2]:
     )
 
 
-def write_cloud(writer: CdrWriter, columns: dict[str, Any], like: PointCloud2) -> None:
-    layout = cloud_layout(columns)
+def write(writer: CdrWriter, columns: dict[str, Any], like: PointCloud2) -> None:
     stamp_ns = like.header.stamp.sec * 10**9 + like.header.stamp.nanosec
-    write_cloud_head(writer, layout, like.width, like.header.frame_id, stamp_ns)
-    nbytes = layout.point_step * like.width
-    writer.uint32(nbytes)
-    if nbytes:
-        writer.blob(nbytes, lambda place: fill_rows(place, columns, (0.0, 0.0, 0.0), layout))
-    writer.boolean(True)
+    layout = cloud_layout(columns)
+    write_cloud(writer, columns, (0.0, 0.0, 0.0), layout, like.header.frame_id, stamp_ns)
 
 
 @SETTINGS
@@ -78,7 +73,7 @@ def write_cloud(writer: CdrWriter, columns: dict[str, Any], like: PointCloud2) -
 def test_a_cloud_is_written_as_the_serializer_does(cloud: tuple[dict[str, Any], PointCloud2]) -> None:
     columns, message = cloud
     writer = CdrWriter()
-    write_cloud(writer, columns, message)
+    write(writer, columns, message)
     wanted = padded(message.serialize(use_version_2=False))
     assert bytes(writer.content()) == wanted
     for before in (0, 3, len(wanted), len(wanted) + 9):
@@ -106,7 +101,7 @@ def test_a_reply_is_written_as_the_serializer_does(
     writer.uint32(len(cells))
     for name, (columns, message) in cells:
         writer.text(name)
-        write_cloud(writer, columns, message)
+        write(writer, columns, message)
         writer.float32(*box)
     writer.texts(removed)
     assert bytes(writer.content()) == padded(wanted)

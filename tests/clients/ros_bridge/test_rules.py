@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge import names
+from shmmap_clients.ros_bridge import names, recent_cells
 from shmmap_clients.ros_bridge.areas import sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
+from shmmap_clients.ros_bridge.recent_cells import RecentCells
 from shmmap_clients.ros_bridge.requesters import Requesters
 from shmmap_clients.ros_bridge.service_server import Request, Requester
 from shmmap_clients.ros_bridge.waiting import MOST_OF_ONE, MOST_WAITING, WaitingRequests
@@ -175,3 +176,40 @@ def test_values_have_their_types() -> None:
     )
     assert "not declared" in result["result"].reason
     assert parameters.reply("set_parameters_atomically", SimpleNamespace(parameters=[]))["result"].successful
+
+
+# --- recent cells -------------------------------------------------------------------------------------
+
+
+def cell(name: str, version: int, nbytes: int = 1) -> Any:
+    return SimpleNamespace(id=name, version=version, nbytes=nbytes)
+
+
+def test_cells_are_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr(recent_cells.time, "monotonic", lambda: now_s[0])
+    recent = RecentCells()
+    first, second = cell("a", 1), cell("b", 1)
+    assert recent.kept([first, second]) == [first, second]
+    again = recent.kept([cell("a", 1), cell("a", 2), cell("a", 1)])
+    assert again[0] is again[2] is first, "as it was kept"
+    assert again[1].version == 2
+    now_s[0] += 1.9
+    assert not recent.let_go()
+    recent.kept([second])
+    now_s[0] += 1.9
+    assert (recent.let_go(), len(recent)) == (False, 3), "somebody has asked"
+    now_s[0] += 0.2
+    assert (recent.let_go(), len(recent), recent.let_go()) == (True, 0, False)
+    assert recent.kept([cell("a", 1)])[0] is not first
+
+
+def test_few_bytes_are_kept_and_the_newest() -> None:
+    recent = RecentCells()
+    large = [cell("abc"[n], 1, 30 << 20) for n in range(3)]
+    assert recent.kept(large) == large, "an answer has all of them"
+    assert len(recent) == 2
+    assert recent.kept([cell("c", 1), cell("b", 1)]) == [large[2], large[1]]
+    huge = cell("h", 1, 100 << 20)
+    assert recent.kept([huge]) == [huge]
+    assert len(recent) == 0
