@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge's part in a DDS domain: settings of CycloneDDS, qualities of service, closing.
 
-Settings of the user (``CYCLONEDDS_URI``, ``ROS_LOCALHOST_ONLY``) count as they do for ROS nodes. One default
-is ours: a writer of replies never waits until a reader has acknowledged what was sent before. All clients of
-a service read the same topic, and one that has stopped would hold up the answers to all others. What is kept
-for it is bounded: a writer keeps its last ten replies.
+Settings of the user (``CYCLONEDDS_URI``, ``ROS_LOCALHOST_ONLY``) count as they do for ROS nodes.
+
+All clients of a service read the same topic. A writer keeps its last samples, ten of replies, and so never
+waits for a reader that has stopped: that one misses what has been replaced, and the others notice nothing.
 """
 
 from __future__ import annotations
@@ -25,10 +25,6 @@ __all__ = ["MOST_DOMAIN", "close", "endpoint_qos", "open_participant", "settings
 MOST_DOMAIN: Final = 232
 """Highest number of a domain: those above have no UDP ports."""
 
-_PATIENT: Final = (
-    "<CycloneDDS><Domain Id='any'><Internal><Watermarks><WhcHigh>2147483647 B</WhcHigh></Watermarks>"
-    "</Internal></Domain></CycloneDDS>"
-)
 _LOCALHOST: Final = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
     "</General></Domain></CycloneDDS>"
@@ -37,10 +33,10 @@ _BLOCKING_MS: Final = 100
 
 
 def settings(environ: Mapping[str, str] = os.environ) -> str:
-    """Return what CycloneDDS is configured with: ours first, so that the user's counts over it."""
+    """Return what CycloneDDS is configured with: what ROS says first, so that the user's counts over it."""
     localhost = [_LOCALHOST] if environ.get("ROS_LOCALHOST_ONLY") == "1" else []
     users = environ.get("CYCLONEDDS_URI", "")
-    return ",".join([_PATIENT, *localhost, *([users] if users else [])])
+    return ",".join([*localhost, *([users] if users else [])])
 
 
 def open_participant(domain: int) -> tuple[Domain, DomainParticipant]:

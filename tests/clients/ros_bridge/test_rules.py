@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge import names, recent_cells
+from shmmap_clients.ros_bridge import names
 from shmmap_clients.ros_bridge.areas import sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
@@ -132,10 +132,12 @@ def test_a_node_s_name_has_no_slash() -> None:
         names.node_name("/loader")
 
 
-def test_settings_of_the_user_come_after_ours() -> None:
-    assert settings({}).startswith("<CycloneDDS>")
-    assert settings({"CYCLONEDDS_URI": "file:///x.xml"}).endswith(",file:///x.xml")
-    assert "127.0.0.1" in settings({"ROS_LOCALHOST_ONLY": "1"})
+def test_settings_are_the_user_s_and_those_of_ros() -> None:
+    assert settings({}) == ""
+    assert settings({"CYCLONEDDS_URI": "file:///x.xml"}) == "file:///x.xml"
+    both = settings({"CYCLONEDDS_URI": "file:///x.xml", "ROS_LOCALHOST_ONLY": "1"})
+    assert both.endswith(",file:///x.xml"), "so that it counts over the other"
+    assert "127.0.0.1" in both
     assert "127.0.0.1" not in settings({"ROS_LOCALHOST_ONLY": "0"})
 
 
@@ -187,7 +189,7 @@ def cell(name: str, version: int, nbytes: int = 1) -> Any:
 
 def test_cells_are_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [100.0]
-    monkeypatch.setattr(recent_cells.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr("shmmap_clients.ros_bridge.recent_cells.time.monotonic", lambda: now_s[0])
     recent = RecentCells()
     first, second = cell("a", 1), cell("b", 1)
     assert recent.kept([first, second]) == [first, second]
