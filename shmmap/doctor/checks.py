@@ -20,6 +20,7 @@ from shmmap.doctor.memory import (
     check_shared_memory,
 )
 from shmmap.doctor.patient import Patient
+from shmmap.doctor.ros_bridge import check_ros_bridge
 
 __all__ = ["CHECKS", "diagnose"]
 
@@ -38,6 +39,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_live_maps,
     check_live_disk,
     check_live_memory,
+    check_ros_bridge,
     check_pins,
     check_descriptors,
     check_leftovers,

@@ -16,12 +16,20 @@ from typing import Literal
 
 from shmmap.errors import CannotWrite, MapMissing
 from shmmap.service.huge_pages import DROP_IN, MOUNT
-from shmmap.service.program import check_readable, daemon_command, hidden_directories, is_hidden, quoted
+from shmmap.service.program import (
+    bridge_command,
+    check_readable,
+    daemon_command,
+    hidden_directories,
+    is_hidden,
+    quoted,
+)
 from shmmap.service.shipped_files import shipped_names, shipped_text
 
 __all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_text", "write"]
 
 SHIPPED_PROGRAM = "/usr/bin/shmmapd"
+SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
 _GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
 
 
@@ -55,7 +63,8 @@ class PlannedFile:
 
 def unit_text(name: str, root: str = "/") -> str:
     """Return a shipped unit with the program of this installation in it, as ``root`` will see it."""
-    return shipped_text(name).replace(SHIPPED_PROGRAM, daemon_command(root))
+    text = shipped_text(name).replace(SHIPPED_PROGRAM, daemon_command(root))
+    return text.replace(SHIPPED_BRIDGE, bridge_command(root))
 
 
 def configuration(map_path: str = "", *, group: bool = True) -> str:
@@ -114,7 +123,7 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
         if name.startswith("system/") and not name.endswith(".mount")
     ]
     why = "This Python lies where ProtectHome= or PrivateTmp= would hide it."
-    for service in ("shmmapd.service", "shmmapd@.service"):
+    for service in ("shmmapd.service", "shmmapd@.service", "shmmap-ros-bridge.service"):
         planned += _drop_in(units / f"{service}.d" / "10-program.conf", hidden_directories(root=root), why)
     if map_path:
         shown = [map_path] if is_hidden(map_path) else []

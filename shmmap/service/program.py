@@ -21,6 +21,7 @@ from shmmap.errors import ConfigError
 
 __all__ = [
     "INSTALL_FOR_SERVICE",
+    "bridge_command",
     "check_readable",
     "daemon_command",
     "hidden_directories",
@@ -40,8 +41,17 @@ def daemon_command(root: str = "/") -> str:
 
     Where the installation lies below ``root``, an image's file system, as the image will see it.
     """
-    script = Path(sys.prefix, "bin", "shmmapd")
-    command = [str(script)] if os.access(script, os.X_OK) else [sys.executable, "-m", "shmmap.daemon"]
+    return _command("shmmapd", "shmmap.daemon", root)
+
+
+def bridge_command(root: str = "/") -> str:
+    """Return what starts the bridge to ROS of this installation, as `daemon_command` does."""
+    return _command("shmmap-ros-bridge", "shmmap_clients.ros_bridge", root)
+
+
+def _command(name: str, module: str, root: str) -> str:
+    script = Path(sys.prefix, "bin", name)
+    command = [str(script)] if os.access(script, os.X_OK) else [sys.executable, "-m", module]
     return " ".join(quoted(word) for word in (_seen_from(root, command[0]), *command[1:]))
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -16,6 +16,10 @@ from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_daemon import SETTINGS, LiveDaemon
 from tests.support.live_drive import RESOLUTION
 from tests.support.raw_client import RawClient
+
+if TYPE_CHECKING:
+    from tests.support.bridge_process import BridgeProcess
+    from tests.support.ros_peer import RosPeer
 
 DaemonFactory = Callable[..., DaemonProcess]
 
@@ -88,3 +92,41 @@ def live_daemon(daemon: DaemonFactory, tmp_path: Path) -> LiveDaemon:
         return one
 
     return make
+
+
+@pytest.fixture
+def dds() -> Iterator[int]:
+    """Have a DDS domain that no other test is in; the test is skipped where there is no DDS."""
+    pytest.importorskip(
+        "cyclonedds", reason="needs the package cyclonedds, which has no wheel for this machine"
+    )
+    from tests.support.dds_domain import dds_domain
+
+    with dds_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def served(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
+    """A daemon that serves the divided map."""
+    one: DaemonProcess = daemon(divided_map.root)
+    return one
+
+
+@pytest.fixture
+def bridge(served: DaemonProcess, dds: int) -> Iterator[BridgeProcess]:
+    """A bridge of that daemon, in the test's domain."""
+    from tests.support.bridge_process import BridgeProcess
+
+    with BridgeProcess(served, dds) as one:
+        yield one
+
+
+@pytest.fixture
+def peer(dds: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[RosPeer]:
+    """A participant of that domain, to make clients with."""
+    from tests.support.ros_peer import ros_peer
+
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    with ros_peer(dds) as one:
+        yield one

@@ -17,7 +17,7 @@ from shmmap.segment.names import HUGE_PAGES_DIR
 from shmmap.service import installation, program
 from shmmap.service.huge_pages import check_possible
 from shmmap.service.installation import PlannedFile, configuration, plan_system, plan_user, unit_text, write
-from shmmap.service.program import daemon_command, hidden_directories, outermost, quoted
+from shmmap.service.program import bridge_command, daemon_command, hidden_directories, outermost, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
 from tests.support.daemon_process import ROOT
 
@@ -35,6 +35,7 @@ def test_a_service_for_the_machine(tmp_path: Path) -> None:
         "etc/systemd/system/shmmapd.socket",
         "etc/systemd/system/shmmapd@.service",
         "etc/systemd/system/shmmapd@.socket",
+        "etc/systemd/system/shmmap-ros-bridge.service",
         "etc/sysusers.d/shmmap.conf",
         "etc/tmpfiles.d/shmmap.conf",
         "etc/shmmap/shmmap.toml",
@@ -44,6 +45,8 @@ def test_a_service_for_the_machine(tmp_path: Path) -> None:
     assert {one.action for one in plan_system(root=str(tmp_path))} == {"same", "kept"}
     unit = (tmp_path / "etc/systemd/system/shmmapd.service").read_text()
     assert f"\nExecStart={daemon_command()} --config %E/shmmap/shmmap.toml\n" in unit
+    bridge = (tmp_path / "etc/systemd/system/shmmap-ros-bridge.service").read_text()
+    assert f"\nExecStart={bridge_command()} $ROS_BRIDGE_OPTIONS\n" in bridge
     assert sorted(path.name for path in tmp_path.rglob(".*")) == []
 
 
@@ -112,6 +115,7 @@ def test_a_user_s_service(tmp_path: Path) -> None:
     write(planned)
     assert sorted(str(one.path.relative_to(tmp_path / "config")) for one in planned) == [
         "shmmap/shmmap.toml",
+        "systemd/user/shmmap-ros-bridge.service",
         "systemd/user/shmmapd.service",
         "systemd/user/shmmapd.socket",
     ]
@@ -210,6 +214,19 @@ def test_the_daemon_s_command_starts_the_daemon() -> None:
         check=True,
     )
     assert "usage: shmmap serve" in done.stdout
+
+
+def test_the_bridge_s_command_starts_the_bridge() -> None:
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "clients")])
+    done = subprocess.run(
+        f"exec {bridge_command()} --help",
+        shell=True,
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "usage: shmmap-ros-bridge" in done.stdout
 
 
 def test_printing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Serves the daemon's map to ROS 2 nodes that know nothing of shmmap, in place of Autoware's map loader."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from shmmap_clients.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap_clients.ros_bridge.node import BridgeSettings, RosBridge
+
+__all__ = ["BridgeSettings", "RosBridge"]
+
+__getattr__ = lazy_names(__name__, {"BridgeSettings": "node", "RosBridge": "node"})

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, with the daemon's map behind it.
+
+Three threads: one answers with cells, one with voxels where there is a live map, and one what parameters
+there are. Each takes the requests itself. The last one also looks every second which clients there are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Final, TypeVar
+
+import msgspec
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+
+from shmmap import Client, LiveMap
+from shmmap_clients.ros_bridge import names
+from shmmap_clients.ros_bridge.cdr import MOST_BYTES
+from shmmap_clients.ros_bridge.listening import Listening
+from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES
+from shmmap_clients.ros_bridge.live_worker import LiveWorker
+from shmmap_clients.ros_bridge.map_worker import MapWorker
+from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, MapMetaData
+from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
+from shmmap_clients.ros_bridge.messages.standard import PointCloud2
+from shmmap_clients.ros_bridge.messages.wire import ServiceKind
+from shmmap_clients.ros_bridge.parameters import Parameters
+from shmmap_clients.ros_bridge.participant import close, endpoint_qos, open_participant
+from shmmap_clients.ros_bridge.service_server import ServiceServer
+from shmmap_clients.ros_bridge.status_file import StatusFile
+from shmmap_clients.ros_bridge.strangers import Strangers
+from shmmap_clients.ros_bridge.worker import Worker
+
+__all__ = ["NAMES", "BridgeSettings", "RosBridge"]
+
+NAMES: Final[Mapping[str, str]] = {
+    "partial": "get_partial_pointcloud_map",
+    "differential": "get_differential_pointcloud_map",
+    "selected": "get_selected_pointcloud_map",
+    "metadata": "pointcloud_map_metadata",
+    "whole": "pointcloud_map",
+    "live": "/shmmap/live",
+}
+"""What services and topics are called in the node's namespace, where `BridgeSettings.names` does not say."""
+_KINDS: Final = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
+_LOOK_S: Final = 1.0
+
+_Self = TypeVar("_Self", bound="RosBridge")
+
+
+class BridgeSettings(msgspec.Struct, frozen=True):
+    """How the bridge appears in ROS.
+
+    Attributes
+    ----------
+    domain
+        DDS domain, ``ROS_DOMAIN_ID``.
+    node, namespace
+        The node's name, and where names are that do not begin with a slash.
+    names
+        Other names than those of `NAMES`.
+    wait_s
+        How long cells may take to load.
+    whole_map, whole_bytes
+        Publish the whole map; it may take so many bytes.
+    voxels_every_s
+        How often voxels are published at most.
+    """
+
+    domain: int = 0
+    node: str = "pointcloud_map_loader"
+    namespace: str = "/map"
+    names: Mapping[str, str] = {}
+    wait_s: float = 30.0
+    whole_map: bool = False
+    whole_bytes: int = MOST_BYTES
+    voxels_every_s: float = 1.0
+
+    def name(self, what: str) -> str:
+        """Return the name of a service or topic, in full."""
+        return names.resolved(self.names.get(what, NAMES[what]), self.namespace)
+
+
+class RosBridge:
+    """Serves the daemon's map to ROS nodes.
+
+    Parameters
+    ----------
+    client
+        Of the daemon; the bridge alone uses it.
+    settings
+        How it appears.
+    log
+        Told what goes wrong.
+    live
+        A live map of another client, to be served, too.
+
+    Raises
+    ------
+    BadRequest
+        A name is no ROS name, the domain is no domain, or the whole map is too large.
+    Busy
+        A bridge of this daemon runs in this domain.
+    CannotStart
+        CycloneDDS does not start.
+    DaemonUnreachable
+        Nobody answers.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        settings: BridgeSettings,
+        log: Callable[[str], None],
+        live: LiveMap | None = None,
+    ) -> None:
+        self._settings = settings
+        self._log = log
+        self._stop = threading.Event()
+        self._ids = 0
+        self._id = secrets.token_bytes(12)
+        self._strangers = Strangers(log)
+        with contextlib.ExitStack() as undo:
+            own = names.resolved(names.node_name(settings.node), settings.namespace)
+            services = {one: settings.name(one) for one in NAMES}
+            welcome = client.welcome
+            self._status = StatusFile(client.endpoint, welcome.instance, settings.domain)
+            undo.callback(self._status.close)
+            domain, self._participant = open_participant(settings.domain)
+            undo.callback(close, self._participant, domain)
+            self._map = MapWorker(
+                client,
+                self._latched(services["metadata"], MapMetaData),
+                self._latched(services["whole"], PointCloud2) if settings.whole_map else None,
+                Listening(self._participant, log),
+                wait_s=settings.wait_s,
+                whole_bytes=settings.whole_bytes,
+                stop=self._stop,
+                log=log,
+            )
+            self._workers: list[Worker] = [self._map]
+            self._map.begin()
+            for what, kind in _KINDS.items():
+                self._add(services[what], kind, self._map.listening)
+            if live is not None:
+                self._add_live(live, services["live"])
+            self._parameters = self._make_parameters(welcome.map_path)
+            self._listening = Listening(self._participant, log)
+            for name, kind in PARAMETER_SERVICES.items():
+                self._add(f"{own}/{name}", kind, self._listening)
+            self._tell()
+            self._undo = undo.pop_all()
+
+    def __enter__(self: _Self) -> _Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def services(self) -> list[str]:
+        """Names of all services."""
+        return [server.name for server in self._servers]
+
+    @property
+    def status_path(self) -> str:
+        """Where ``shmmap doctor`` reads how the bridge is; empty where it cannot."""
+        return self._status.path
+
+    def stop(self) -> None:
+        """Let `run` end; may be called from a signal handler."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Serve until `stop` is called."""
+        with ThreadPoolExecutor(1 + len(self._workers)) as threads:
+            runs: list[Future[None]] = [
+                threads.submit(self._answer_parameters),
+                *(threads.submit(one.run) for one in self._workers),
+            ]
+            for one in runs:
+                one.add_done_callback(lambda _: self._stop.set())
+            try:
+                self._stop.wait()
+            finally:
+                self._stop.set()
+                for listening in self._all_listening:
+                    listening.wake()
+        for one in runs:
+            one.result()
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._undo.close()
+
+    # --- what is served -----------------------------------------------------------------------------
+
+    @property
+    def _all_listening(self) -> list[Listening]:
+        return [self._listening, *(worker.listening for worker in self._workers)]
+
+    @property
+    def _servers(self) -> list[ServiceServer]:
+        return [server for one in self._all_listening for server in one.servers]
+
+    def _add(self, name: str, kind: ServiceKind, listening: Listening) -> None:
+        self._ids += 1
+        number = self._id + self._ids.to_bytes(4, "big")
+        service_id = ".".join(f"{one:x}" for one in number)  # as rmw_cyclonedds_cpp writes it
+        listening.add(ServiceServer(self._participant, name, kind, service_id))
+
+    def _latched(self, name: str, kind: type) -> DataWriter:
+        qos = endpoint_qos(depth=1, latched=True)
+        return DataWriter(self._participant, Topic(self._participant, names.topic(name), kind), qos)
+
+    def _add_live(self, live: LiveMap, place: str) -> None:
+        qos = endpoint_qos(depth=1)
+        clouds = {
+            kind: DataWriter(
+                self._participant,
+                Topic(self._participant, names.topic(f"{place}/{kind}_voxels"), PointCloud2),
+                qos,
+            )
+            for kind in ("occupied", "free")
+        }
+        worker = LiveWorker(
+            live,
+            clouds,
+            Listening(self._participant, self._log),
+            every_s=self._settings.voxels_every_s,
+            stop=self._stop,
+            log=self._log,
+        )
+        self._workers.append(worker)
+        for name, (kind, _, _) in LIVE_SERVICES.items():
+            self._add(f"{place}/{name}", kind, worker.listening)
+
+    def _make_parameters(self, map_path: str) -> Parameters:
+        return Parameters(
+            {
+                "enable_whole_load": self._settings.whole_map,
+                "enable_downsampled_whole_load": False,
+                "enable_partial_load": True,
+                "enable_selected_load": True,
+                "pcd_metadata_path": "",
+                "pcd_paths_or_directory": [map_path],
+                "use_sim_time": False,
+            },
+            {"pcd_paths_or_directory": "the map that shmmap serves"},
+        )
+
+    # --- requests -----------------------------------------------------------------------------------
+
+    def _answer_parameters(self) -> None:
+        look_s = 0.0
+        while not self._stop.is_set():
+            self._listening.wait(_LOOK_S)
+            for request in self._listening.take():
+                server = request.server
+                fields = self._parameters.reply(server.name.rpartition("/")[2], request.message)
+                if server.present(request) and (why := server.reply_fields(request, **fields)):
+                    self._log(f"{server.name}: an answer was not sent: {why}")
+            if time.monotonic() >= look_s:
+                self._look()
+                look_s = time.monotonic() + _LOOK_S
+
+    def _look(self) -> None:
+        """See which clients there are."""
+        clients = [(server, one) for server in self._servers for one in server.requesters()]
+        self._map.alive = frozenset(one.name for _, one in clients)
+        self._strangers.look(clients)
+        self._tell(len({one.name for _, one in clients}))
+
+    def _tell(self, clients: int = 0) -> None:
+        self._status.write(
+            {
+                "domain": self._settings.domain,
+                "node": names.resolved(self._settings.node, self._settings.namespace),
+                "clients": clients,
+                "remembered": self._map.requesters,
+                "strangers": self._strangers.now,
+            }
+        )

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells of the map as ``sensor_msgs/PointCloud2``, byte for byte as Autoware's map loader sends them.
+
+It reads a file by ``pcl::io::loadPCDFile`` and sends what is in it: each field with its own type, one after
+another without gaps, in the file's order. A map of x y z intensity has points of 16 bytes, one of x y z has
+points of 12. A cell's columns are the same fields. Autoware's nodes look x, y and z up by name and take only
+float32, so doubles, and coordinates with an origin of their own, are rounded to float32 here.
+
+Different from Autoware: points that are not finite are not in a cell; ``height`` is always 1; integers of 64
+bits, for which the message has no type, are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ros_bridge.cdr import CdrWriter
+
+__all__ = ["CloudLayout", "cloud_layout", "fill_rows", "write_cloud", "write_cloud_head"]
+
+_DATATYPES: Final = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+"""By numpy's names; numbers as in ``sensor_msgs/PointField``."""
+_FLOAT32: Final = 7
+
+
+@dataclass(frozen=True, slots=True)
+class CloudLayout:
+    """How a point's bytes are divided.
+
+    Attributes
+    ----------
+    fields
+        Name, offset, type and count of each value.
+    columns
+        Name, offset, type and count of each of the cell's columns, of which ``xyz`` is three fields.
+    point_step
+        Bytes of a point.
+    described
+        The fields as bytes of the message, for a place at a multiple of four.
+    """
+
+    fields: tuple[tuple[str, int, int, int], ...]
+    columns: tuple[tuple[str, int, np.dtype[Any], int], ...]
+    point_step: int
+    described: bytes
+
+
+def cloud_layout(columns: Mapping[str, NDArray[Any]]) -> CloudLayout:
+    """Return the layout for columns of these names and types, (N,) or (N, k)."""
+    fields: list[tuple[str, int, int, int]] = []
+    places: list[tuple[str, int, np.dtype[Any], int]] = []
+    offset = 0
+    for name, values in columns.items():
+        kind, count = values.dtype.str[1:], math.prod(values.shape[1:])
+        if name == "xyz":
+            fields += [(axis, offset + 4 * n, _FLOAT32, 1) for n, axis in enumerate("xyz")]
+            kind = "f4"
+        elif kind in _DATATYPES:
+            fields.append((name, offset, _DATATYPES[kind], count))
+        else:
+            continue
+        places.append((name, offset, np.dtype(f"<{kind}"), count))
+        offset += int(kind[1:]) * count
+    writer = CdrWriter()
+    writer.uint32(len(fields))
+    for name, start, datatype, count in fields:
+        writer.text(name)
+        writer.uint32(start)
+        writer.uint8(datatype)
+        writer.uint32(count)
+    writer.boolean(False)  # is_bigendian
+    writer.uint32(offset)
+    return CloudLayout(tuple(fields), tuple(places), offset, bytes(writer.content()[4:]))
+
+
+def write_cloud(
+    writer: CdrWriter,
+    columns: Mapping[str, NDArray[Any]],
+    origin: tuple[float, float, float],
+    layout: CloudLayout,
+    frame_id: str = "",
+    stamp_ns: int = 0,
+) -> None:
+    """Append a ``PointCloud2``; inside a cell Autoware's have an empty header.
+
+    Parameters
+    ----------
+    columns
+        As those of the layout, of equal lengths; they are read when the message is put together.
+    origin
+        What ``xyz`` is relative to, metres.
+    layout
+        How a point's bytes are divided.
+    frame_id, stamp_ns
+        For the header; nanoseconds since 1970.
+    """
+    points = len(columns["xyz"])
+    nbytes = points * layout.point_step
+    write_cloud_head(writer, layout, points, frame_id, stamp_ns)
+    writer.uint32(nbytes)
+    if nbytes:
+        writer.blob(nbytes, partial(fill_rows, columns=columns, origin=origin, layout=layout))
+    writer.boolean(True)  # is_dense: every coordinate is finite
+
+
+def write_cloud_head(
+    writer: CdrWriter, layout: CloudLayout, points: int, frame_id: str = "", stamp_ns: int = 0
+) -> None:
+    """Append what stands in front of the points: header, size, fields."""
+    writer.int32(stamp_ns // 10**9)
+    writer.uint32(stamp_ns % 10**9)
+    writer.text(frame_id)
+    writer.uint32(1, points)  # height, width
+    writer.prepared(layout.described)
+    writer.uint32(layout.point_step * points)
+
+
+def fill_rows(
+    place: memoryview,
+    columns: Mapping[str, NDArray[Any]],
+    origin: tuple[float, float, float],
+    layout: CloudLayout,
+) -> None:
+    """Write points into ``place``: each value is copied once, from shared memory to where it is sent from.
+
+    They go value by value, five times as fast as point by point.  A column that is missing, or has other
+    values for a point than the layout's, leaves zeros.
+    """
+    step = layout.point_step
+    count = len(place) // step
+    for name, offset, kind, values_each in layout.columns:
+        column = columns.get(name)
+        if column is None or column.shape[0] != count or math.prod(column.shape[1:]) != values_each:
+            continue
+        values = column.reshape(count, values_each)
+        for n in range(values_each):
+            target: NDArray[Any] = np.ndarray((count,), kind, place, offset + n * kind.itemsize, (step,))
+            if name == "xyz" and origin[n]:
+                np.add(values[:, n], origin[n], out=target, dtype=np.float64, casting="same_kind")
+            else:
+                target[...] = values[:, n]

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One ROS service over CycloneDDS, as rmw_cyclonedds_cpp speaks it.
+
+A service is two topics: requests are read, replies are written, and every client reads all replies and takes
+its own. Reader and writer say in their user data that they belong together (``serviceid=``), and so do a
+client's (``clientid=``). A reply is written only when the client's reader is known: one that is not known yet
+would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does.
+
+Other implementations of ROS send no ``clientid=``. They carry the number of a request outside of the message,
+where neither can read the other's, and their clients wait for ever: they are `strangers`.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+from shmmap_clients.ros_bridge.cdr import Content
+from shmmap_clients.ros_bridge.messages.wire import Damaged, ServiceKind, ready_made
+from shmmap_clients.ros_bridge.names import reply_topic, request_topic
+from shmmap_clients.ros_bridge.participant import endpoint_qos
+
+__all__ = ["Request", "Requester", "ServiceServer"]
+
+_KNOWN_WITHIN_S: Final = 0.1
+_LOOK_EVERY_S: Final = 0.01
+_KEPT: Final = 1024
+"""Requests that a reader keeps until they are taken: of all clients together, so more than rclcpp's ten."""
+_CLIENT_ID: Final = re.compile(rb"(?:^|;)clientid=([^;]*);")
+_VENDORS: Final = {0x0101: "RTI Connext", 0x010F: "Fast DDS", 0x0110: "CycloneDDS", 0x0112: "RustDDS"}
+"""By the first two bytes of an endpoint's key: there most implementations put their number (DDSI-RTPS)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Requester:
+    """Who asks: a client's writer of requests.
+
+    Attributes
+    ----------
+    name
+        Its ``clientid``, or the key of the writer where it has none.
+    stranger
+        It has none.
+    vendor
+        Whose DDS it speaks; empty where that cannot be told.
+    """
+
+    name: str
+    stranger: bool
+    vendor: str
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A request that has come.
+
+    Attributes
+    ----------
+    server
+        Of which service.
+    message
+        What is asked; its ``client`` and ``number`` go into the reply.
+    requester, handle
+        Who asks; DDS's number of its writer.
+    """
+
+    server: ServiceServer
+    message: Any
+    requester: Requester
+    handle: int
+
+
+class ServiceServer:
+    """Takes requests of one service and writes replies.
+
+    Parameters
+    ----------
+    participant
+        In whose domain.
+    name
+        The service's, in full.
+    kind
+        Its messages.
+    service_id
+        Which server it is: no other of the domain has this one.
+    """
+
+    def __init__(self, participant: DomainParticipant, name: str, kind: ServiceKind, service_id: str) -> None:
+        self.name = name
+        self.kind = kind
+        belongs = f"serviceid={service_id};"
+        requests = Topic(participant, request_topic(name), kind.request)
+        replies = Topic(participant, reply_topic(name), kind.reply)
+        self._reader = DataReader(participant, requests, endpoint_qos(belongs, depth=_KEPT))
+        self._writer = DataWriter(participant, replies, endpoint_qos(belongs))
+        self.condition = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
+        self._lock = threading.Lock()  # one thread takes requests, another one replies
+        self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
+        self._readers: dict[int, str] = {}  # clientid by DDS's number of the reader of replies
+
+    def __repr__(self) -> str:
+        return f"<ServiceServer {self.name}>"
+
+    def take(self) -> Iterator[Request | Damaged]:
+        """Take the requests that have come; of one that is no message of the service, why not."""
+        for one in self._reader.take(_KEPT):
+            if not one.sample_info.valid_data:
+                continue
+            if isinstance(one, Damaged):
+                yield one
+                continue
+            (handle,) = _unsigned([one.sample_info.publication_handle])
+            requester = self._requester(handle)
+            if requester is not None:
+                yield Request(self, one, requester, handle)
+
+    def requesters(self) -> list[Requester]:
+        """All clients that there are now, whether they have asked or not."""
+        handles = _unsigned(self._reader.get_matched_publications())
+        readers = _unsigned(self._writer.get_matched_subscriptions())
+        with self._lock:
+            for handle in self._requesters.keys() - handles:
+                del self._requesters[handle]
+            for handle in self._readers.keys() - readers:
+                del self._readers[handle]
+        return [found for one in handles if (found := self._requester(one)) is not None]
+
+    def present(self, request: Request) -> bool:
+        """Whether the client can hear the reply; waits up to 100 ms for its reader to be found."""
+        name = request.requester.name
+        with self._lock:
+            if request.requester.stranger or name in self._readers.values():
+                return True
+        until_s = time.monotonic() + _KNOWN_WITHIN_S
+        while not self._hears(name):
+            if self.gone(request) or time.monotonic() >= until_s:
+                return False
+            time.sleep(_LOOK_EVERY_S)
+        return True
+
+    def gone(self, request: Request) -> bool:
+        """Whether nobody waits for the reply any more."""
+        return self._requester(request.handle, anew=True) is None
+
+    def reply(self, content: Content) -> str:
+        """Send a reply; returns why it cannot be sent, empty when it was."""
+        return self._write(ready_made(self.kind.reply, content))
+
+    def reply_fields(self, request: Request, **fields: Any) -> str:
+        """Send a reply of these fields; returns why it cannot be sent, empty when it was."""
+        message = request.message
+        return self._write(self.kind.reply(client=message.client, number=message.number, **fields))
+
+    def _write(self, message: Any) -> str:
+        try:
+            self._writer.write(message)
+        except DDSException as error:
+            return str(error)
+        return ""
+
+    def _requester(self, handle: int, *, anew: bool = False) -> Requester | None:
+        """Who writes there; None when it is gone.  ``anew``: what was known before does not count."""
+        with self._lock:
+            known = self._requesters.get(handle)
+            if known is not None and (
+                not anew or handle in _unsigned(self._reader.get_matched_publications())
+            ):
+                return known
+            found = None if known is not None else self._reader.get_matched_publication_data(handle)
+            if found is None:
+                self._requesters.pop(handle, None)
+                return None
+            client_id = _client_id(found)
+            vendor = _VENDORS.get(int.from_bytes(found.key.bytes[:2], "big"), "")
+            one = Requester(client_id or found.key.hex, not client_id, vendor)
+            self._requesters[handle] = one
+            return one
+
+    def _hears(self, client_id: str) -> bool:
+        """Look for a client's reader among those that are known now."""
+        handles = _unsigned(self._writer.get_matched_subscriptions())
+        with self._lock:
+            for handle in handles - self._readers.keys():
+                found = self._writer.get_matched_subscription_data(handle)
+                if found is not None:
+                    self._readers[handle] = _client_id(found)
+            return client_id in self._readers.values()
+
+
+def _client_id(endpoint: Any) -> str:
+    data = endpoint.qos[Policy.Userdata]
+    found = _CLIENT_ID.search(data.data) if data is not None else None
+    return found[1].decode("ascii", "backslashreplace") if found else ""
+
+
+def _unsigned(handles: Iterable[int]) -> set[int]:
+    """Numbers of DDS as they are: some of the package's calls take them for signed ones."""
+    return {one & (2**64 - 1) for one in handles}

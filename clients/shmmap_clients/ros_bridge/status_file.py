@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the bridge tells ``shmmap doctor``: a small file beside the daemon's socket.
+
+Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. While a bridge runs it holds a lock on it (fcntl(2)), so
+that nobody takes the word of one that was killed, and no second bridge answers the same requests. It is
+written in place by one call, with blanks to its former length, so that who reads it never sees half of it.
+
+Where the daemon's directory may not be written, it lies in the user's own, ``$XDG_RUNTIME_DIR/shmmap``; where
+there is none either, nobody is told.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import stat
+from collections.abc import Mapping
+from typing import Any, Final
+
+from shmmap import Busy
+
+__all__ = ["StatusFile", "status_name"]
+
+_MODE: Final = 0o644
+
+
+def status_name(instance: str, domain: int) -> str:
+    """Return the file's name."""
+    return f"{instance}.ros-bridge-{domain}.json"
+
+
+class StatusFile:
+    """The file, from its making to its end.
+
+    Parameters
+    ----------
+    endpoint
+        The daemon's socket.
+    instance, domain
+        Whose cells the bridge serves, and where.
+
+    Attributes
+    ----------
+    path
+        Where it is; empty where it could not be made.
+
+    Raises
+    ------
+    Busy
+        A bridge of this daemon runs in this domain.
+    """
+
+    def __init__(self, endpoint: str, instance: str, domain: int) -> None:
+        self.path = ""
+        self._fd = -1
+        self._written = 0
+        own = os.environ.get("XDG_RUNTIME_DIR", "")
+        for place in (os.path.dirname(endpoint), f"{own}/shmmap" if own else ""):
+            if place and self._take(f"{place}/{status_name(instance, domain)}"):
+                return
+
+    def _take(self, path: str) -> bool:
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        while True:
+            try:
+                fd = os.open(path, flags, _MODE)
+            except OSError:
+                return False  # not for this user, or there is no such directory
+            try:
+                fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                status = os.fstat(fd)
+                same = os.path.samestat(status, os.stat(path, follow_symlinks=False))
+            except (BlockingIOError, PermissionError):  # as POSIX lets a system choose
+                os.close(fd)
+                raise Busy(
+                    f"another bridge of this daemon runs in this domain: it holds {path}",
+                    hint="stop it, or choose another --domain",
+                ) from None
+            except FileNotFoundError:  # the one before was just ending
+                same = False
+            if same and stat.S_ISREG(status.st_mode):
+                self.path, self._fd, self._written = path, fd, status.st_size
+                return True
+            os.close(fd)
+            if same:
+                return False
+
+    def write(self, told: Mapping[str, Any]) -> None:
+        """Tell this from now on."""
+        if self._fd < 0:
+            return
+        data = json.dumps(told).encode() + b"\n"
+        data = data.ljust(self._written)
+        with contextlib.suppress(OSError):  # a full disk: what is told is older then
+            self._written = max(self._written, os.pwrite(self._fd, data, 0))
+
+    def close(self) -> None:
+        """Remove the file."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                os.unlink(self.path)
+            os.close(self._fd)
+            self._fd = -1

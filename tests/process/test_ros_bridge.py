@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap-ros-bridge`` against real daemons, asked by clients of three implementations of DDS."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
+
+from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES
+from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo, MapMetaData
+from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
+from shmmap_clients.ros_bridge.messages.standard import PointCloud2
+
+from tests.process.conftest import DaemonFactory
+from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment
+from tests.support.daemon_process import DaemonProcess
+from tests.support.dds_programs import built_cyclone_peer, built_fast_peer
+from tests.support.divided_map import DividedMap
+from tests.support.pages import read_page
+from tests.support.ros_maps import KINDS, NAMES, asked, reload
+from tests.support.ros_peer import RosPeer
+from tests.support.ros_reply import Reply, expected, from_lines, from_message
+
+Ask = Callable[..., Reply]
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path | None]:
+    folder = tmp_path_factory.mktemp("peers")
+    return {"cyclone": built_cyclone_peer(folder), "fast": built_fast_peer(folder)}
+
+
+@pytest.fixture(params=["python", "cyclone", "fast"])
+def ask(request: pytest.FixtureRequest, dds: int, programs: dict[str, Path | None]) -> Ask:
+    """Ask a service by one of the peers."""
+    if request.param == "python":
+        peer = request.getfixturevalue("peer")
+        return lambda verb, **what: asked(peer, verb, **what)
+    program = programs[request.param]
+    if program is None:
+        packages = {"cyclone": "cyclonedds-dev cyclonedds-tools gcc", "fast": "libfastrtps-dev g++"}
+        pytest.skip(f"needs {packages[request.param]}")
+
+    def run(verb: str, *, area: Sequence[float] = (), ids: Sequence[str] = ()) -> Reply:
+        words = [str(program), str(dds), verb, NAMES[verb], *(repr(float(one)) for one in area), *ids]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=bridge_environment())
+        assert done.returncode == 0, done.stderr
+        return from_lines(done.stdout)
+
+    return run
+
+
+def in_order(town: DividedMap, wanted: Callable[[tuple[float, ...]], bool]) -> list[str]:
+    """Names of the cells, in the order of their ids."""
+    names = sorted(town.corners, key=town.id)
+    return [name for name in names if wanted(town.box(name))]
+
+
+# --- what is answered ---------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("bridge")
+def test_three_services_to_the_byte(ask: Ask, divided_map: DividedMap) -> None:
+    near = in_order(
+        divided_map, lambda box: box[0] - 15 <= 3 <= box[2] + 15 and box[1] - 15 <= -4 <= box[3] + 15
+    )
+    assert 4 <= len(near) < len(divided_map.corners)
+    assert ask("partial", area=(3, -4, 15)) == expected(divided_map, near)
+    has = [divided_map.id(near[1]), "gone.pcd", divided_map.id("40_40.pcd"), divided_map.id(near[2])]
+    left = [name for name in near if name not in near[1:3]]
+    assert ask("differential", area=(3, -4, 15), ids=has) == expected(divided_map, left, [has[1], has[2]])
+    wanted = ["40_40.pcd", near[0], "40_40.pcd"]
+    ids = [divided_map.id(wanted[0]), "unknown", *map(divided_map.id, wanted[1:])]
+    assert ask("selected", ids=ids) == expected(divided_map, wanted)
+    assert ask("selected", ids=[]) == expected(divided_map, [])
+
+
+@pytest.mark.usefixtures("bridge")
+def test_areas_that_make_no_sense_are_answered_as_autoware_does(
+    peer: RosPeer, divided_map: DividedMap
+) -> None:
+    everything = in_order(divided_map, lambda _: True)
+    inside = in_order(
+        divided_map, lambda box: box[0] + 5 <= 10 <= box[2] - 5 and box[1] + 5 <= 10 <= box[3] - 5
+    )
+    assert inside == ["0_0.pcd"]
+    has = [divided_map.id("0_0.pcd"), divided_map.id("20_0.pcd"), "x"]
+    for area, names in {
+        (0.0, 0.0, math.inf): everything,
+        (math.nan, 0.0, 100.0): [],
+        (0.0, 0.0, math.nan): [],
+        (10.0, 10.0, -5.0): inside,
+        (10.0, 10.0, -11.0): [],
+    }.items():
+        assert asked(peer, "partial", area=area).ids == [divided_map.id(name) for name in names], area
+        found = asked(peer, "differential", area=area, ids=has)
+        ids = [divided_map.id(name) for name in names]
+        assert found.ids == [one for one in ids if one not in has], area
+        assert found.removed == [one for one in has if one not in ids], area
+
+
+def test_points_have_the_fields_of_the_file(
+    daemon: DaemonFactory, dds: int, peer: RosPeer, tmp_path: Path
+) -> None:
+    """x y z alone are 12 bytes; other types stay as they are, without gaps."""
+    town = DividedMap(tmp_path / "map")
+    town.pcd_dir.mkdir(parents=True)
+    random = np.random.default_rng(1)
+    plain = {axis: random.uniform(0, 20, 100).astype("<f4") for axis in "xyz"}
+    town.write_cell("0_0.pcd", (0, 0), plain)
+    ring, intensity = random.integers(0, 64, 100).astype("u1"), random.uniform(0, 1, 100).astype("<f4")
+    town.write_cell("20_0.pcd", (20, 0), {**plain, "ring": ring, "intensity": intensity})
+    town.write_metadata()
+    with BridgeProcess(daemon(town.root), dds):
+        found = asked(peer, "partial", area=(20, 10, 5))
+    assert found == expected(town, ["0_0.pcd", "20_0.pcd"])
+    assert [cell.shape[3] for cell in found.cells] == [12, 17]
+
+
+def test_a_changed_cell_is_sent_again_to_who_has_the_old_one(
+    bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
+) -> None:
+    first, second = (peer.client(NAMES["differential"], DIFFERENTIAL) for _ in range(2))
+    area = AreaInfo(3.0, -4.0, 15.0)
+    ids = from_message(first.call(area=area, cached_ids=[])).ids
+    assert from_message(second.call(area=area, cached_ids=ids[:1])).ids == ids[1:], "an id counts as current"
+    divided_map.change(Path(ids[0]).name, seed=5)
+    reload(served)
+    found = from_message(first.call(area=area, cached_ids=ids))
+    assert (found.ids, found.removed) == (ids[:1], [])
+    assert found.cells[0] == expected(divided_map, [Path(ids[0]).name]).cells[0]
+    assert from_message(first.call(area=area, cached_ids=ids)).ids == [], "once"
+    assert from_message(second.call(area=area, cached_ids=ids)).ids == ids[:1]
+
+
+def test_a_cell_that_cannot_be_loaded_is_left_out_and_told(
+    bridge: BridgeProcess, peer: RosPeer, divided_map: DividedMap
+) -> None:
+    Path(divided_map.id("0_0.pcd")).write_bytes(b"this is no cloud")
+    found = asked(peer, "partial", area=(10, 10, 5))
+    assert found.ids == []
+    bridge.wait_said("left out of an answer")
+
+
+# --- topics and parameters ----------------------------------------------------------------------------
+
+
+def test_the_list_of_cells_is_latched_and_follows_the_map(
+    bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
+) -> None:
+    listed = peer.latched("/map/pointcloud_map_metadata", MapMetaData)
+    assert listed.header.frame_id == "map"
+    assert listed.header.stamp.sec > 0
+    told = {one.cell_id: one.metadata for one in listed.metadata_list}
+    assert list(told) == sorted(divided_map.id(name) for name in divided_map.corners)
+    for name in divided_map.corners:
+        box = told[divided_map.id(name)]
+        assert (box.min_x, box.min_y, box.max_x, box.max_y) == divided_map.box(name)
+    divided_map.remove_cell("0_0.pcd")
+    divided_map.write_metadata()
+    reload(served)
+    reader = peer.following("/map/pointcloud_map_metadata", MapMetaData)
+    assert any(len(one.metadata_list) == len(told) - 1 for one in reader)
+
+
+def test_the_whole_map_is_one_cloud_where_it_is_asked_for(
+    served: DaemonProcess, dds: int, peer: RosPeer, divided_map: DividedMap
+) -> None:
+    with BridgeProcess(served, dds, "--whole-map"):
+        cloud = peer.latched("/map/pointcloud_map", PointCloud2)
+    cells = expected(divided_map, in_order(divided_map, lambda _: True)).cells
+    assert bytes(cloud.data) == b"".join(cell.data for cell in cells)
+    assert (cloud.header.frame_id, cloud.point_step, cloud.width) == (
+        "map",
+        16,
+        sum(c.shape[1] for c in cells),
+    )
+    size = len(cloud.data)
+    words = [*PROGRAM, "--endpoint", served.endpoint, "--domain", str(dds), "--whole-map"]
+    done = subprocess.run(
+        [*words, "--whole-map-limit", "0.0001"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=bridge_environment(),
+    )
+    assert done.returncode == 2
+    told = float(done.stderr.split("takes about ")[1].split(" GB")[0])
+    assert told == pytest.approx(size / 1e9, rel=0.1)
+    assert "0.0001 GB is the most" in done.stderr
+
+
+def test_parameters_are_there_and_cannot_be_set(
+    bridge: BridgeProcess, peer: RosPeer, divided_map: DividedMap
+) -> None:
+    from shmmap_clients.ros_bridge.messages.parameters import Parameter, ParameterValue
+
+    clients = {
+        name: peer.client(f"/map/pointcloud_map_loader/{name}", kind)
+        for name, kind in PARAMETER_SERVICES.items()
+    }
+    names = ["enable_partial_load", "pcd_paths_or_directory"]
+    partial, paths = clients["get_parameters"].call(names=names).values
+    assert (partial.type, partial.bool_value) == (1, True)
+    assert (paths.type, paths.string_array_value) == (9, [str(divided_map.root)])
+    assert clients["get_parameters"].call(names=["enable_partial_load", "nothing"]).values == []
+    assert list(clients["get_parameter_types"].call(names=names).types) == [1, 9]
+    listed = clients["list_parameters"].call(prefixes=[], depth=0).result
+    assert names[0] in listed.names
+    described = clients["describe_parameters"].call(names=names).descriptors
+    assert [(one.name, one.type, one.read_only) for one in described] == [
+        (names[0], 1, True),
+        (names[1], 9, True),
+    ]
+    off = ParameterValue(1, False, 0, 0.0, "", [], [], [], [], [])
+    results = (
+        clients["set_parameters"].call(parameters=[Parameter(names[0], off), Parameter("x", off)]).results
+    )
+    assert [one.successful for one in results] == [False, False]
+    assert "read-only" in results[0].reason
+    assert "was not declared" in results[1].reason
+    result = clients["set_parameters_atomically"].call(parameters=[Parameter(names[0], off)]).result
+    assert (result.successful, "read-only" in result.reason) == (False, True)
+    assert clients["get_parameters"].call(names=names[:1]).values[0].bool_value
+
+
+def test_other_names(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
+    options = [
+        "--namespace",
+        "/town",
+        "--node",
+        "loader",
+        "--name",
+        "partial=near",
+        "--name",
+        "selected=/by_id",
+    ]
+    with BridgeProcess(served, dds, *options) as bridge:
+        assert peer.client("/town/near", PARTIAL).call(area=AreaInfo(0, 0, 5)).new_pointcloud_with_ids
+        assert peer.client("/by_id", SELECTED).call(cell_ids=[]).new_pointcloud_with_ids == []
+        assert peer.client("/town/loader/get_parameters", PARAMETER_SERVICES["get_parameters"]).call(names=[])
+        assert bridge.status["node"] == "/town/loader"
+
+
+def test_the_page_is_true(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
+    """Its command starts a bridge, and every service and topic that it names is there."""
+    page = read_page("clients/shmmap_clients/ros_bridge/ROS_BRIDGE.md")
+    assert set(page.blocks) == {"bridge"}
+    (command,) = page.commands("bridge")
+    program, *words = command.split()
+    assert program == "shmmap-ros-bridge"
+    assert words == ["--domain", "0"], "replaced here by the test's own"
+    listed = set(re.findall(r"`(/map/get_\w+)`", page.text))
+    assert listed == set(NAMES.values())
+    with BridgeProcess(served, dds):
+        for verb, name in NAMES.items():
+            peer.client(name, KINDS[verb]).wait_for_service()
+        assert peer.latched("/map/pointcloud_map_metadata", MapMetaData)
+    for name in ("/map/pointcloud_map", *LIVE_SERVICES, "occupied_voxels", "free_voxels"):
+        assert f"{name}`" in page.text, name
