@@ -21,32 +21,33 @@ class Catalogue:
         `shmmap.CellInfo` by id, in the order of ids.
     versions : dict
         Version of each cell's points by id.
+    map_version : int or None
+        Which state of the map this is; None before the first `refresh`.
     """
 
     def __init__(self) -> None:
         self.cells: dict[str, CellInfo] = {}
         self.versions: dict[str, int] = {}
-        self._map_version: int | None = None
+        self.map_version: int | None = None
 
-    def refresh(self, client: Client) -> bool:
-        """Take in what has changed; returns whether anything has.
+    def refresh(self, client: Client) -> None:
+        """Take in what has changed.
 
         Raises
         ------
         DaemonUnreachable
             Nobody answers.
         """
-        listing = client.metadata(since=self._map_version)
-        if listing.map_version == self._map_version:
-            return False
+        listing = client.metadata(since=self.map_version)
+        if listing.map_version == self.map_version:
+            return
         changed = {cell.id: cell for cell in listing}
         cells = {**self.cells, **changed} if listing.since_known else changed
         for gone in listing.removed if listing.since_known else ():
             cells.pop(gone, None)
         self.cells = dict(sorted(cells.items()))
         self.versions = {cell.id: cell.version for cell in self.cells.values()}
-        self._map_version = listing.map_version
-        return True
+        self.map_version = listing.map_version
 
     def boxes(self) -> NDArray[np.float64]:
         """Return all boxes, (N, 4) min_x min_y max_x max_y, metres, in the order of ids."""

@@ -71,7 +71,7 @@ class MapWorker(Worker):
         self._catalogue = Catalogue()
         self._requesters = Requesters()
         self._answers = MapAnswers(client, self._catalogue, self._requesters, wait_s, log)
-        self._published = False
+        self._published: int | None = None  # which state of the map
         self.alive: Collection[str] | None = None
 
     @property
@@ -94,7 +94,7 @@ class MapWorker(Worker):
         """Return a reply with cells."""
         if self._client.disconnected_since is not None:
             # a request for cells has longer than this to find out that the daemon is away
-            self._published &= not self._catalogue.refresh(self._client)
+            self._catalogue.refresh(self._client)
         return self._answers.answer(message, request.requester.name)
 
     def empty(self, message: Any) -> Content:
@@ -106,14 +106,14 @@ class MapWorker(Worker):
         if self.alive is not None:
             self._requesters.keep_only(self.alive)
         self._answers.let_go()
-        self._published &= not self._catalogue.refresh(self._client)
-        if self._published:
+        self._catalogue.refresh(self._client)
+        if self._published == self._catalogue.map_version:
             return
         try:
             self._publish()
         except BadRequest as error:  # it has grown: what was published stays
             self._log(str(error))
-            self._published = True
+            self._published = self._catalogue.map_version
 
     def _publish(self) -> None:
         now_ns = time.time_ns()
@@ -128,4 +128,4 @@ class MapWorker(Worker):
                 wait_s=self._wait_s,
             )
             self._whole.write(ready_made(PointCloud2, cloud))
-        self._published = True
+        self._published = self._catalogue.map_version
