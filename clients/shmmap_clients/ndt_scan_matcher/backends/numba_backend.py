@@ -21,8 +21,9 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     search_columns,
     total,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
 from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
+from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
 
 __all__ = ["NumbaBackend"]
 
@@ -35,9 +36,12 @@ class NumbaBackend:
     """
 
     name = "numba"
+    on_device = False
 
     def __init__(self, limits: Limits, threads: int = 1) -> None:
         self._source = ScanBuffer(limits.source_points)
+        self._most_poses = limits.poses
+        self.most_map_bytes = limits.most_map_bytes
         self._map = VoxelMap({})
         self._rows = np.zeros((-(-limits.source_points // CHUNK_POINTS), SUMS))
         self._scratch = [
@@ -50,6 +54,11 @@ class NumbaBackend:
         """End the threads."""
         if self._pool is not None:
             self._pool.shutdown()
+
+    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+        """Derive covariances and the table of addresses; nothing else is copied."""
+        del neighbors
+        voxel_map.table(covariance)
 
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on."""
@@ -67,8 +76,10 @@ class NumbaBackend:
         covariance: Covariance,
         pitch_sign: float = -1.0,
         T: NDArray[np.float64] | None = None,
+        deadline_s: float | None = None,
     ) -> Evaluation:
         """Return score, gradient and Hessian at a pose vector."""
+        del deadline_s
         source = self._source.points
         chunks = -(-len(source) // CHUNK_POINTS)
         threads = min(len(self._scratch), max(chunks, 1))
@@ -112,3 +123,24 @@ class NumbaBackend:
             for other in others:
                 other.result()
         return total(self._rows[:chunks], pose, pitch_sign)
+
+    def evaluate_many(
+        self,
+        poses: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        deadline_s: float | None = None,
+    ) -> list[Evaluation]:
+        """Return the same as `evaluate` for each of (k, 6) poses."""
+        del deadline_s
+        check_batch(poses, self._most_poses)
+        return [
+            self.evaluate(pose, neighbors=neighbors, covariance=covariance, pitch_sign=pitch_sign)
+            for pose in poses
+        ]
+
+    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+        """Return the step that an evaluation asks for."""
+        return numpy_step(at, steady)

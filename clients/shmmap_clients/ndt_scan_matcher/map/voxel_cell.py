@@ -52,6 +52,11 @@ class VoxelCell:
     inverse: NDArray[np.float64]
     memory: object = None
 
+    @property
+    def map_bytes(self) -> int:
+        """Bytes that matching needs of it: lattice, means and inverse covariances."""
+        return self.lattice.nbytes + self.mean.nbytes + self.inverse.nbytes
+
 
 def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6) -> VoxelCell:
     """Compute the Gaussians of a cloud, as the daemon's ``ndt`` layer has them.

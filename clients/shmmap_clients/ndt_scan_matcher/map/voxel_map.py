@@ -39,9 +39,9 @@ class VoxelMap:
     ----------
     cells
         By any key; their order is the order of summation.
-    max_voxels
-        Cells nearest to ``centre`` are taken until the next would exceed this; the others are left
-        out and counted.
+    max_voxels, max_bytes
+        Cells nearest to ``centre`` are taken until the next would exceed one of these; the others are left
+        out and counted.  Bytes are `VoxelCell.map_bytes`.
     centre
         (x, y), metres, map frame; by default the middle of all cells.
     previous
@@ -58,6 +58,7 @@ class VoxelMap:
         cells: Mapping[str, VoxelCell],
         *,
         max_voxels: int | None = None,
+        max_bytes: int | None = None,
         centre: tuple[float, float] | None = None,
         previous: VoxelMap | None = None,
     ) -> None:
@@ -65,9 +66,12 @@ class VoxelMap:
         if len(leaves) > 1:
             raise BadRequest(f"cells of one map must have one leaf size, these have {sorted(leaves)}")
         self.leaf: float = leaves.pop() if leaves else 1.0
-        kept, self.voxels_left_out = _within(cells, max_voxels, centre)
+        kept = _within(cells, max_voxels, max_bytes, centre)
+        left = [cell for key, cell in cells.items() if key not in kept]
         self.cells: dict[str, VoxelCell] = kept
         self.voxels = sum(len(cell.count) for cell in kept.values())
+        self.voxels_left_out = sum(len(cell.count) for cell in left)
+        self.bytes_left_out = sum(cell.map_bytes for cell in left)
         self.origins = np.array([cell.origin for cell in kept.values()]).reshape(-1, 3)
         self._derived: dict[str, Inverses] = {}
         if previous is not None:
@@ -111,25 +115,24 @@ class VoxelMap:
 
 
 def _within(
-    cells: Mapping[str, VoxelCell], max_voxels: int | None, centre: tuple[float, float] | None
-) -> tuple[dict[str, VoxelCell], int]:
-    total = sum(len(cell.count) for cell in cells.values())
-    if max_voxels is None or total <= max_voxels:
-        return dict(cells), 0
+    cells: Mapping[str, VoxelCell],
+    max_voxels: int | None,
+    max_bytes: int | None,
+    centre: tuple[float, float] | None,
+) -> dict[str, VoxelCell]:
+    most = np.array([np.inf if limit is None else limit for limit in (max_voxels, max_bytes)])
+    sizes = np.array([(len(cell.count), cell.map_bytes) for cell in cells.values()]).reshape(-1, 2)
+    if (sizes.sum(axis=0) <= most).all():
+        return dict(cells)
     keys = list(cells)
     low = np.array([cell.lattice_origin[:2] for cell in cells.values()], np.float64)
     size = np.array([cell.lattice.shape[:2] for cell in cells.values()], np.float64)
     middle = (low + size / 2) * next(iter(cells.values())).leaf
     target = np.array(centre) if centre is not None else middle.mean(axis=0)
-    chosen: set[str] = set()
-    count = 0
-    for index in np.argsort(((middle - target) ** 2).sum(axis=1), kind="stable"):
-        size_here = len(cells[keys[index]].count)
-        if count + size_here > max_voxels:
-            break
-        count += size_here
-        chosen.add(keys[index])
-    return {key: cell for key, cell in cells.items() if key in chosen}, total - count
+    nearest = np.argsort(((middle - target) ** 2).sum(axis=1), kind="stable")
+    fits = (np.cumsum(sizes[nearest], axis=0) <= most).all(axis=1)
+    chosen = {keys[index] for index in nearest[np.logical_and.accumulate(fits)]}
+    return {key: cell for key, cell in cells.items() if key in chosen}
 
 
 def _directory(
