@@ -8,6 +8,7 @@ import argparse
 from shmmap_clients.command_line import finite, not_negative, positive
 
 __all__ = [
+    "Parser",
     "add_backend_option",
     "add_height_option",
     "add_leaf_option",

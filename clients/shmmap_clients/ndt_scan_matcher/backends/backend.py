@@ -23,9 +23,14 @@ class Backend(Protocol):
     One object serves one thread at a time.
     """
 
-    name: str
-    on_device: bool
-    """Whether the work is done elsewhere than in the threads of this process."""
+    @property
+    def name(self) -> str:
+        """As in `BACKENDS`."""
+
+    @property
+    def on_device(self) -> bool:
+        """Whether the work is done elsewhere than in the threads of this process."""
+
     most_map_bytes: int
     """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
 

@@ -26,8 +26,8 @@ class DeviceOptions:
     precision
         ``"auto"``: double where the device has it.
     memory
-        ``"svm"``: shared segments are read where they lie; ``"copy"``: each cell is copied once to the device;
-        ``"auto"``: the first where the device says that it can (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
+        ``"svm"``: shared segments are read where they lie; ``"copy"``: each cell is copied to the device
+        once; ``"auto"``: the first where the device says that it can (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
     """
 
     device: str | None = None

@@ -113,7 +113,11 @@ class FallbackBackend:
         """Return the evaluations of many poses."""
         return self._trying(
             lambda backend: backend.evaluate_many(
-                poses, neighbors=neighbors, covariance=covariance, pitch_sign=pitch_sign, deadline_s=deadline_s
+                poses,
+                neighbors=neighbors,
+                covariance=covariance,
+                pitch_sign=pitch_sign,
+                deadline_s=deadline_s,
             )
         )
 

@@ -99,15 +99,15 @@ class OpenclBackend:
         self.pool = MapPool(self._context, device, capacity)
 
     def _room_for_maps(self) -> int:
-        """Return the most bytes that a map may have: as limited, or what one buffer of the device holds twice."""
+        """Return the most bytes that a map may have: as limited, or half of the largest buffer."""
         wanted = self._limits.most_map_bytes
         if self.device.in_place:
             return wanted
         room = self.device.info.most_bytes // 2 - _TABLES_BYTES
         if room <= 0:
             raise DeviceMemory(
-                f"device {self.device.info.name!r} allocates at most {self.device.info.most_bytes} bytes at once,"
-                " too little for a map"
+                f"device {self.device.info.name!r} allocates at most {self.device.info.most_bytes} bytes at"
+                " once, too little for a map"
             )
         return min(wanted, room)
 
@@ -200,7 +200,9 @@ class OpenclBackend:
             with np.errstate(invalid="ignore"):
                 places[:] = np.floor(translation * (1.0 / self._map.leaf)).clip(-(2**30), 2**30)
             translation = translation - places * self._map.leaf
-        records[:, :12] = np.concatenate([matrices[:, :3, :3], translation[:, :, None]], axis=2).reshape(-1, 12)
+        records[:, :12] = np.concatenate([matrices[:, :3, :3], translation[:, :, None]], axis=2).reshape(
+            -1, 12
+        )
         records[:, 12:39] = derivatives[:, :3].reshape(-1, 27)
         cl, queue, device = self._cl, self._queue, self.device
         rows = self._rows[: number * chunks]

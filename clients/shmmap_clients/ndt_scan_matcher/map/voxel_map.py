@@ -19,7 +19,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, voxel_covariances
+from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
 
 __all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
@@ -46,6 +46,8 @@ class VoxelMap:
         (x, y), metres, map frame; by default the middle of all cells.
     previous
         A map whose derived tables are used again for the cells that both have.
+    derived
+        Inverse covariances, by a cell's key and their kind, that were computed elsewhere.
 
     Raises
     ------
@@ -61,6 +63,7 @@ class VoxelMap:
         max_bytes: int | None = None,
         centre: tuple[float, float] | None = None,
         previous: VoxelMap | None = None,
+        derived: Mapping[str, Inverses] | None = None,
     ) -> None:
         leaves = {cell.leaf for cell in cells.values()}
         if len(leaves) > 1:
@@ -73,9 +76,9 @@ class VoxelMap:
         self.voxels_left_out = sum(len(cell.count) for cell in left)
         self.bytes_left_out = sum(cell.map_bytes for cell in left)
         self.origins = np.array([cell.origin for cell in kept.values()]).reshape(-1, 3)
-        self._derived: dict[str, Inverses] = {}
+        self._derived: dict[str, Inverses] = {key: dict(known) for key, known in (derived or {}).items()}
         if previous is not None:
-            self._derived = {
+            self._derived |= {
                 key: previous._derived[key]
                 for key, cell in kept.items()
                 if previous.cells.get(key) is cell and key in previous._derived
@@ -90,6 +93,8 @@ class VoxelMap:
             return cell.inverse
         derived = self._derived.setdefault(key, {})
         if covariance not in derived:
+            from shmmap import voxel_covariances
+
             derived[covariance] = voxel_covariances(cell.count, cell.scatter, covariance)[1]
         return derived[covariance]
 

@@ -14,7 +14,7 @@ from shmmap import BadRequest
 
 __all__ = ["VOXEL_BYTES", "Cut", "Limits", "check_batch"]
 
-VOXEL_BYTES: Final = 96  # 72 for the Gaussian, the rest for the lattice: enough where cells are as of a street
+VOXEL_BYTES: Final = 96  # 72 for the Gaussian, the rest for the lattice of a street
 _MOST_POSES: Final = 65_536
 
 
@@ -96,5 +96,17 @@ class Cut:
     map_bytes: int = 0
     deadline: bool = False
 
+    @property
+    def by(self) -> tuple[str, ...]:
+        """Names of the limits that left something out; a cell left out counts for both of its limits."""
+        left = {
+            "points": self.points,
+            "neighbors": self.neighbor_points,
+            "voxels": self.voxels,
+            "map_bytes": self.map_bytes,
+            "deadline": self.deadline,
+        }
+        return tuple(name for name, count in left.items() if count)
+
     def __bool__(self) -> bool:
-        return bool(self.points or self.neighbor_points or self.voxels or self.map_bytes or self.deadline)
+        return bool(self.by)

@@ -250,7 +250,7 @@ class NdtMatcher:
             for number, at in self._evaluated(wanted, rule.variant, deadline_s):
                 pose = wanted[number][0]
                 if regularization is not None:
-                    at = regularization.applied(at, pose)  # noqa: PLW2901
+                    at = regularization.applied(at, pose)
                 try:
                     wanted[number] = climbs[number].send(at)
                 except StopIteration:

@@ -58,12 +58,12 @@ def search_step(
     """
     search = line_search(first, step_min, step_max, phi_0, slope_0, by_upper_end=by_upper_end)
     a = next(search)
-    while True:
-        try:
+    try:
+        while True:
             a = search.send(phi(a))
-        except StopIteration as ended:
-            found: tuple[float, int] = ended.value
-            return found
+    except StopIteration as ended:
+        found: tuple[float, int] = ended.value
+        return found
 
 
 def line_search(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -92,11 +93,10 @@ def ascend(
     ascent = started(T_guess)
     way = climb(ascent, rule, step_of)
     asked = next(way)
-    while True:
-        try:
+    with suppress(StopIteration):
+        while True:
             asked = way.send(evaluate(*asked))
-        except StopIteration:
-            return ascent
+    return ascent
 
 
 def climb(ascent: Ascent, rule: StepRule, step_of: Step = numpy_step) -> Climb:
@@ -140,9 +140,7 @@ def _take_step(
     direction: NDArray[np.float64],
     rule: StepRule,
     longest: float,
-) -> Generator[
-    tuple[NDArray[np.float64], float], Evaluation, tuple[float, NDArray[np.float64], Evaluation]
-]:
+) -> Generator[tuple[NDArray[np.float64], float], Evaluation, tuple[float, NDArray[np.float64], Evaluation]]:
     """Return the step's length and direction, and the evaluation where it ends."""
     sign = rule.variant.pitch_sign
     slope = -float(at.gradient @ direction)

@@ -103,10 +103,9 @@ def evaluations_of(rows: NDArray[np.floating], derivatives: NDArray[np.float64])
         As `derivatives_of_poses` gives them.
     """
     number, chunks, width = rows.shape
+    sums = np.zeros((number, width))
     if chunks:
         sums = np.add.accumulate(rows, axis=1, dtype=np.float64)[:, -1]
-    else:
-        sums = np.zeros((number, width))
     contracted = (derivatives.reshape(-1, 9, 9) * sums[:, None, AX]).sum(axis=2)
     gradients = np.concatenate([sums[:, A], contracted[:, :3]], axis=1)
     parts = np.concatenate([sums[:, B], sums[:, BJ], sums[:, JBJ] + contracted[:, 3:]], axis=1)

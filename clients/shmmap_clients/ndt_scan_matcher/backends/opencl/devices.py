@@ -10,13 +10,13 @@ from typing import Any, Final
 from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import NoDevice
 
-__all__ = ["Device", "DeviceInfo", "choose_device", "list_devices"]
+__all__ = ["NO_DRIVER_HINT", "Device", "DeviceInfo", "choose_device", "list_devices"]
 
 _VARIABLE: Final = "SHMMAP_OPENCL_DEVICE"
-_NO_DRIVER_HINT: Final = (
-    "`apt install pocl-opencl-icd` brings one for processors, the vendor's package one for its GPU; in a container"
-    " also /etc/OpenCL/vendors must have the driver's .icd file; PoCL without a cache directory that it can write"
-    " (POCL_CACHE_DIR) shows no device"
+NO_DRIVER_HINT: Final = (
+    "`apt install pocl-opencl-icd` brings one for processors, the vendor's package one for its GPU; in a"
+    " container, /etc/OpenCL/vendors must have the driver's .icd file, too; PoCL without a cache directory"
+    " that it can write (POCL_CACHE_DIR) shows no device"
 )
 _PREFERENCE: Final = ("GPU", "accelerator", "CPU", "other")
 
@@ -117,19 +117,22 @@ def choose_device(options: DeviceOptions) -> Device:
     """
     found = _found()
     if not found:
-        raise NoDevice("no OpenCL device: no driver is installed, or none of them has a device", hint=_NO_DRIVER_HINT)
+        raise NoDevice(
+            "no OpenCL device: no driver is installed, or none of them has a device", hint=NO_DRIVER_HINT
+        )
     wanted = options.device if options.device is not None else os.environ.get(_VARIABLE) or None
     info, handle = _first_preferred(found) if wanted is None else _named(found, wanted)
     if info.unusable:
         raise NoDevice(f"device {info.name!r} cannot be used: {info.unusable}")
     if options.precision == "double" and not info.fp64:
         raise NoDevice(
-            f"device {info.name!r} has no double precision (cl_khr_fp64)", hint="--precision float asks for less"
+            f"device {info.name!r} has no double precision (cl_khr_fp64)",
+            hint="--precision float asks for less",
         )
     double = info.fp64 if options.precision == "auto" else options.precision == "double"
     if options.memory == "svm" and not double:
         raise NoDevice(
-            "segments have double precision: they cannot be read in place by a program that computes with floats",
+            "segments have double precision: a program that computes with floats cannot read them in place",
             hint="--memory copy, or --precision double",
         )
     in_place = double and (options.memory == "svm" or (options.memory == "auto" and info.svm_system))
@@ -150,7 +153,9 @@ def _first_preferred(found: list[tuple[DeviceInfo, Any]]) -> tuple[DeviceInfo, A
 
 
 def _found() -> list[tuple[DeviceInfo, Any]]:
-    os.environ.setdefault("PYOPENCL_NO_CACHE", "1")  # a cache of its own, which fails where it cannot be written
+    os.environ.setdefault(
+        "PYOPENCL_NO_CACHE", "1"
+    )  # a cache of its own, which fails where it cannot be written
     import pyopencl as cl
 
     try:
@@ -164,9 +169,7 @@ def _found() -> list[tuple[DeviceInfo, Any]]:
         except cl.Error:
             continue
         found += [(platform, handle) for handle in handles]
-    return [
-        (_info(cl, index, platform, handle), handle) for index, (platform, handle) in enumerate(found)
-    ]
+    return [(_info(cl, index, platform, handle), handle) for index, (platform, handle) in enumerate(found)]
 
 
 def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:

@@ -19,7 +19,12 @@ from shmmap import ShmmapError
 
 __all__ = ["DeviceError", "DeviceHung", "DeviceMemory", "KernelBuildFailed", "NoDevice", "device_errors"]
 
-_OUT_OF_MEMORY = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+_OUT_OF_MEMORY = (
+    "MEM_OBJECT_ALLOCATION_FAILURE",
+    "OUT_OF_RESOURCES",
+    "OUT_OF_HOST_MEMORY",
+    "INVALID_BUFFER_SIZE",
+)
 
 
 class DeviceError(ShmmapError):

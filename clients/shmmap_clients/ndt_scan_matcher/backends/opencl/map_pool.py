@@ -150,8 +150,8 @@ class MapPool:
                 placed = self._place(voxel_map, covariance, tables)
         if placed is None:
             raise DeviceMemory(
-                f"a map of {voxel_map.voxels} voxels takes more than the {self.capacity / 1e6:.0f} MB that device"
-                f" {self._device.info.name!r} has for maps",
+                f"a map of {voxel_map.voxels} voxels takes more than the {self.capacity / 1e6:.0f} MB that"
+                f" device {self._device.info.name!r} has for maps",
                 hint="VoxelMap(max_bytes=...) or --max-map-bytes leave out what is too much",
             )
         return placed
@@ -175,9 +175,9 @@ class MapPool:
         if self._device.in_place:
             table = voxel_map.table(covariance)
         else:
-            table = np.array(
-                [_row(cell) for cell in voxel_map.cells.values()], np.int64
-            ).reshape(-1, TABLE_COLUMNS)
+            table = np.array([_row(cell) for cell in voxel_map.cells.values()], np.int64).reshape(
+                -1, TABLE_COLUMNS
+            )
             for key in voxel_map.cells:
                 voxel_map.inverses(key, covariance)
         return [table, voxel_map.origins, voxel_map.column_start, voxel_map.column_cell]
@@ -211,7 +211,9 @@ class MapPool:
         parts: list[tuple[int, list[NDArray[np.generic]]]] = []
         for (at, part), block in new.items():
             if part.startswith("tables "):
-                parts += [(block.offset + start, [table]) for start, table in zip(starts, tables, strict=False)]
+                parts += [
+                    (block.offset + start, [table]) for start, table in zip(starts, tables, strict=False)
+                ]
             elif part == "voxels":
                 parts.append((block.offset, self._voxels(voxel_map.cells[names[at]])))
             else:
@@ -284,7 +286,11 @@ def _stretches(
     """Group what lies side by side, but for the roundings, into pieces that are staged at once."""
     found: list[list[tuple[int, list[NDArray[np.generic]]]]] = []
     for part in sorted(parts, key=lambda one: one[0]):
-        if found and part[0] <= rounded(_end(found[-1][-1])) and _end(part) - found[-1][0][0] <= _STRETCH_BYTES:
+        if (
+            found
+            and part[0] <= rounded(_end(found[-1][-1]))
+            and _end(part) - found[-1][0][0] <= _STRETCH_BYTES
+        ):
             found[-1].append(part)
         else:
             found.append([part])
