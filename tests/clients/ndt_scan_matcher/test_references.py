@@ -43,20 +43,36 @@ def usable(row: dict[str, Any]) -> bool:
     return "DIRECT26" not in row["name"] and "ls=1" not in row["name"]
 
 
-def align(folder: Path, row: dict[str, Any], backend: str) -> Result:
-    search = next(ours for theirs, ours in SEARCH.items() if theirs in row["name"])
+def settings_of(
+    row: dict[str, Any],
+) -> tuple[Settings, NDArray[np.float64], int, NDArray[np.float64], float]:
+    """What a reference was aligned with: settings and guess; and its iterations, pose and score."""
+    if "program" in row:
+        settings = Settings(
+            "autoware" if row["program"] == "autoware" else "pclomp",
+            row["neighbors"],
+            epsilon=row["epsilon"],
+            max_iterations=row["max_iterations"],
+        )
+        guess, T = np.array(row["guess"]), np.array(row["T"]).reshape(3, 4)
+        return settings, matrix_from_pose(guess), row["iterations"], T, row["transform_probability"]
     settings = Settings(
         "autoware" if row["name"].startswith("autoware") else "pclomp",
-        search,  # type: ignore[arg-type]
+        next(ours for theirs, ours in SEARCH.items() if theirs in row["name"]),  # type: ignore[arg-type]
         epsilon=row["eps"],
         max_iterations=row["max_iter"],
         step_size=row["step_size"],
     )
     x, y, z, yaw = row["guess_xyz_yaw"]
+    guess = matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw]))
+    return settings, guess, row["iters"], np.array(row["T"]), row["tp"]
+
+
+def align(folder: Path, row: dict[str, Any], backend: str) -> Result:
+    settings, guess, *_ = settings_of(row)
     with NdtMatcher(settings, backend=backend) as matcher:
         matcher.set_map(target(folder, row["dataset"], row["leaf"]))
-        scan = clouds(folder, row["dataset"])[1]
-        return matcher.align(scan, matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw])))
+        return matcher.align(clouds(folder, row["dataset"])[1], guess)
 
 
 @pytest.mark.parametrize("backend", ["numba", "numpy"])
@@ -82,17 +98,7 @@ def test_alignments_equal_the_originals_at_other_leaf_sizes_and_guesses(data_dir
     folder = data_dir / "ndt"
     rows = json.loads(Path(__file__).with_name("reference_alignments.json").read_text(encoding="utf-8"))
     for row in rows["alignments"]:
-        settings = Settings(
-            "autoware" if row["program"] == "autoware" else "pclomp",
-            row["neighbors"],
-            epsilon=row["epsilon"],
-            max_iterations=row["max_iterations"],
-        )
-        with NdtMatcher(settings) as matcher:
-            matcher.set_map(target(folder, row["dataset"], row["leaf"]))
-            result = matcher.align(
-                clouds(folder, row["dataset"])[1], matrix_from_pose(np.array(row["guess"]))
-            )
+        result = align(folder, row, "numba")
         T = np.array(row["T"]).reshape(3, 4)
         what = str({name: value for name, value in row.items() if name != "T"})
         assert result.iterations == row["iterations"], what

@@ -7,7 +7,6 @@ launch.  All buffers are made once, as large as the limits allow.
 
 from __future__ import annotations
 
-import ctypes
 import math
 from typing import Any, Final
 
@@ -113,9 +112,6 @@ class OpenclBackend:
 
     def close(self) -> None:
         """Give back the device's memory; what a hung device still uses stays until the process ends."""
-        if self._running is not None and self._running.command_execution_status > 0:
-            _abandon(self)
-            return
         self._running = None
         self._kernels.clear()
         self._arguments.clear()
@@ -208,12 +204,14 @@ class OpenclBackend:
         rows = self._rows[: number * chunks]
         items = (chunks, number) if device.is_processor else (chunks * CHUNK_POINTS, number)
         with device_errors(device.info.name, "evaluate"):
+            # who lets go of a copy's event waits for it: they are kept until all is done
+            inputs = [cl.enqueue_copy(queue, self._poses_buffer, records, is_blocking=False)]
             if self._source_is_new:
-                cl.enqueue_copy(queue, self._source_buffer, self._source.points, is_blocking=False)
+                points_here = self._source.points
+                inputs.append(cl.enqueue_copy(queue, self._source_buffer, points_here, is_blocking=False))
                 self._source_is_new = False
-            cl.enqueue_copy(queue, self._poses_buffer, records, is_blocking=False)
             if not device.double:
-                cl.enqueue_copy(queue, self._places_buffer, places, is_blocking=False)
+                inputs.append(cl.enqueue_copy(queue, self._places_buffer, places, is_blocking=False))
             cl.enqueue_nd_range_kernel(
                 queue, kernel, items, (1, 1) if device.is_processor else (CHUNK_POINTS, 1)
             )
@@ -221,6 +219,7 @@ class OpenclBackend:
             queue.flush()
             self._waiting.until(self._running, deadline_s)
         self._running = None
+        inputs.clear()
         return evaluations_of(rows.reshape(number, chunks, SUMS), derivatives)
 
     def _check_idle(self) -> None:
@@ -266,9 +265,3 @@ class OpenclBackend:
         )
         self._arguments[neighbors] = (placed, points)
         return kernel
-
-
-def _abandon(backend: OpenclBackend) -> None:
-    """Never free what a hung device still uses: freeing it would wait for the device."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(backend))
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(backend.__dict__))

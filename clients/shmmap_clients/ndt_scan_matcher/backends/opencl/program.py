@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any, Final
 
@@ -41,7 +42,9 @@ def build_options(device: Device, neighbors: Neighbors, most: int) -> list[str]:
     return ["-cl-std=CL1.2", *(f"-D{name}={value}" for name, value in macros.items())]
 
 
-def build_kernel(context: Any, device: Device, neighbors: Neighbors, most: int, source: str = "") -> Any:
+def build_kernel(
+    context: Any, device: Device, neighbors: Neighbors, most: int, *, extra: Sequence[str] = ()
+) -> Any:
     """Return the kernel for a device, a new one; drivers keep what they have built, and build once.
 
     Parameters
@@ -50,8 +53,8 @@ def build_kernel(context: Any, device: Device, neighbors: Neighbors, most: int, 
         Of the device.
     device, neighbors, most
         As in `build_options`.
-    source
-        Another source than `kernel_source`.
+    extra
+        More options for the driver's compiler.
 
     Raises
     ------
@@ -60,9 +63,9 @@ def build_kernel(context: Any, device: Device, neighbors: Neighbors, most: int, 
     """
     import pyopencl as cl
 
-    program = cl.Program(context, source or kernel_source())
+    program = cl.Program(context, kernel_source())
     try:
-        built = program.build(build_options(device, neighbors, most), devices=[device.handle])
+        built = program.build([*build_options(device, neighbors, most), *extra], devices=[device.handle])
     except cl.Error as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         told = next((line for line in lines if "error" in line.lower() and "clBuild" not in line), lines[0])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import time
 from typing import Any, Final
 
@@ -55,6 +56,7 @@ class Waiting:
             time.sleep(min(0.6 * self._usual_s, max(latest_s - began_s, 0.0)))
         while not _ended(event):
             if time.monotonic() >= latest_s:
+                _never_free(event)
                 raise DeviceHung(
                     f"device {self._device!r} has not answered within {time.monotonic() - began_s:.3f} s",
                     hint="a higher --deadline gives it more time; --fallback numba goes on without it",
@@ -69,3 +71,8 @@ class Waiting:
 
 def _ended(event: Any) -> bool:
     return bool(event.command_execution_status <= 0)  # CL_COMPLETE is 0, an error is negative
+
+
+def _never_free(event: Any) -> None:
+    """Keep an event for ever: who frees one of a hung device waits for the device, even at the process's end."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))
