@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The OpenCL backend gives what the compiled one gives: sums, alignments, bits; on processors and as on GPUs."""
+"""The OpenCL backend gives what the compiled one gives: sums, alignments, bits."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ def add_parser(subparsers: Any) -> None:
         "device-check",
         run,
         help="compare devices with the processor, and time them",
-        description="Compare what each OpenCL device computes with what numpy computes: scores and derivatives,"
-        " whole alignments in a generated town, repeats bit for bit; and measure how long it takes.  The"
+        description="Compare what each OpenCL device computes with what numpy computes: scores and"
+        " derivatives, whole alignments in a generated town, repeats bit for bit; and measure how long it takes.  The"
         " report belongs to any report of a defect on a device.",
         epilog=_JSON,
     )
@@ -155,8 +155,7 @@ def _checked(info: DeviceInfo, scenes: list[Scene], known: dict[str, Result]) ->
         try:
             for scene in scenes:
                 checks: list[Check] = check_alignments(scene, device, known)
-                for most in (32, 2):
-                    checks.append(check_evaluations(scene, device, most))
+                checks += [check_evaluations(scene, device, most) for most in (32, 2)]
                 checks.append(check_repeats(scene, device))
                 entry["latencies"][scene.name] = latencies(scene, device)
                 for check in checks:

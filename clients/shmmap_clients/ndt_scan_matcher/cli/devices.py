@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
         "devices",
         run,
         help="list the devices for --backend opencl",
-        description="List the OpenCL devices of this machine: what they can do, and whether they can be used.",
+        description="List the OpenCL devices of this machine: what they can do, whether they can be used.",
         epilog=_JSON,
     )
     add_allow_empty(parser)

@@ -18,8 +18,8 @@ def add_parser(subparsers: Any) -> None:
         "warmup",
         help="compile the kernels and cache them",
         description="Compile the kernels and keep them in numba's cache (NUMBA_CACHE_DIR where it is set), so"
-        " that no program that aligns has to wait for the compiler.  With --backend opencl, build the device's"
-        " programs, which its driver keeps (PoCL in POCL_CACHE_DIR).",
+        " that no program that aligns has to wait for the compiler.  With --backend opencl, build the"
+        " device's programs, which its driver keeps (PoCL in POCL_CACHE_DIR).",
     )
     parser.add_argument(
         "--backend", choices=("numba", "opencl"), default="numba", help="whose kernels (default: numba)"

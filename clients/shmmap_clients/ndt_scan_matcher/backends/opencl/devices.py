@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.opencl.drivers import make_drivers_known
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import NoDevice
 
 __all__ = ["NO_DRIVER_HINT", "Device", "DeviceInfo", "choose_device", "list_devices"]
@@ -156,6 +157,7 @@ def _found() -> list[tuple[DeviceInfo, Any]]:
     os.environ.setdefault(
         "PYOPENCL_NO_CACHE", "1"
     )  # a cache of its own, which fails where it cannot be written
+    make_drivers_known()
     import pyopencl as cl
 
     try:

@@ -74,5 +74,5 @@ def _ended(event: Any) -> bool:
 
 
 def _never_free(event: Any) -> None:
-    """Keep an event for ever: who frees one of a hung device waits for the device, even at the process's end."""
+    """Keep an event for ever: who frees one of a hung device waits for it, even when the process ends."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))
