@@ -33,7 +33,7 @@ def hang() -> None:
     """Let every program that is built from now on never end."""
     source = program.kernel_source()
     assert source.count(_BEGIN) == 1
-    program.kernel_source = lambda: source.replace(_BEGIN, _SPIN + _BEGIN)  # type: ignore[assignment]
+    program.kernel_source = lambda: source.replace(_BEGIN, _SPIN + _BEGIN)
 
 
 def align(deadline_s: float, fallback: str | None) -> None:
@@ -49,7 +49,7 @@ def align(deadline_s: float, fallback: str | None) -> None:
         try:
             result = matcher.align(scan, matrix_from_pose(pose + 0.05))
         except DeviceError as error:
-            said = {"error": error.code}
+            said: dict[str, object] = {"error": error.code}
         else:
             said = {"converged": result.converged, "late": result.cut.deadline}
         fault = None if matcher.fault is None else matcher.fault.code

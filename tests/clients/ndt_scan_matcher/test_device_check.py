@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ndt device-check``: equal devices pass, others do not, and it runs with numpy and pyopencl alone."""
+"""``shmmap-ndt device-check``: equal devices pass, others do not; numpy and pyopencl are all it needs."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def test_scenes_come_back_from_their_file(packed: Path) -> None:
         np.testing.assert_array_equal(scene.voxel_map.cells[key].lattice, cell.lattice)
         for covariance in ("autoware", "pclomp", "pcl"):
             np.testing.assert_array_equal(
-                scene.voxel_map.inverses(key, covariance),  # type: ignore[arg-type]
-                fresh.inverses(key, covariance),  # type: ignore[arg-type]
+                scene.voxel_map.inverses(key, covariance),
+                fresh.inverses(key, covariance),
             )
     with pytest.raises(shmmap.MapMissing):
         load_scenes(packed.with_name("none.npz"))

@@ -197,7 +197,7 @@ def test_alignments_take_the_same_way(
     guess = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]) + np.r_[moved, 0, 0, 0])
     for mode in ("single", "coarse_fine"):
         for neighbors in ("direct1", "direct7", "radius"):
-            settings = Settings(variant, neighbors, mode=mode)  # type: ignore[arg-type]
+            settings = Settings(variant, neighbors, mode=mode)
             wanted = aligned(settings, voxel_map, scan, guess)
             for options in (COPY, SVM):
                 found = aligned(replace(settings, backend="opencl", device=options), voxel_map, scan, guess)
@@ -250,7 +250,7 @@ def test_the_program_builds_without_a_warning(
     as_if(monkeypatch, kind=kind_of_device)
     backend = OpenclBackend(Limits(), options=COPY if double else FLOAT)
     for neighbors in ("direct1", "direct7", "radius"):
-        kernel = build_kernel(backend._context, backend.device, neighbors, 32, extra=["-Werror"])  # type: ignore[arg-type]
+        kernel = build_kernel(backend._context, backend.device, neighbors, 32, extra=["-Werror"])
         program = kernel.program
         assert program.get_build_info(backend.device.handle, cl.program_build_info.LOG).strip() == ""
 

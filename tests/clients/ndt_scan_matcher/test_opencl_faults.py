@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, NdtMatcher, Settings, VoxelMap
+from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, NdtMatcher, Settings, VoxelMap, voxel_cell
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
 from shmmap_clients.ndt_scan_matcher.backends.fallback_backend import FallbackBackend
 from shmmap_clients.ndt_scan_matcher.backends.opencl import devices, program
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import choose_device, list_devices
@@ -209,23 +210,25 @@ def test_maps_that_do_not_fit_side_by_side_take_turns(points: NDArray[np.float64
 
 def test_a_pool_in_pieces_is_laid_out_anew(points: NDArray[np.float64]) -> None:
     scan = scan_from(points, TRUTH, 300)
-    cells = cells_of(points, 2.0, edge=5.0)
-    size = sum(cell.map_bytes + 128 for cell in cells.values())
-    backend = OpenclBackend(Limits(source_points=300), options=COPY)
-    backend.pool = MapPool(backend._context, backend.device, int(1.1 * size))
-    backend.set_source(scan)
+    cells = sorted(cells_of(points, 2.0, edge=5.0).items(), key=lambda item: item[1].map_bytes)
+    a, b, large = cells[-3:]
+    # one voxel: less than any piece of another cell, or a map's tables, would go where it was
+    small = voxel_cell(np.random.default_rng(1).normal(1.0, 0.1, (50, 3)), 2.0)
+    first, second = VoxelMap(dict([a, ("small", small), b])), VoxelMap(dict([a, b, large]))
     free = OpenclBackend(Limits(source_points=300), options=COPY)
-    free.set_source(scan)
-    rng = np.random.default_rng(8)
-    for _ in range(30):
-        chosen = rng.permutation(len(cells))[: int(rng.integers(len(cells) // 2, len(cells)))]
-        names = [name for number, name in enumerate(cells) if number in chosen]
-        voxel_map = VoxelMap({name: cells[name] for name in names})
-        backend.prepare(voxel_map, **HOW)
+    free.prepare(second, **HOW)
+    needed = free.pool.used_bytes
+    backend = OpenclBackend(Limits(source_points=300), options=COPY)
+    # the second map fits exactly, but not where the small cell was, with the others in their places
+    backend.pool = MapPool(backend._context, backend.device, needed)
+    for one in (backend, free):
+        one.set_source(scan)
+    for voxel_map in (first, second, first):
         for one in (backend, free):
+            one.prepare(voxel_map, **HOW)
             one.set_map(voxel_map)
         assert backend.evaluate(TRUTH, **HOW).score == free.evaluate(TRUTH, **HOW).score
-    assert backend.pool.statistics.laid_out_anew > 0
+    assert backend.pool.statistics.laid_out_anew == 1
     assert free.pool.statistics.laid_out_anew == 0
 
 
@@ -288,8 +291,9 @@ class Failing:
     on_device = True
     most_map_bytes = 1_000
 
-    def __init__(self, calls: int) -> None:
+    def __init__(self, calls: int, real: Backend) -> None:
         self._left = calls
+        self.real = real
 
     def __getattr__(self, name: str) -> Any:
         def call(*arguments: Any, **options: Any) -> Any:
@@ -306,9 +310,8 @@ def test_wherever_a_device_fails_the_fallback_goes_on(points: NDArray[np.float64
     from shmmap_clients.ndt_scan_matcher.backends.numpy_backend import NumpyBackend
 
     limits = Limits(source_points=300)
-    failing = Failing(calls)
-    failing.real = NumpyBackend(limits)
-    backend = FallbackBackend(failing, NumpyBackend(limits))  # type: ignore[arg-type]
+    failing: Any = Failing(calls, NumpyBackend(limits))
+    backend = FallbackBackend(failing, NumpyBackend(limits))
     assert backend.most_map_bytes == 1_000
     plain = NumpyBackend(limits)
     voxel_map, scan = map_of(points, 2.0), scan_from(points, TRUTH, 400)

@@ -19,10 +19,11 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
     voxel_cell,
 )
+from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 
 from shmmap import read_cloud
 
-SEARCH = {"KDTREE": "radius", "DIRECT7": "direct7", "DIRECT1": "direct1"}
+SEARCH: dict[str, Neighbors] = {"KDTREE": "radius", "DIRECT7": "direct7", "DIRECT1": "direct1"}
 
 
 @cache
@@ -58,7 +59,7 @@ def settings_of(
         return settings, matrix_from_pose(guess), row["iterations"], T, row["transform_probability"]
     settings = Settings(
         "autoware" if row["name"].startswith("autoware") else "pclomp",
-        next(ours for theirs, ours in SEARCH.items() if theirs in row["name"]),  # type: ignore[arg-type]
+        next(ours for theirs, ours in SEARCH.items() if theirs in row["name"]),
         epsilon=row["eps"],
         max_iterations=row["max_iter"],
         step_size=row["step_size"],

@@ -39,8 +39,8 @@ def add_parser(subparsers: Any) -> None:
         run,
         help="compare devices with the processor, and time them",
         description="Compare what each OpenCL device computes with what numpy computes: scores and"
-        " derivatives, whole alignments in a generated town, repeats bit for bit; and measure how long it takes.  The"
-        " report belongs to any report of a defect on a device.",
+        " derivatives, whole alignments in a generated town, repeats bit for bit; and measure how long it"
+        " takes.  The report belongs to any report of a defect on a device.",
         epilog=_JSON,
     )
     parser.add_argument(

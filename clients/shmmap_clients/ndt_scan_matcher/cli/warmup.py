@@ -49,6 +49,6 @@ def _build_programs(args: argparse.Namespace, begin: float) -> int:
 
     device = device_options_from(args)
     for search in ("radius", "direct7", "direct1"):
-        warmup_alignment(Settings(neighbors=search, backend="opencl", device=device))  # type: ignore[arg-type]
+        warmup_alignment(Settings(neighbors=search, backend="opencl", device=device))
     print(f"programs built, or loaded from the driver's cache, in {time.monotonic() - begin:.1f} s")
     return 0
