@@ -158,15 +158,12 @@ class MapPool:
 
     def _forget(self) -> None:
         """Give back what neither the map in use nor the next one needs."""
-        kept = {id(one) for one in (self._current, self._latest) if one is not None}
-        self._placed = {key: placed for key, placed in self._placed.items() if key[0] in kept}
-        needed: set[_Key] = set()
-        for (_, covariance), placed in self._placed.items():
-            needed.add((id(placed.voxel_map), f"tables {covariance}"))
-            if not self._device.in_place:
-                for cell in placed.voxel_map.cells.values():
-                    needed |= {(id(cell), "voxels"), (id(cell), covariance)}
-        for key in self._blocks.keys() - needed:
+        kept = [one for one in (self._current, self._latest) if one is not None]
+        maps = {id(one) for one in kept}
+        self._placed = {key: placed for key, placed in self._placed.items() if key[0] in maps}
+        needed = {(at, f"tables {covariance}") for at, covariance in self._placed}
+        cells = {id(cell) for one in kept for cell in one.cells.values()}
+        for key in [key for key in self._blocks if key not in needed and key[0] not in cells]:
             block = self._blocks.pop(key)
             self._free.give(block.offset, block.nbytes)
 
