@@ -7,7 +7,7 @@
     ├── NoDevice           no driver, no such device, or it cannot do what was asked
     ├── KernelBuildFailed  the driver refuses the program
     ├── DeviceMemory       the device has not the memory that the limits ask for
-    └── DeviceHung         it did not answer in time; also a `TimeoutError`
+    └── DeviceHung         it did not answer in time
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class DeviceMemory(DeviceError):
     code = "device_memory"
 
 
-class DeviceHung(DeviceError, TimeoutError):
+class DeviceHung(DeviceError):
     """The device did not answer in time."""
 
     code = "device_hung"
