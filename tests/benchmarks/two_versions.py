@@ -3,7 +3,7 @@
 
     git worktree add ../other COMMIT
     (cd ../other && python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]')
-    python -m tests.benchmarks.two_versions ../other [warm attach load import status] [--pairs 40]
+    python -m tests.benchmarks.two_versions ../other [warm attach load import status ndt pose] [--pairs 40]
 
 The other checkout has its environment in ``.venv``, as this one has.  Printed are the medians of both, the
 median of the paired ratios (this version to the other), and the ratio that it is below with 95 %
@@ -14,6 +14,9 @@ confidence (bootstrap).  Less than 1: this version is faster.
 - ``load``: the cells of `load_pcd` into segments, one after the other
 - ``import``: CPU time of importing the client
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
+- ``ndt``: CPU time of alignments by numba on one thread: two scans by DIRECT7 and DIRECT1, and Autoware's
+  working point (1500 points, 2 m voxels), its data in the caches, and after 64 MiB of other data
+- ``pose``: wall and CPU time of a first pose among 200 candidates, two threads
 """
 
 from __future__ import annotations
@@ -28,7 +31,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from tests.benchmarks.load_pcd import cloud, cut
+from tests.benchmarks.ndt_clouds import city, scan_pair
 
 __all__ = ["main"]
 
@@ -99,6 +105,35 @@ for line in sys.stdin:
     print(took * 1e6, flush=True)
 os.rmdir(path)
 """
+_NDT = """
+import sys, time
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, voxel_cell
+clouds = np.load(sys.argv[1])
+other = np.ones(8 << 20)
+made = {}
+for name, at, leaf, settings in (
+    ("direct7", "pair", 1.0, Settings("pclomp", "direct7", epsilon=0.1)),
+    ("direct1", "pair", 1.0, Settings("pclomp", "direct1", epsilon=0.1)),
+    ("working", "city", 2.0, Settings()),
+):
+    matcher = NdtMatcher(settings)
+    matcher.set_map(VoxelMap({"map": voxel_cell(clouds[at + "_target"], leaf)}))
+    made[name] = matcher, clouds[at + "_source"], clouds[at + "_guess"]
+print("up", flush=True)
+for line in sys.stdin:
+    name, _, cold = line.strip().partition(" ")
+    matcher, source, guess = made[name]
+    times = []
+    for _ in range(10):
+        if cold:
+            other += 1.0
+        begin = time.process_time()
+        matcher.align(source, guess)
+        times.append(time.process_time() - begin)
+    # the least is what it costs; after other data every one pays
+    print((float(np.median(times)) if cold else min(times)) * 1e6, flush=True)
+"""
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 
 
@@ -168,6 +203,15 @@ def compare(name: str, this: Callable[[], float], other: Callable[[], float], pa
     )
 
 
+def write_clouds(path: str) -> None:
+    """Write what is aligned, for versions of any age."""
+    arrays = {}
+    for pair in (scan_pair(), city()):
+        arrays |= {f"{pair.name}_target": pair.target, f"{pair.name}_source": pair.source}
+        arrays[f"{pair.name}_guess"] = pair.T_guess
+    np.savez(path, **arrays)
+
+
 def served(points: int, begin: str, rounds: int, work: str) -> str:
     """Return a program that measures ``work`` on a daemon of its checkout."""
     return _SERVED.format(points=points, begin=begin.strip(), rounds=rounds, work=work)
@@ -205,6 +249,11 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 paths = cut(cloud(), Path(folder))["binary"]
                 both(_LOAD, {"load": ""}, *paths)
+        elif what == "ndt":
+            asks = {name: name for name in ("direct7", "direct1", "working")}
+            with tempfile.NamedTemporaryFile(suffix=".npz") as file:
+                write_clouds(file.name)
+                both(_NDT, {**asks, "working, cold": "working cold"}, file.name)
         elif what == "import":
             started("import", "-c", _CLIENT)
         elif what == "status":
