@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a point's neighbours come to where they are more than the limit; and the exponential of all of them."""
+"""What a point's neighbours come to where they are more than the limit; and the exponential of all."""
 
 from __future__ import annotations
 

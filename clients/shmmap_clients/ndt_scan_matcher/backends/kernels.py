@@ -62,12 +62,9 @@ def accumulate(
         m100, m101, m102 = M[pose, 1, 0, 0], M[pose, 1, 0, 1], M[pose, 1, 0, 2]
         m110, m111, m112 = M[pose, 1, 1, 0], M[pose, 1, 1, 1], M[pose, 1, 1, 2]
         m120, m121, m122 = M[pose, 1, 2, 0], M[pose, 1, 2, 1], M[pose, 1, 2, 2]
-        m200 = M[pose, 2, 0, 0]
-        m201 = M[pose, 2, 0, 1]
-        m210 = M[pose, 2, 1, 0]
-        m211 = M[pose, 2, 1, 1]
-        m220 = M[pose, 2, 2, 0]
-        m221 = M[pose, 2, 2, 1]
+        m200, m201 = M[pose, 2, 0, 0], M[pose, 2, 0, 1]
+        m210, m211 = M[pose, 2, 1, 0], M[pose, 2, 1, 1]
+        m220, m221 = M[pose, 2, 2, 0], M[pose, 2, 2, 1]
         known = -1  # the cell of which the table's row is at hand
         lattice = mean = inverses = voxels = np.int64(0)
         i0 = j0 = k0 = nk = si = sj = sk = np.int64(0)
@@ -179,8 +176,8 @@ def accumulate(
                 cut_points += 1
                 cut_neighbours += count - most
                 add_nearest(
-                    px, py, pz, i, j, k, table, origins, box, column_start, column_cell, columns, radius2, d1, d2,
-                    near, near_inverse, crowd,
+                    px, py, pz, i, j, k, table, origins, box, column_start, column_cell, columns, radius2,
+                    d1, d2, near, near_inverse, crowd,
                 )  # fmt: skip
                 total = crowd[0]
                 best = crowd[1]

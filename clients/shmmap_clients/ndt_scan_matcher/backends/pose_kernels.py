@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is computed once per pose, compiled: derivatives of its rotation, its sums' contraction, the next step.
+"""What is computed once a pose, compiled: its rotation's derivatives, its sums' contraction, the next step.
 
 In Python these are some hundred small operations an evaluation, and their code is what has left the
 processor's caches by the time of the next scan.
