@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 __all__ = ["add_device_options", "add_scoring_options", "device_options_from", "scoring_settings"]
 
 
-def add_scoring_options(parser: Parser) -> None:
-    """Add ``--backend``, ``--fallback``, ``--threads``, and the options of devices."""
+def add_scoring_options(parser: Parser, *, all_processors: bool = False) -> None:
+    """Add ``--backend``, ``--fallback``, ``--threads`` as `add_threads_option`, and devices' options."""
     parser.add_argument(
         "--backend",
         default="numba",
@@ -30,7 +30,7 @@ def add_scoring_options(parser: Parser) -> None:
         " that is an error)",
     )
     add_device_options(parser)
-    add_threads_option(parser)
+    add_threads_option(parser, all_processors=all_processors)
 
 
 def add_device_options(parser: Parser) -> None:

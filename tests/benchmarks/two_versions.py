@@ -16,7 +16,7 @@ confidence (bootstrap).  Less than 1: this version is faster.
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
 - ``ndt``: CPU time of alignments by numba on one thread: two scans by DIRECT7 and DIRECT1, and Autoware's
   working point (1500 points, 2 m voxels), its data in the caches, and after 64 MiB of other data
-- ``pose``: wall and CPU time of a first pose among 200 candidates, two threads
+- ``pose``: wall and CPU time of a first pose among 200 candidates: one thread without batches, two with
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -134,6 +135,37 @@ for line in sys.stdin:
     # the least is what it costs; after other data every one pays
     print((float(np.median(times)) if cold else min(times)) * 1e6, flush=True)
 """
+_POSE = """
+import shutil, sys, tempfile, time
+from pathlib import Path
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher
+from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
+from shmmap_clients.scans.scan_file import read_scan
+from tests.support.daemon_process import DaemonProcess
+from tests.support.town_drive import make_town_drive
+scratch = tempfile.mkdtemp()
+drive = make_town_drive(Path(scratch), blocks=(3, 3), density=5.0, frames=4, step=15.0)
+one = DaemonProcess(drive.map_dir).start()
+threads = 2 if hasattr(NdtMatcher, "align_many") else 1
+initializer = PoseInitializer(one.endpoint, InitializerRules(height=1.8), threads=threads)
+scans = [read_scan(path) for path in sorted(drive.scans.iterdir())]
+print("up", flush=True)
+for line in sys.stdin:
+    times = []
+    for number, scan in enumerate(scans):
+        x, y, _, _, _, yaw = drive.poses[number]
+        clock = time.process_time if line.strip() == "cpu" else time.perf_counter
+        begin = clock()
+        found = initializer.initialize(scan, RoughPose(x + 1.2, y - 0.9, z=0.0, yaw=yaw + 0.1))
+        times.append(clock() - begin)
+        assert found.reliable and abs(found.T_map_base[0, 3] - x) < 0.3, found.T_map_base
+    print(sum(times) / len(times) * 1e6, flush=True)
+initializer.close()
+one.stop()
+one.dispose()
+shutil.rmtree(scratch)
+"""
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 
 
@@ -205,7 +237,7 @@ def compare(name: str, this: Callable[[], float], other: Callable[[], float], pa
 
 def write_clouds(path: str) -> None:
     """Write what is aligned, for versions of any age."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for pair in (scan_pair(), city()):
         arrays |= {f"{pair.name}_target": pair.target, f"{pair.name}_source": pair.source}
         arrays[f"{pair.name}_guess"] = pair.T_guess
@@ -254,6 +286,8 @@ def main() -> None:
             with tempfile.NamedTemporaryFile(suffix=".npz") as file:
                 write_clouds(file.name)
                 both(_NDT, {**asks, "working, cold": "working cold"}, file.name)
+        elif what == "pose":
+            both(_POSE, {"pose, wall": "wall", "pose, CPU": "cpu"})
         elif what == "import":
             started("import", "-c", _CLIENT)
         elif what == "status":

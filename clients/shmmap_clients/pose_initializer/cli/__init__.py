@@ -82,7 +82,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_thin_option(parser, default=1.0)
     add_leaf_option(parser)
     add_radius_option(parser)
-    add_scoring_options(parser)
+    add_scoring_options(parser, all_processors=True)
     add_allow_empty(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
