@@ -3,7 +3,7 @@
 
     git worktree add ../other COMMIT
     (cd ../other && python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]')
-    python -m tests.benchmarks.two_versions ../other [warm attach load import status ndt pose] [--pairs 40]
+    python -m tests.benchmarks.two_versions ../other [warm attach load import status ndt device pose] [--pairs 40]
 
 The other checkout has its environment in ``.venv``, as this one has.  Printed are the medians of both, the
 median of the paired ratios (this version to the other), and the ratio that it is below with 95 %
@@ -16,12 +16,15 @@ confidence (bootstrap).  Less than 1: this version is faster.
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
 - ``ndt``: CPU time of alignments by numba on one thread: two scans by DIRECT7 and DIRECT1, and Autoware's
   working point (1500 points, 2 m voxels), its data in the caches, and after 64 MiB of other data
+- ``device``: CPU time, of all threads, of the reference alignments in ``SHMMAP_TEST_DATA``, on the first OpenCL
+  device; of a version that knows none, by numba
 - ``pose``: wall and CPU time of a first pose among 200 candidates: one thread without batches, two with
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import statistics
@@ -33,9 +36,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from shmmap_clients.ndt_scan_matcher import pose_from_matrix
 
 from tests.benchmarks.load_pcd import cloud, cut
 from tests.benchmarks.ndt_clouds import city, scan_pair
+from tests.benchmarks.street_data import data_dir
 
 __all__ = ["main"]
 
@@ -134,6 +139,31 @@ for line in sys.stdin:
         times.append(time.process_time() - begin)
     # the least is what it costs; after other data every one pays
     print((float(np.median(times)) if cold else min(times)) * 1e6, flush=True)
+"""
+_DEVICE = """
+import json, sys, time
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose, voxel_cell
+cases = json.load(open(sys.argv[1]))
+clouds = np.load(sys.argv[2])
+options = {"backend": "opencl"} if hasattr(NdtMatcher, "align_many") else {}
+maps, matchers = {}, []
+for case in cases:
+    key = case["dataset"], case["leaf"]
+    if key not in maps:
+        maps[key] = VoxelMap({"map": voxel_cell(clouds[case["dataset"] + " target"], case["leaf"])})
+    matcher = NdtMatcher(Settings(**case["settings"], **options))
+    matcher.set_map(matcher.prepare(maps[key]))
+    matchers.append((matcher, clouds[case["dataset"] + " source"], matrix_from_pose(np.array(case["guess"]))))
+print("up", flush=True)
+for line in sys.stdin:
+    least = np.full(len(matchers), np.inf)
+    for _ in range(3):
+        for number, (matcher, source, guess) in enumerate(matchers):
+            begin = time.process_time()
+            matcher.align(source, guess)
+            least[number] = min(least[number], time.process_time() - begin)
+    print(float(least.sum()) * 1e6, flush=True)
 """
 _POSE = """
 import shutil, sys, tempfile, time
@@ -244,6 +274,27 @@ def write_clouds(path: str) -> None:
     np.savez(path, **arrays)
 
 
+def write_references(folder: Path) -> tuple[str, str]:
+    """Write all reference alignments, and their clouds, for versions of any age; returns the files."""
+    from tests.clients.ndt_scan_matcher.references import clouds, reference_rows, settings_of
+
+    data = data_dir() / "ndt"
+    cases, arrays = [], dict[str, Any]()
+    for row in reference_rows(data):
+        settings, T_guess, *_ = settings_of(row)
+        arrays[f"{row['dataset']} target"], arrays[f"{row['dataset']} source"] = clouds(data, row["dataset"])
+        names = ("variant", "neighbors", "epsilon", "max_iterations", "step_size")
+        cases.append({
+            "dataset": row["dataset"],
+            "leaf": row["leaf"],
+            "guess": pose_from_matrix(T_guess).tolist(),
+            "settings": {name: getattr(settings, name) for name in names},
+        })  # fmt: skip
+    (folder / "cases.json").write_text(json.dumps(cases), encoding="utf-8")
+    np.savez(folder / "clouds.npz", **arrays)
+    return str(folder / "cases.json"), str(folder / "clouds.npz")
+
+
 def served(points: int, begin: str, rounds: int, work: str) -> str:
     """Return a program that measures ``work`` on a daemon of its checkout."""
     return _SERVED.format(points=points, begin=begin.strip(), rounds=rounds, work=work)
@@ -286,6 +337,9 @@ def main() -> None:
             with tempfile.NamedTemporaryFile(suffix=".npz") as file:
                 write_clouds(file.name)
                 both(_NDT, {**asks, "working, cold": "working cold"}, file.name)
+        elif what == "device":
+            with tempfile.TemporaryDirectory() as folder:
+                both(_DEVICE, {"references on a device": ""}, *write_references(Path(folder)))
         elif what == "pose":
             both(_POSE, {"pose, wall": "wall", "pose, CPU": "cpu"})
         elif what == "import":

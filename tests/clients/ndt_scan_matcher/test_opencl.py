@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,8 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 
+from tests.clients.ndt_scan_matcher.references import clouds, reference_rows, settings_of, target
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
-from tests.clients.ndt_scan_matcher.test_references import clouds, target, usable
-from tests.clients.ndt_scan_matcher.test_references import settings_of as reference_settings
 from tests.support.opencl_device import as_if, need_device
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
@@ -223,12 +221,10 @@ def test_all_reference_alignments(
     to_numba: tuple[float, float, float],
 ) -> None:
     folder = data_dir / "ndt"
-    rows = json.loads((folder / "reference_results.json").read_text(encoding="utf-8"))["results"]
-    kept = json.loads(Path(__file__).with_name("reference_alignments.json").read_text(encoding="utf-8"))
-    cases = [*filter(usable, rows), *kept["alignments"]]
+    cases = reference_rows(folder)
     assert len(cases) == 32 + 78
     for row in cases:
-        settings, guess, iterations, T, probability = reference_settings(row)
+        settings, guess, iterations, T, probability = settings_of(row)
         voxel_map, scan = target(folder, row["dataset"], row["leaf"]), clouds(folder, row["dataset"])[1]
         found = aligned(replace(settings, backend="opencl", device=options), voxel_map, scan, guess)
         assert found.iterations == iterations, row

@@ -4,69 +4,17 @@
 from __future__ import annotations
 
 import json
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
     NdtMatcher,
     Result,
-    Settings,
-    VoxelMap,
-    matrix_from_pose,
-    voxel_cell,
 )
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 
-from shmmap import read_cloud
-
-SEARCH: dict[str, Neighbors] = {"KDTREE": "radius", "DIRECT7": "direct7", "DIRECT1": "direct1"}
-
-
-@cache
-def clouds(folder: Path, dataset: str) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    if dataset == "synthetic":
-        return read_cloud(folder / "synthetic_map.pcd").xyz, read_cloud(folder / "synthetic_scan1500.pcd").xyz
-    with np.load(folder / "target_ds0.1_points.npz") as a, np.load(folder / "source_ds0.1_points.npz") as b:
-        return a["xyz"], b["xyz"]
-
-
-@cache
-def target(folder: Path, dataset: str, leaf: float) -> VoxelMap:
-    return VoxelMap({"map": voxel_cell(clouds(folder, dataset)[0], leaf)})
-
-
-def usable(row: dict[str, Any]) -> bool:
-    # DIRECT26 leaves out the centre; Autoware itself does not use its line search
-    return "DIRECT26" not in row["name"] and "ls=1" not in row["name"]
-
-
-def settings_of(
-    row: dict[str, Any],
-) -> tuple[Settings, NDArray[np.float64], int, NDArray[np.float64], float]:
-    """What a reference was aligned with: settings and guess; and its iterations, pose and score."""
-    if "program" in row:
-        settings = Settings(
-            "autoware" if row["program"] == "autoware" else "pclomp",
-            row["neighbors"],
-            epsilon=row["epsilon"],
-            max_iterations=row["max_iterations"],
-        )
-        guess, T = np.array(row["guess"]), np.array(row["T"]).reshape(3, 4)
-        return settings, matrix_from_pose(guess), row["iterations"], T, row["transform_probability"]
-    settings = Settings(
-        "autoware" if row["name"].startswith("autoware") else "pclomp",
-        next(ours for theirs, ours in SEARCH.items() if theirs in row["name"]),
-        epsilon=row["eps"],
-        max_iterations=row["max_iter"],
-        step_size=row["step_size"],
-    )
-    x, y, z, yaw = row["guess_xyz_yaw"]
-    guess = matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw]))
-    return settings, guess, row["iters"], np.array(row["T"]), row["tp"]
+from tests.clients.ndt_scan_matcher.references import clouds, settings_of, target, usable
 
 
 def align(folder: Path, row: dict[str, Any], backend: str) -> Result:
