@@ -3,7 +3,8 @@
 
     git worktree add ../other COMMIT
     (cd ../other && python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]')
-    python -m tests.benchmarks.two_versions ../other [warm attach load import status ndt device pose] [--pairs 40]
+    python -m tests.benchmarks.two_versions ../other [warm attach load import status] [--pairs 40]
+    python -m tests.benchmarks.two_versions ../other ndt device pose
 
 The other checkout has its environment in ``.venv``, as this one has.  Printed are the medians of both, the
 median of the paired ratios (this version to the other), and the ratio that it is below with 95 %
@@ -16,8 +17,8 @@ confidence (bootstrap).  Less than 1: this version is faster.
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
 - ``ndt``: CPU time of alignments by numba on one thread: two scans by DIRECT7 and DIRECT1, and Autoware's
   working point (1500 points, 2 m voxels), its data in the caches, and after 64 MiB of other data
-- ``device``: CPU time, of all threads, of the reference alignments in ``SHMMAP_TEST_DATA``, on the first OpenCL
-  device; of a version that knows none, by numba
+- ``device``: CPU time, of all threads, of the reference alignments in ``SHMMAP_TEST_DATA``, on the first
+  OpenCL device; of a version that knows none, by numba
 - ``pose``: wall and CPU time of a first pose among 200 candidates: one thread without batches, two with
 """
 
@@ -152,7 +153,8 @@ for case in cases:
     key = case["dataset"], case["leaf"]
     if key not in maps:
         maps[key] = VoxelMap({"map": voxel_cell(clouds[case["dataset"] + " target"], case["leaf"])})
-    matcher = NdtMatcher(Settings(**case["settings"], **options))
+    variant, neighbors, *how = case["settings"]  # by place: names have changed
+    matcher = NdtMatcher(Settings(variant, neighbors, *how, **options))
     matcher.set_map(matcher.prepare(maps[key]))
     matchers.append((matcher, clouds[case["dataset"] + " source"], matrix_from_pose(np.array(case["guess"]))))
 print("up", flush=True)
@@ -288,7 +290,7 @@ def write_references(folder: Path) -> tuple[str, str]:
             "dataset": row["dataset"],
             "leaf": row["leaf"],
             "guess": pose_from_matrix(T_guess).tolist(),
-            "settings": {name: getattr(settings, name) for name in names},
+            "settings": [getattr(settings, name) for name in names],
         })  # fmt: skip
     (folder / "cases.json").write_text(json.dumps(cases), encoding="utf-8")
     np.savez(folder / "clouds.npz", **arrays)

@@ -254,8 +254,8 @@ class OpenclBackend:
             self._places_buffer,
             self._rows_buffer,
             self.pool.buffer,
-            *(offset(at) for at in (placed.table, placed.origins, placed.column_start, placed.column_cell)),
-            *(integer(side) for side in box),
+            *(offset(at) for at in placed.offsets),
+            *(integer(side) for side in (*box, *placed.lead, placed.squares)),
             real(leaf),
             real(1.0 / leaf),
             # one leaf: every neighbour in reach of the radius lies in the 27 cells around the point

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
 
-__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
+__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap", "directory_of"]
 
 Covariance = Literal["autoware", "pclomp", "pcl"]
 
@@ -83,7 +83,7 @@ class VoxelMap:
                 for key, cell in kept.items()
                 if previous.cells.get(key) is cell and key in previous._derived
             }
-        self.box, self.column_start, self.column_cell = _directory(list(kept.values()))
+        self.box, self.column_start, self.column_cell = directory_of(list(kept.values()))
         self._tables: dict[Covariance, NDArray[np.int64]] = {}
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
@@ -140,15 +140,20 @@ def _within(
     return {key: cell for key, cell in cells.items() if key in chosen}
 
 
-def _directory(
-    cells: Iterable[VoxelCell],
+def directory_of(
+    cells: Iterable[VoxelCell], shift: int = 0
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return (i0, j0, ni, nj), where each column's cells start, and the cells."""
-    boxes = [
-        (index, *map(int, cell.lattice_origin[:2]), *cell.lattice.shape[:2])
-        for index, cell in enumerate(cells)
-        if len(cell.count)
-    ]
+    """Return (i0, j0, ni, nj), where each place's cells start, and the cells.
+
+    A place is a column of the lattice, or with ``shift`` a square of 2^shift columns, of which its cells need
+    not have all.
+    """
+    boxes = []
+    for index, cell in enumerate(cells):
+        if len(cell.count):
+            first = cell.lattice_origin[:2] >> shift
+            last = (cell.lattice_origin[:2] + cell.lattice.shape[:2] - 1) >> shift
+            boxes.append((index, *map(int, first), *map(int, last - first + 1)))
     if not boxes:
         return np.zeros(4, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
     i0, j0 = (min(box[axis] for box in boxes) for axis in (1, 2))

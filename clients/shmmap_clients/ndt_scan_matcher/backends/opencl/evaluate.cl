@@ -25,6 +25,7 @@ typedef float real;
 #define CHUNK 128
 #define SUMS 40
 #define USED 39
+#define SHIFT 3  // the directory has a place for each square of 8 x 8 columns
 #define PASS 13  // sums that lie in local memory at a time, for all points of a chunk
 #define POSE 40  // numbers of a pose: the transform's three rows, then three derivatives of the rotation
 #define NEGLIGIBLE R(36.7)
@@ -35,8 +36,8 @@ typedef float real;
 #define AT(type, base) ((__global const type *)(pool + (base)))
 #endif
 
-// columns of the table of cells, as VoxelMap.table has them
-enum { LATTICE, MEAN, INVERSE, I0, J0, K0, NK, SI, SJ, SK, VOXELS, COLUMNS };
+// columns of the table of cells: those of VoxelMap.table, and how many columns a cell has
+enum { LATTICE, MEAN, INVERSE, I0, J0, K0, NK, SI, SJ, SK, VOXELS, NI, NJ, COLUMNS };
 
 #if SEARCH == 1
 #define SEARCHED 1
@@ -57,10 +58,11 @@ typedef struct {
 #if DOUBLE
     __global const double *origins;
 #endif
-    __global const int *column_start;
-    __global const int *column_cell;
-    int box_i, box_j, ni, nj;  // of the directory; the corner relative to the pose's own place
-    int ref_i, ref_j, ref_k;   // that place: coordinates are relative to it, where they are floats
+    __global const int *square_start;
+    __global const int *square_cell;
+    int lead_i, lead_j, squares;  // of the directory: columns before the box, squares in a row
+    int box_i, box_j, ni, nj;     // of all columns; the corner relative to the pose's own place
+    int ref_i, ref_j, ref_k;      // that place: coordinates are relative to it, where they are floats
     real leaf, inverse_leaf, radius2, d1, d2;
 } Map;
 
@@ -108,18 +110,20 @@ static inline int visit(const Map map, real px, real py, real pz, int i, int j, 
         const int cj = j + searched[column][1];
         if (ci < 0 || ci >= map.ni || cj < 0 || cj >= map.nj)
             continue;
-        const int place = ci * map.nj + cj;
-        const int end = map.column_start[place + 1];
-        for (int entry = map.column_start[place]; entry < end; entry++) {
-            const int cell = map.column_cell[entry];
+        const int place = ((ci + map.lead_i) >> SHIFT) * map.squares + ((cj + map.lead_j) >> SHIFT);
+        const int end = map.square_start[place + 1];
+        for (int entry = map.square_start[place]; entry < end; entry++) {
+            const int cell = map.square_cell[entry];
             __global const long *row = map.table + cell * COLUMNS;
+            const int across = ci + map.box_i + map.ref_i - (int)row[I0];
+            const int along = cj + map.box_j + map.ref_j - (int)row[J0];
+            if (across < 0 || across >= (int)row[NI] || along < 0 || along >= (int)row[NJ])
+                continue;
             const int k0 = (int)row[K0] - map.ref_k;
             const int low = max(k + searched[column][2] - k0, 0);
             const int high = min(k + searched[column][3] - k0, (int)row[NK] - 1);
             if (low > high)
                 continue;
-            const int across = ci + map.box_i + map.ref_i - (int)row[I0];
-            const int along = cj + map.box_j + map.ref_j - (int)row[J0];
             const int step = (int)row[SK];
             __global const int *lattice = AT(int, row[LATTICE]) + (across * (int)row[SI] + along * (int)row[SJ]);
             __global const real *mean = AT(real, row[MEAN]);
@@ -263,7 +267,8 @@ __kernel void evaluate(__global const real *restrict source, const int points,
                        __global const real *restrict poses, __global const int *restrict places,
                        __global real *restrict rows, __global const uchar *restrict pool, const long table_at,
                        const long origins_at, const long start_at, const long cell_at, const int box_i,
-                       const int box_j, const int ni, const int nj, const real leaf, const real inverse_leaf,
+                       const int box_j, const int ni, const int nj, const int lead_i, const int lead_j,
+                       const int squares, const real leaf, const real inverse_leaf,
                        const real radius2, const real d1, const real d2) {
     const int at = get_global_id(1);
     __global const real *pose = poses + at * POSE;
@@ -274,8 +279,11 @@ __kernel void evaluate(__global const real *restrict source, const int points,
 #if DOUBLE
     map.origins = (__global const double *)(pool + origins_at);
 #endif
-    map.column_start = (__global const int *)(pool + start_at);
-    map.column_cell = (__global const int *)(pool + cell_at);
+    map.square_start = (__global const int *)(pool + start_at);
+    map.square_cell = (__global const int *)(pool + cell_at);
+    map.lead_i = lead_i;
+    map.lead_j = lead_j;
+    map.squares = squares;
     map.ref_i = place[0];
     map.ref_j = place[1];
     map.ref_k = place[2];

@@ -21,22 +21,33 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceMemory,
 from shmmap_clients.ndt_scan_matcher.backends.opencl.free_list import FreeList, rounded
 from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelMap, directory_of
 
 __all__ = ["MapPool", "PlacedMap", "UploadStatistics"]
 
 _STRETCH_BYTES: Final = 1 << 22  # staged in one piece at most
+_SHIFT: Final = 3  # squares of 8 x 8 columns, as in the kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedMap:
-    """Where a map's tables lie in the pool, as byte offsets."""
+    """Where a map's tables lie in the pool, as byte offsets; and how the kernel finds its way in them.
+
+    Attributes
+    ----------
+    voxel_map
+    offsets
+        Of the table of cells, their origins, where each square's cells start, and the cells.
+    lead
+        Columns of the lattice between the first square's corner and the map's box, in i and j.
+    squares
+        In a row of j.
+    """
 
     voxel_map: VoxelMap
-    table: int
-    origins: int
-    column_start: int
-    column_cell: int
+    offsets: tuple[int, int, int, int]
+    lead: tuple[int, int]
+    squares: int
 
 
 @dataclass(slots=True)
@@ -53,6 +64,13 @@ class _Block:
     offset: int
     nbytes: int
     owner: object  # keeps the id of what the block is a copy of from being used again
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tables:
+    arrays: list[NDArray[Any]]
+    lead: tuple[int, int]
+    squares: int
 
 
 _Key = tuple[int, str]
@@ -88,6 +106,7 @@ class MapPool:
         self._latest: VoxelMap | None = None
         self._lock = threading.Lock()
         self._waiting = Waiting(device.info.name)
+        self._staging = np.empty(min(capacity, _STRETCH_BYTES), np.uint8)
         with device_errors(device.info.name, f"allocate {capacity / 1e6:.0f} MB for maps"):
             self.buffer = cl.Buffer(context, cl.mem_flags.READ_ONLY, capacity)
             # a queue of its own: no evaluation waits for a map that is being written
@@ -167,22 +186,27 @@ class MapPool:
             block = self._blocks.pop(key)
             self._free.give(block.offset, block.nbytes)
 
-    def _tables(self, voxel_map: VoxelMap, covariance: Covariance) -> list[NDArray[np.generic]]:
+    def _tables(self, voxel_map: VoxelMap, covariance: Covariance) -> _Tables:
         """Return what is small, without where cells lie: that is filled in when they have a place."""
+        cells = list(voxel_map.cells.values())
         if self._device.in_place:
             table = voxel_map.table(covariance)
         else:
-            table = np.array([_row(cell) for cell in voxel_map.cells.values()], np.int64).reshape(
-                -1, TABLE_COLUMNS
-            )
+            table = np.array([_row(cell) for cell in cells], np.int64).reshape(-1, TABLE_COLUMNS)
             for key in voxel_map.cells:
                 voxel_map.inverses(key, covariance)
-        return [table, voxel_map.origins, voxel_map.column_start, voxel_map.column_cell]
+        shapes = np.array([cell.lattice.shape[:2] for cell in cells], np.int64).reshape(-1, 2)
+        box, start, square_cell = directory_of(cells, _SHIFT)
+        lead = voxel_map.box[:2] - (box[:2] << _SHIFT)
+        return _Tables(
+            [np.concatenate([table, shapes], axis=1), voxel_map.origins, start, square_cell],
+            (int(lead[0]), int(lead[1])),
+            int(box[3]),
+        )
 
-    def _place(
-        self, voxel_map: VoxelMap, covariance: Covariance, tables: list[NDArray[np.generic]]
-    ) -> PlacedMap | None:
+    def _place(self, voxel_map: VoxelMap, covariance: Covariance, found: _Tables) -> PlacedMap | None:
         """Find room and write; None, and nothing has changed, where there is no room."""
+        tables = found.arrays
         new: dict[_Key, _Block] = {}
         wanted: list[tuple[_Key, int, object]] = []
         if not self._device.in_place:
@@ -218,7 +242,9 @@ class MapPool:
                 parts.append((block.offset, [inverse.astype(self._real, copy=False)]))
         self._write(parts)
         base = self._blocks[(id(voxel_map), f"tables {covariance}")].offset
-        placed = PlacedMap(voxel_map, *(base + start for start in starts[:4]))
+        table_at, origins_at, start_at, cell_at = (base + start for start in starts[:4])
+        offsets = (table_at, origins_at, start_at, cell_at)
+        placed = PlacedMap(voxel_map, offsets, found.lead, found.squares)
         self._placed[(id(voxel_map), covariance)] = placed
         return placed
 
@@ -244,27 +270,25 @@ class MapPool:
         """Write arrays to their places: what lies side by side, together."""
         import pyopencl as cl
 
-        name = self._device.info.name
-        events = []
-        with device_errors(name, "write a map"):
+        with device_errors(self._device.info.name, "write a map"):
             for stretch in _stretches(parts):
                 first, last = stretch[0][0], _end(stretch[-1])
-                staged = np.empty(last - first, np.uint8)
+                # one piece of memory for all stretches; a cell that is larger than that has one of its own
+                large = last - first > len(self._staging)
+                staged = np.empty(last - first, np.uint8) if large else self._staging[: last - first]
                 for offset, arrays in stretch:
                     at = offset - first
                     for array in arrays:
                         room = staged[at : at + array.nbytes].view(array.dtype).reshape(array.shape)
                         np.copyto(room, array)
                         at += array.nbytes
-                copied = cl.enqueue_copy(
+                written = cl.enqueue_copy(
                     self._queue, self.buffer, staged, dst_offset=first, is_blocking=False
                 )
-                events.append((copied, staged))
+                self._queue.flush()
+                self._waiting.until(written)
                 self.statistics.writes += 1
                 self.statistics.written_bytes += len(staged)
-            self._queue.flush()
-            for event, _ in events:
-                self._waiting.until(event)
 
 
 def _row(cell: VoxelCell) -> list[int]:
