@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
 
-__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap", "directory_of"]
+__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
 
 Covariance = Literal["autoware", "pclomp", "pcl"]
 
@@ -83,7 +83,12 @@ class VoxelMap:
                 for key, cell in kept.items()
                 if previous.cells.get(key) is cell and key in previous._derived
             }
-        self.box, self.column_start, self.column_cell = directory_of(list(kept.values()))
+        self.box, self.column_start, self.column_cell = _directory(list(kept.values()))
+        self._rows: dict[Covariance, dict[str, list[int]]] = {}
+        if previous is not None:
+            same = [key for key, cell in kept.items() if previous.cells.get(key) is cell]
+            for covariance, rows in previous._rows.items():
+                self._rows[covariance] = {key: rows[key] for key in same if key in rows}
         self._tables: dict[Covariance, NDArray[np.int64]] = {}
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
@@ -102,8 +107,11 @@ class VoxelMap:
         """Return the kernel's table, (C, `TABLE_COLUMNS`); valid as long as this map lives."""
         table = self._tables.get(covariance)
         if table is None:
-            rows = [_row(cell, self.inverses(key, covariance)) for key, cell in self.cells.items()]
-            table = np.array(rows, np.int64).reshape(-1, TABLE_COLUMNS)
+            rows = self._rows.setdefault(covariance, {})
+            for key, cell in self.cells.items():
+                if key not in rows:
+                    rows[key] = _row(cell, self.inverses(key, covariance))
+            table = np.array([rows[key] for key in self.cells], np.int64).reshape(-1, TABLE_COLUMNS)
             self._tables[covariance] = table
         return table
 
@@ -140,20 +148,15 @@ def _within(
     return {key: cell for key, cell in cells.items() if key in chosen}
 
 
-def directory_of(
-    cells: Iterable[VoxelCell], shift: int = 0
+def _directory(
+    cells: Iterable[VoxelCell],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return (i0, j0, ni, nj), where each place's cells start, and the cells.
-
-    A place is a column of the lattice, or with ``shift`` a square of 2^shift columns, of which its cells need
-    not have all.
-    """
-    boxes = []
-    for index, cell in enumerate(cells):
-        if len(cell.count):
-            first = cell.lattice_origin[:2] >> shift
-            last = (cell.lattice_origin[:2] + cell.lattice.shape[:2] - 1) >> shift
-            boxes.append((index, *map(int, first), *map(int, last - first + 1)))
+    """Return (i0, j0, ni, nj), where each column's cells start, and the cells."""
+    boxes = [
+        (index, *cell.lattice_origin[:2].tolist(), *cell.lattice.shape[:2])
+        for index, cell in enumerate(cells)
+        if len(cell.count)
+    ]
     if not boxes:
         return np.zeros(4, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
     i0, j0 = (min(box[axis] for box in boxes) for axis in (1, 2))

@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceMemory, device_errors
-from shmmap_clients.ndt_scan_matcher.backends.opencl.free_list import FreeList, rounded
+from shmmap_clients.ndt_scan_matcher.backends.opencl.free_list import ALIGNMENT, FreeList, rounded
+from shmmap_clients.ndt_scan_matcher.backends.opencl.square_directory import squares_of
 from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelMap, directory_of
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelMap
 
 __all__ = ["MapPool", "PlacedMap", "UploadStatistics"]
 
 _STRETCH_BYTES: Final = 1 << 22  # staged in one piece at most
-_SHIFT: Final = 3  # squares of 8 x 8 columns, as in the kernel
+_NOTHING: Final = np.zeros(ALIGNMENT, np.uint8)  # what lies between blocks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,12 +197,11 @@ class MapPool:
             for key in voxel_map.cells:
                 voxel_map.inverses(key, covariance)
         shapes = np.array([cell.lattice.shape[:2] for cell in cells], np.int64).reshape(-1, 2)
-        box, start, square_cell = directory_of(cells, _SHIFT)
-        lead = voxel_map.box[:2] - (box[:2] << _SHIFT)
+        low, squares, start, square_cell = squares_of(table[:, 3:5], shapes)
         return _Tables(
             [np.concatenate([table, shapes], axis=1), voxel_map.origins, start, square_cell],
-            (int(lead[0]), int(lead[1])),
-            int(box[3]),
+            (int(voxel_map.box[0] - low[0]), int(voxel_map.box[1] - low[1])),
+            squares,
         )
 
     def _place(self, voxel_map: VoxelMap, covariance: Covariance, found: _Tables) -> PlacedMap | None:
@@ -252,11 +252,11 @@ class MapPool:
         self, voxel_map: VoxelMap, covariance: Covariance, table: NDArray[np.generic]
     ) -> NDArray[np.int64]:
         rows = np.array(table, np.int64)
-        for row, cell in zip(rows, voxel_map.cells.values(), strict=True):
-            base = self._blocks[(id(cell), "voxels")].offset
-            row[0] = base + 3 * self._real.itemsize * len(cell.count)
-            row[1] = base
-            row[2] = self._blocks[(id(cell), covariance)].offset
+        cells = list(voxel_map.cells.values())
+        means = np.array([self._blocks[(id(cell), "voxels")].offset for cell in cells], np.int64)
+        rows[:, 0] = means + 3 * self._real.itemsize * rows[:, 10]
+        rows[:, 1] = means
+        rows[:, 2] = [self._blocks[(id(cell), covariance)].offset for cell in cells]
         return rows
 
     def _voxels(self, cell: VoxelCell) -> list[NDArray[np.generic]]:
@@ -276,12 +276,12 @@ class MapPool:
                 # one piece of memory for all stretches; a cell that is larger than that has one of its own
                 large = last - first > len(self._staging)
                 staged = np.empty(last - first, np.uint8) if large else self._staging[: last - first]
+                pieces, at = [], first
                 for offset, arrays in stretch:
-                    at = offset - first
-                    for array in arrays:
-                        room = staged[at : at + array.nbytes].view(array.dtype).reshape(array.shape)
-                        np.copyto(room, array)
-                        at += array.nbytes
+                    pieces.append(_NOTHING[: offset - at])
+                    pieces += [array.reshape(-1).view(np.uint8) for array in arrays]
+                    at = offset + sum(array.nbytes for array in arrays)
+                np.concatenate(pieces, out=staged)
                 written = cl.enqueue_copy(
                     self._queue, self.buffer, staged, dst_offset=first, is_blocking=False
                 )
@@ -294,7 +294,7 @@ class MapPool:
 def _row(cell: VoxelCell) -> list[int]:
     """Return a cell's row of the table, for a lattice that is written with i fastest, without its places."""
     ni, nj, nk = cell.lattice.shape
-    return [0, 0, 0, *map(int, cell.lattice_origin), nk, 1, ni, ni * nj, len(cell.count)]
+    return [0, 0, 0, *cell.lattice_origin.tolist(), nk, 1, ni, ni * nj, len(cell.count)]
 
 
 def _end(part: tuple[int, list[NDArray[np.generic]]]) -> int:
