@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cells a square of the lattice touches: the directory of a map on a device, a few kilobytes.
 
-A place for each square of 8 x 8 columns instead of one for each column: what moves with every map is small.  The
-kernel tests whether a cell really has the column.
+A place for each square of 8 x 8 columns instead of one for each column: what is written for every map is
+small.  The kernel tests whether a cell really has the column.
 """
 
 from __future__ import annotations
