@@ -73,7 +73,10 @@ def measure(memory: str, here: VoxelMap, ahead: VoxelMap, repeats: int) -> None:
     first_ms = (time.perf_counter() - begin) * 1e3
     private = process_memory(os.getpid()).private_bytes - private
     written = statistics.written_bytes - written
-    whole, taking, steps, sizes = [], [], [], []
+    whole: list[float] = []
+    taking: list[float] = []
+    steps: list[float] = []
+    sizes: list[int] = []
     for number in range(2 * repeats):
         if number % 2 == 0:
             # everything is given up, then the whole map comes at once
