@@ -16,7 +16,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["compiled", "float32_at", "float64_at", "int32_at", "read_only"]
+__all__ = ["compiled", "float32_at", "float64_at", "inlined", "int32_at", "read_only"]
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
@@ -45,6 +45,11 @@ def compiled(*signatures: Any, **settings: Any) -> Callable[[_Kernel], _Kernel]:
         return cast("_Kernel", kernel)
 
     return compile_now
+
+
+def inlined(function: _Kernel) -> _Kernel:
+    """Make a function callable from kernels; compiled with whoever calls it."""
+    return cast("_Kernel", numba.njit(nogil=True, inline="always")(function))
 
 
 def _element_of(result: types.Type, llvm_type: ir.Type) -> Any:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 
 from shmmap_clients.command_line import finite, not_negative, positive
 
 __all__ = [
+    "Parser",
     "add_backend_option",
     "add_height_option",
     "add_leaf_option",
@@ -86,14 +88,15 @@ def add_backend_option(parser: Parser) -> None:
     )
 
 
-def add_threads_option(parser: Parser) -> None:
-    """Add ``--threads``."""
+def add_threads_option(parser: Parser, *, all_processors: bool = False) -> None:
+    """Add ``--threads``; by default one, or as many as there are processors, but at most four."""
     parser.add_argument(
         "--threads",
         type=int,
-        default=1,
+        default=min(len(os.sched_getaffinity(0)), 4) if all_processors else 1,
         metavar="N",
-        help="threads to compute with; results do not depend on it (default: 1)",
+        help="threads to compute with; results do not depend on it (default:"
+        f" {'as many as there are processors, at most 4' if all_processors else '1'})",
     )
 
 

@@ -4,6 +4,7 @@
     git worktree add ../other COMMIT
     (cd ../other && python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]')
     python -m tests.benchmarks.two_versions ../other [warm attach load import status] [--pairs 40]
+    python -m tests.benchmarks.two_versions ../other ndt device pose
 
 The other checkout has its environment in ``.venv``, as this one has.  Printed are the medians of both, the
 median of the paired ratios (this version to the other), and the ratio that it is below with 95 %
@@ -14,11 +15,17 @@ confidence (bootstrap).  Less than 1: this version is faster.
 - ``load``: the cells of `load_pcd` into segments, one after the other
 - ``import``: CPU time of importing the client
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
+- ``ndt``: CPU time of alignments by numba on one thread: two scans by DIRECT7 and DIRECT1, and Autoware's
+  working point (1500 points, 2 m voxels), its data in the caches, and after 64 MiB of other data
+- ``device``: CPU time, of all threads, of the reference alignments in ``SHMMAP_TEST_DATA``, on the first
+  OpenCL device; of a version that knows none, by numba
+- ``pose``: wall and CPU time of a first pose among 200 candidates: one thread without batches, two with
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import statistics
@@ -27,8 +34,14 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import pose_from_matrix
 
 from tests.benchmarks.load_pcd import cloud, cut
+from tests.benchmarks.ndt_clouds import city, scan_pair
+from tests.benchmarks.street_data import data_dir
 
 __all__ = ["main"]
 
@@ -99,6 +112,92 @@ for line in sys.stdin:
     print(took * 1e6, flush=True)
 os.rmdir(path)
 """
+_NDT = """
+import sys, time
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, voxel_cell
+clouds = np.load(sys.argv[1])
+other = np.ones(8 << 20)
+made = {}
+for name, at, leaf, settings in (
+    ("direct7", "pair", 1.0, Settings("pclomp", "direct7", epsilon=0.1)),
+    ("direct1", "pair", 1.0, Settings("pclomp", "direct1", epsilon=0.1)),
+    ("working", "city", 2.0, Settings()),
+):
+    matcher = NdtMatcher(settings)
+    matcher.set_map(VoxelMap({"map": voxel_cell(clouds[at + "_target"], leaf)}))
+    made[name] = matcher, clouds[at + "_source"], clouds[at + "_guess"]
+print("up", flush=True)
+for line in sys.stdin:
+    name, _, cold = line.strip().partition(" ")
+    matcher, source, guess = made[name]
+    times = []
+    for _ in range(10):
+        if cold:
+            other += 1.0
+        begin = time.process_time()
+        matcher.align(source, guess)
+        times.append(time.process_time() - begin)
+    # the least is what it costs; after other data every one pays
+    print((float(np.median(times)) if cold else min(times)) * 1e6, flush=True)
+"""
+_DEVICE = """
+import json, sys, time
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose, voxel_cell
+cases = json.load(open(sys.argv[1]))
+clouds = np.load(sys.argv[2])
+options = {"backend": "opencl"} if hasattr(NdtMatcher, "align_many") else {}
+maps, matchers = {}, []
+for case in cases:
+    key = case["dataset"], case["leaf"]
+    if key not in maps:
+        maps[key] = VoxelMap({"map": voxel_cell(clouds[case["dataset"] + " target"], case["leaf"])})
+    variant, neighbors, *how = case["settings"]  # by place: names have changed
+    matcher = NdtMatcher(Settings(variant, neighbors, *how, **options))
+    matcher.set_map(matcher.prepare(maps[key]))
+    matchers.append((matcher, clouds[case["dataset"] + " source"], matrix_from_pose(np.array(case["guess"]))))
+print("up", flush=True)
+for line in sys.stdin:
+    least = np.full(len(matchers), np.inf)
+    for _ in range(3):
+        for number, (matcher, source, guess) in enumerate(matchers):
+            begin = time.process_time()
+            matcher.align(source, guess)
+            least[number] = min(least[number], time.process_time() - begin)
+    print(float(least.sum()) * 1e6, flush=True)
+"""
+_POSE = """
+import shutil, sys, tempfile, time
+from pathlib import Path
+import numpy as np
+from shmmap_clients.ndt_scan_matcher import NdtMatcher
+from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
+from shmmap_clients.scans.scan_file import read_scan
+from tests.support.daemon_process import DaemonProcess
+from tests.support.town_drive import make_town_drive
+scratch = tempfile.mkdtemp()
+drive = make_town_drive(Path(scratch), blocks=(3, 3), density=5.0, frames=4, step=15.0)
+one = DaemonProcess(drive.map_dir).start()
+threads = 2 if hasattr(NdtMatcher, "align_many") else 1
+initializer = PoseInitializer(one.endpoint, InitializerRules(height=1.8), threads=threads)
+scans = [read_scan(path) for path in sorted(drive.scans.iterdir())]
+print("up", flush=True)
+for line in sys.stdin:
+    times = []
+    for number, scan in enumerate(scans):
+        x, y, _, _, _, yaw = drive.poses[number]
+        clock = time.process_time if line.strip() == "cpu" else time.perf_counter
+        begin = clock()
+        found = initializer.initialize(scan, RoughPose(x + 1.2, y - 0.9, z=0.0, yaw=yaw + 0.1))
+        times.append(clock() - begin)
+        assert found.reliable and abs(found.T_map_base[0, 3] - x) < 0.3, found.T_map_base
+    print(sum(times) / len(times) * 1e6, flush=True)
+initializer.close()
+one.stop()
+one.dispose()
+shutil.rmtree(scratch)
+"""
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 
 
@@ -168,6 +267,36 @@ def compare(name: str, this: Callable[[], float], other: Callable[[], float], pa
     )
 
 
+def write_clouds(path: str) -> None:
+    """Write what is aligned, for versions of any age."""
+    arrays: dict[str, Any] = {}
+    for pair in (scan_pair(), city()):
+        arrays |= {f"{pair.name}_target": pair.target, f"{pair.name}_source": pair.source}
+        arrays[f"{pair.name}_guess"] = pair.T_guess
+    np.savez(path, **arrays)
+
+
+def write_references(folder: Path) -> tuple[str, str]:
+    """Write all reference alignments, and their clouds, for versions of any age; returns the files."""
+    from tests.clients.ndt_scan_matcher.references import clouds, reference_rows, settings_of
+
+    data = data_dir() / "ndt"
+    cases, arrays = [], dict[str, Any]()
+    for row in reference_rows(data):
+        settings, T_guess, *_ = settings_of(row)
+        arrays[f"{row['dataset']} target"], arrays[f"{row['dataset']} source"] = clouds(data, row["dataset"])
+        names = ("variant", "neighbors", "epsilon", "max_iterations", "step_size")
+        cases.append({
+            "dataset": row["dataset"],
+            "leaf": row["leaf"],
+            "guess": pose_from_matrix(T_guess).tolist(),
+            "settings": [getattr(settings, name) for name in names],
+        })  # fmt: skip
+    (folder / "cases.json").write_text(json.dumps(cases), encoding="utf-8")
+    np.savez(folder / "clouds.npz", **arrays)
+    return str(folder / "cases.json"), str(folder / "clouds.npz")
+
+
 def served(points: int, begin: str, rounds: int, work: str) -> str:
     """Return a program that measures ``work`` on a daemon of its checkout."""
     return _SERVED.format(points=points, begin=begin.strip(), rounds=rounds, work=work)
@@ -205,6 +334,16 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 paths = cut(cloud(), Path(folder))["binary"]
                 both(_LOAD, {"load": ""}, *paths)
+        elif what == "ndt":
+            asks = {name: name for name in ("direct7", "direct1", "working")}
+            with tempfile.NamedTemporaryFile(suffix=".npz") as file:
+                write_clouds(file.name)
+                both(_NDT, {**asks, "working, cold": "working cold"}, file.name)
+        elif what == "device":
+            with tempfile.TemporaryDirectory() as folder:
+                both(_DEVICE, {"references on a device": ""}, *write_references(Path(folder)))
+        elif what == "pose":
+            both(_POSE, {"pose, wall": "wall", "pose, CPU": "cpu"})
         elif what == "import":
             started("import", "-c", _CLIENT)
         elif what == "status":

@@ -91,7 +91,7 @@ def test_a_scan_without_points_is_said_so(tmp_path: Path, capsys: pytest.Capture
 
 
 PROGRAMS = {
-    "ndt_scan_matcher": (ndt, ["align"], ["follow"]),
+    "ndt_scan_matcher": (ndt, ["align"], ["follow"], ["devices"]),
     "compare_map_filter": (compare, ["apply"], ["follow"]),
     "elevation_map": (elevation, ["build"]),
     "pose_initializer": (pose_init, []),
@@ -143,6 +143,7 @@ def test_the_same_option_is_the_same_everywhere(
     assert with_daemon == 5
     # these differ in their defaults, or in what they are of
     own = {"--thin", "--height", "--update-distance", "--wait", "--out", "--mask", "--pose", "--picture"}
+    own |= {"--backend", "--threads"}
     assert {name: said for name, said in seen.items() if len(said) > 1 and name not in own} == {}
 
 

@@ -20,21 +20,26 @@ from shmmap_clients.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
+    from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+    from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
     from shmmap_clients.ndt_scan_matcher.backends.registry import BACKENDS
     from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
     from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
     from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
     from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
     from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
-    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
     from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
     from shmmap_clients.ndt_scan_matcher.matching.result import Result
+    from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
     from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 
 __all__ = [
     "BACKENDS",
     "Backend",
     "Cut",
+    "DeviceError",
+    "DeviceOptions",
     "Evaluation",
     "Limits",
     "NdtMatcher",
@@ -56,12 +61,14 @@ __getattr__ = lazy_names(
         "BACKENDS": "backends.registry",
         "Backend": "backends.backend",
         "Cut": "matching.limits",
+        "DeviceError": "backends.opencl.errors",
+        "DeviceOptions": "backends.device_options",
         "Evaluation": "matching.evaluation",
         "Limits": "matching.limits",
         "NdtMatcher": "matching.matcher",
         "Regularization": "matching.regularization",
         "Result": "matching.result",
-        "Settings": "matching.matcher",
+        "Settings": "matching.settings",
         "TrustLimits": "matching.trust",
         "VoxelCell": "map.voxel_cell",
         "VoxelMap": "map.voxel_map",

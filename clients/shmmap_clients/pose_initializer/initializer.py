@@ -6,9 +6,9 @@ from __future__ import annotations
 import math
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Client, MapWindow, NoAnswer, canonical_layer
 from shmmap_clients.map_extent import NoMapHere, map_extent
 from shmmap_clients.ndt_scan_matcher import (
+    DeviceError,
+    DeviceOptions,
     Limits,
     NdtMatcher,
     Result,
@@ -91,7 +93,9 @@ class PoseInitializer:
     rules
     limits, trust
         Of the final alignments, as in `NdtMatcher`.
-    backend, threads
+    backend, device, fallback
+        Who computes, as in `Settings`.
+    threads
         As in `NdtMatcher`.
 
     Raises
@@ -108,17 +112,26 @@ class PoseInitializer:
         limits: Limits | None = None,
         trust: TrustLimits | None = None,
         backend: str = "numba",
+        device: DeviceOptions | None = None,
+        fallback: str | None = None,
         threads: int = 1,
     ) -> None:
         self.rules = rules if rules is not None else InitializerRules()
         self._voxels = canonical_layer(f"ndt(leaf={self.rules.leaf!r})")
         self._ground = canonical_layer("ground")
+        computes: dict[str, Any] = {
+            "backend": backend,
+            "device": device if device is not None else DeviceOptions(),
+            "fallback": fallback,
+        }
         few = Limits(source_points=self.rules.scoring_points)
+        if limits is not None:
+            few = replace(few, voxels=limits.voxels, map_bytes=limits.map_bytes)
         self._coarse = NdtMatcher(
-            Settings(steady=True, epsilon=0.05), limits=few, backend=backend, threads=threads
+            Settings(steady=True, epsilon=0.05, **computes), limits=few, threads=threads
         )
         self._fine = NdtMatcher(
-            Settings(mode="coarse_fine"), limits=limits, trust=trust, backend=backend, threads=threads
+            Settings(mode="coarse_fine", **computes), limits=limits, trust=trust, threads=threads
         )
         self._window = MapWindow(
             client,
@@ -177,8 +190,8 @@ class PoseInitializer:
             return np.array([x, y, z, rough.roll, rough.pitch, yaw])
 
         def scores(batch: NDArray[np.float64], z: float) -> NDArray[np.float64]:
-            found = self._coarse.evaluate(points, np.array([pose_of(one, z) for one in batch]))
-            return np.array([at.score for at in found])
+            poses = np.array([pose_of(one, z) for one in batch])
+            return np.array([at.score for at in self._coarse.evaluate(points, poses)])
 
         estimator = ParzenEstimator(rough, self.rules.seed)
         half = max(1, self.rules.candidates // 2)
@@ -192,9 +205,9 @@ class PoseInitializer:
             batch = estimator.next(size)
             estimator.learn(batch, scores(batch, z))
         starts = estimator.best(self.rules.starts, _SEED_APART_M, _SEED_APART_YAW)
-        near = [self._coarse.align(points, matrix_from_pose(pose_of(start, z))) for start in starts]
+        near = self._coarse.align_many(points, [matrix_from_pose(pose_of(start, z)) for start in starts])
         near.sort(key=lambda result: -result.transform_probability)
-        finals = [self._fine.align(points, one.T_map_base) for one in _apart(near)[: self.rules.finals]]
+        finals = self._fine.align_many(points, [one.T_map_base for one in _apart(near)[: self.rules.finals]])
         finals.sort(key=lambda result: -result.transform_probability)
         best = finals[0]
         others = [
@@ -216,6 +229,11 @@ class PoseInitializer:
         """Limits of trust that are in force, for the map that was searched last."""
         return self._fine.trust
 
+    @property
+    def fault(self) -> DeviceError | None:
+        """Why the fallback computes; None as long as it does not."""
+        return self._coarse.fault or self._fine.fault
+
     def _take_map(self, rough: RoughPose) -> tuple[float | None, list[float]]:
         """Have the map around a place, and return the heights of its ground there."""
         self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)
@@ -230,7 +248,16 @@ class PoseInitializer:
             for key, cell in voxels.items():
                 same = self._versions.get((key, self._voxels)) == versions[(key, self._voxels)]
                 kept[key] = known[key] if same and key in known else cell_from_layer(cell)
-            self._map = self._fine.prepare(VoxelMap(kept, previous=self._map))
+            limits = self._fine.limits
+            self._map = self._fine.prepare(
+                VoxelMap(
+                    kept,
+                    max_voxels=limits.voxels,
+                    max_bytes=limits.most_map_bytes,
+                    centre=(rough.x, rough.y),
+                    previous=self._map,
+                )
+            )
             self._coarse.prepare(self._map)
             self._coarse.set_map(self._map)
             self._fine.set_map(self._map)

@@ -85,11 +85,20 @@ class ParzenEstimator:
 
     def _density(self, at: NDArray[np.float64], which: NDArray[np.intp]) -> NDArray[np.float64]:
         """Logarithm of the mean of the kernels on what was tried, up to a constant."""
-        off = at[:, None, :] - self._tried[which][None, :, :]
-        off[..., 2] = _wrapped(off[..., 2])
-        exponent = -0.5 * ((off / _KERNEL) ** 2).sum(axis=2)
+        exponent = np.zeros((len(at), len(which)))
+        for axis, width in enumerate(_KERNEL.tolist()):
+            # one axis at a time, in place: whole turns off, in widths of the kernel, squared
+            off = at[:, axis, None] - self._tried[which, axis]
+            if axis == 2:
+                off -= 2 * math.pi * np.rint(off / (2 * math.pi))
+            off /= width
+            off *= off
+            exponent += off
+        exponent *= -0.5
         most = exponent.max(axis=1)
-        return np.asarray(most + np.log(np.exp(exponent - most[:, None]).mean(axis=1)), np.float64)
+        exponent -= most[:, None]
+        np.exp(exponent, out=exponent)
+        return np.asarray(most + np.log(exponent.mean(axis=1)), np.float64)
 
 
 def _wrapped(angle: NDArray[np.float64] | float) -> NDArray[np.float64]:

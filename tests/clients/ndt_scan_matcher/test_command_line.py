@@ -42,7 +42,8 @@ def test_align_prints_json(files: dict[str, Path], scan: str, capsys: pytest.Cap
     assert document["iterations"] >= 1
     assert document["nvtl"] > 2.3
     assert document["transform_probability"] > 3.0
-    assert document["cut"] == {"points": 0, "neighbor_points": 0, "neighbors": 0, "voxels": 0}
+    nothing = {"points": 0, "neighbor_points": 0, "neighbors": 0, "voxels": 0, "map_bytes": 0}
+    assert document["cut"] == {**nothing, "deadline": False}
     assert np.array(document["covariance"]).shape == (6, 6)
 
 

@@ -4,59 +4,24 @@
 from __future__ import annotations
 
 import json
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
     NdtMatcher,
     Result,
-    Settings,
-    VoxelMap,
-    matrix_from_pose,
-    voxel_cell,
 )
 
-from shmmap import read_cloud
-
-SEARCH = {"KDTREE": "radius", "DIRECT7": "direct7", "DIRECT1": "direct1"}
-
-
-@cache
-def clouds(folder: Path, dataset: str) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    if dataset == "synthetic":
-        return read_cloud(folder / "synthetic_map.pcd").xyz, read_cloud(folder / "synthetic_scan1500.pcd").xyz
-    with np.load(folder / "target_ds0.1_points.npz") as a, np.load(folder / "source_ds0.1_points.npz") as b:
-        return a["xyz"], b["xyz"]
-
-
-@cache
-def target(folder: Path, dataset: str, leaf: float) -> VoxelMap:
-    return VoxelMap({"map": voxel_cell(clouds(folder, dataset)[0], leaf)})
-
-
-def usable(row: dict[str, Any]) -> bool:
-    # DIRECT26 leaves out the centre; Autoware itself does not use its line search
-    return "DIRECT26" not in row["name"] and "ls=1" not in row["name"]
+from tests.clients.ndt_scan_matcher.references import clouds, settings_of, target, usable
 
 
 def align(folder: Path, row: dict[str, Any], backend: str) -> Result:
-    search = next(ours for theirs, ours in SEARCH.items() if theirs in row["name"])
-    settings = Settings(
-        "autoware" if row["name"].startswith("autoware") else "pclomp",
-        search,  # type: ignore[arg-type]
-        epsilon=row["eps"],
-        max_iterations=row["max_iter"],
-        step_size=row["step_size"],
-    )
-    x, y, z, yaw = row["guess_xyz_yaw"]
+    settings, guess, *_ = settings_of(row)
     with NdtMatcher(settings, backend=backend) as matcher:
         matcher.set_map(target(folder, row["dataset"], row["leaf"]))
-        scan = clouds(folder, row["dataset"])[1]
-        return matcher.align(scan, matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw])))
+        return matcher.align(clouds(folder, row["dataset"])[1], guess)
 
 
 @pytest.mark.parametrize("backend", ["numba", "numpy"])
@@ -82,17 +47,7 @@ def test_alignments_equal_the_originals_at_other_leaf_sizes_and_guesses(data_dir
     folder = data_dir / "ndt"
     rows = json.loads(Path(__file__).with_name("reference_alignments.json").read_text(encoding="utf-8"))
     for row in rows["alignments"]:
-        settings = Settings(
-            "autoware" if row["program"] == "autoware" else "pclomp",
-            row["neighbors"],
-            epsilon=row["epsilon"],
-            max_iterations=row["max_iterations"],
-        )
-        with NdtMatcher(settings) as matcher:
-            matcher.set_map(target(folder, row["dataset"], row["leaf"]))
-            result = matcher.align(
-                clouds(folder, row["dataset"])[1], matrix_from_pose(np.array(row["guess"]))
-            )
+        result = align(folder, row, "numba")
         T = np.array(row["T"]).reshape(3, 4)
         what = str({name: value for name, value in row.items() if name != "T"})
         assert result.iterations == row["iterations"], what

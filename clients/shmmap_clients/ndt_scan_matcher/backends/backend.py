@@ -23,7 +23,22 @@ class Backend(Protocol):
     One object serves one thread at a time.
     """
 
-    name: str
+    @property
+    def name(self) -> str:
+        """As in `BACKENDS`."""
+
+    @property
+    def on_device(self) -> bool:
+        """Whether the work is done elsewhere than in the threads of this process."""
+
+    most_map_bytes: int
+    """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
+
+    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+        """Do in advance what evaluations with this map would have to wait for.
+
+        It may be called in another thread, beside evaluations with the map in use.
+        """
 
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on; it is kept alive until the next."""
@@ -39,8 +54,31 @@ class Backend(Protocol):
         covariance: Covariance,
         pitch_sign: float = -1.0,
         T: NDArray[np.float64] | None = None,
+        deadline_s: float | None = None,
     ) -> Evaluation:
-        """Return score, gradient and Hessian at a pose vector; ``T`` is its matrix, where known better."""
+        """Return score, gradient and Hessian at a pose vector.
+
+        Parameters
+        ----------
+        T
+            The pose's matrix, where that is known better.
+        deadline_s
+            Of `time.monotonic`: how long a device is waited for at most; then it is an error.
+        """
+
+    def evaluate_many(
+        self,
+        poses: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        deadline_s: float | None = None,
+    ) -> list[Evaluation]:
+        """Return for each of (k, 6) poses what `evaluate` returns, to the last bit; k up to the limit."""
+
+    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+        """Return the step that an evaluation asks for: `upward_step` if steady, else `newton_step`."""
 
     def close(self) -> None:
-        """Give back threads and memory."""
+        """Give back threads and memory; a hung device is not waited for."""

@@ -5,26 +5,28 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.backends.kernels import accumulate
+from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import CONTRACTED, contract, derive, step_into
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     CHUNK_POINTS,
     SUMS,
     Evaluation,
     gauss_for,
     search_columns,
-    total,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
 from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
 
 __all__ = ["NumbaBackend"]
+
+_BATCH_ROWS: Final = 4096  # of many poses that are evaluated at once: 256 poses of 2048 points
 
 
 class NumbaBackend:
@@ -35,13 +37,20 @@ class NumbaBackend:
     """
 
     name = "numba"
+    on_device = False
 
     def __init__(self, limits: Limits, threads: int = 1) -> None:
         self._source = ScanBuffer(limits.source_points)
+        self._most_poses = limits.poses
+        self.most_map_bytes = limits.most_map_bytes
         self._map = VoxelMap({})
-        self._rows = np.zeros((-(-limits.source_points // CHUNK_POINTS), SUMS))
+        self._most_rows = max(-(-limits.source_points // CHUNK_POINTS), _BATCH_ROWS)
+        self._rows = np.zeros((self._most_rows, SUMS))
+        self._T = np.zeros((limits.poses, 4, 4))
+        self._M = np.zeros((limits.poses, 9, 3, 3))
         self._scratch = [
-            (np.empty((limits.neighbors, 4)), np.empty(limits.neighbors, np.int64)) for _ in range(threads)
+            (np.empty((limits.neighbors, 4)), np.empty(limits.neighbors, np.int64), np.empty(11))
+            for _ in range(threads)
         ]
         self._columns = {name: search_columns(name) for name in ("direct1", "direct7", "radius")}
         self._pool = ThreadPoolExecutor(threads - 1, "ndt") if threads > 1 else None
@@ -50,6 +59,11 @@ class NumbaBackend:
         """End the threads."""
         if self._pool is not None:
             self._pool.shutdown()
+
+    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+        """Derive covariances and the table of addresses; nothing else is copied."""
+        del neighbors
+        voxel_map.table(covariance)
 
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on."""
@@ -67,40 +81,80 @@ class NumbaBackend:
         covariance: Covariance,
         pitch_sign: float = -1.0,
         T: NDArray[np.float64] | None = None,
+        deadline_s: float | None = None,
     ) -> Evaluation:
         """Return score, gradient and Hessian at a pose vector."""
+        del deadline_s
+        if T is not None:
+            self._T[0] = T
+        poses = np.asarray(pose, np.float64)[None]
+        return self._evaluated(poses, neighbors, covariance, pitch_sign, transforms=T is None)[0]
+
+    def evaluate_many(
+        self,
+        poses: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        deadline_s: float | None = None,
+    ) -> list[Evaluation]:
+        """Return the same as `evaluate` for each of (k, 6) poses; threads share all their chunks."""
+        del deadline_s
+        check_batch(poses, self._most_poses)
+        found: list[Evaluation] = []
+        each = max(self._most_rows // max(-(-len(self._source.points) // CHUNK_POINTS), 1), 1)
+        for first in range(0, len(poses), each):
+            part = np.ascontiguousarray(poses[first : first + each], np.float64)
+            found += self._evaluated(part, neighbors, covariance, pitch_sign)
+        return found
+
+    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+        """Return the step that an evaluation asks for."""
+        step = np.empty(6)
+        step_into(np.ascontiguousarray(at.hessian), np.ascontiguousarray(at.gradient), steady, step)
+        return step
+
+    def _evaluated(
+        self,
+        poses: NDArray[np.float64],
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float,
+        *,
+        transforms: bool = True,
+    ) -> list[Evaluation]:
+        derive(poses, pitch_sign, transforms, self._T, self._M)
         source = self._source.points
         chunks = -(-len(source) // CHUNK_POINTS)
-        threads = min(len(self._scratch), max(chunks, 1))
+        units = len(poses) * chunks
+        threads = min(len(self._scratch), max(units, 1))
         voxel_map = self._map
         gauss = gauss_for(voxel_map.leaf)
         # one leaf: every neighbour in reach of the radius lies in the 27 cells around the point
         radius2 = voxel_map.leaf**2 if neighbors == "radius" else math.inf
         table = voxel_map.table(covariance)
-        matrix = matrix_from_pose(pose) if T is None else T
-        derivatives = euler_derivatives(pose, pitch_sign)
 
         def run(part: int) -> None:
-            near, near_inverse = self._scratch[part]
             accumulate(
                 source,
-                chunks * part // threads,
-                chunks * (part + 1) // threads,
+                chunks,
                 CHUNK_POINTS,
-                matrix,
-                derivatives,
+                units * part // threads,
+                units * (part + 1) // threads,
+                self._T,
+                self._M,
+                1.0 / voxel_map.leaf,
                 table,
                 voxel_map.origins,
                 voxel_map.box,
                 voxel_map.column_start,
                 voxel_map.column_cell,
                 self._columns[neighbors],
-                1.0 / voxel_map.leaf,
                 radius2,
                 gauss.d1,
                 gauss.d2,
-                near,
-                near_inverse,
+                *self._scratch[part],
                 self._rows,
             )
 
@@ -111,4 +165,20 @@ class NumbaBackend:
             run(0)
             for other in others:
                 other.result()
-        return total(self._rows[:chunks], pose, pitch_sign)
+        found = np.empty((len(poses), CONTRACTED))
+        contract(self._rows, chunks, self._M, found)
+        return [_evaluation(row) for row in found]
+
+
+def _evaluation(row: NDArray[np.float64]) -> Evaluation:
+    score, nearest, reached, neighbours, cut_points, cut_neighbours = row[:6].tolist()
+    return Evaluation(
+        score=score,
+        gradient=row[6:12],
+        hessian=row[12:].reshape(6, 6),
+        nearest=nearest,
+        found=int(reached),
+        neighbours=int(neighbours),
+        cut_points=int(cut_points),
+        cut_neighbours=int(cut_neighbours),
+    )

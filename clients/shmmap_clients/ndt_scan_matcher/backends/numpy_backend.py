@@ -27,8 +27,9 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     search_columns,
     total,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
 from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
+from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
 
 __all__ = ["NumpyBackend"]
 
@@ -75,18 +76,30 @@ class NumpyBackend:
     """`Backend` by whole-array operations; ``threads`` are not used."""
 
     name = "numpy"
+    on_device = False
 
     def __init__(self, limits: Limits, threads: int = 1) -> None:  # noqa: ARG002
         self._source = ScanBuffer(limits.source_points)
         self._most = limits.neighbors
-        self._gaussians = _Gaussians(VoxelMap({}))
+        self._most_poses = limits.poses
+        self.most_map_bytes = limits.most_map_bytes
+        self._gaussians = self._prepared = _Gaussians(VoxelMap({}))
 
     def close(self) -> None:
         """Nothing to give back."""
 
+    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:  # noqa: ARG002
+        """Gather the map's Gaussians."""
+        prepared = self._prepared
+        if prepared.map is not voxel_map:
+            prepared = _Gaussians(voxel_map)
+        prepared.inverse(covariance)
+        self._prepared = prepared
+
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on."""
-        self._gaussians = _Gaussians(voxel_map)
+        prepared = self._prepared
+        self._gaussians = prepared if prepared.map is voxel_map else _Gaussians(voxel_map)
 
     def set_source(self, points: NDArray[np.floating]) -> int:
         """Take a scan; returns how many points the limit left out."""
@@ -100,14 +113,37 @@ class NumpyBackend:
         covariance: Covariance,
         pitch_sign: float = -1.0,
         T: NDArray[np.float64] | None = None,
+        deadline_s: float | None = None,
     ) -> Evaluation:
         """Return score, gradient and Hessian at a pose vector."""
+        del deadline_s
         matrix = matrix_from_pose(pose) if T is None else T
         J = euler_derivatives(pose, pitch_sign)[:3]
         source = self._source.points
         blocks = [source[at : at + _BLOCK_POINTS] for at in range(0, len(source), _BLOCK_POINTS)]
         rows = [self._sums(block, matrix, J, neighbors, covariance) for block in blocks]
         return total(np.array(rows).reshape(-1, SUMS), pose, pitch_sign)
+
+    def evaluate_many(
+        self,
+        poses: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        deadline_s: float | None = None,
+    ) -> list[Evaluation]:
+        """Return the same as `evaluate` for each of (k, 6) poses."""
+        del deadline_s
+        check_batch(poses, self._most_poses)
+        return [
+            self.evaluate(pose, neighbors=neighbors, covariance=covariance, pitch_sign=pitch_sign)
+            for pose in poses
+        ]
+
+    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+        """Return the step that an evaluation asks for."""
+        return numpy_step(at, steady)
 
     def _pairs(
         self,

@@ -10,6 +10,7 @@ from shmmap_clients.command_line import (
     add_allow_empty,
     add_json_option,
     add_verb,
+    complain,
     nothing_found,
     print_json,
 )
@@ -25,9 +26,10 @@ JSON (fields may be added, none is removed):
    "transform_probability", "nvtl", "oscillations", "evaluations",
    "trustworthy": bool, "no_map": bool, "failed_limits": [name],
    "covariance": 6x6 of x y z roll pitch yaw, or null,
-   "cut": {"points", "neighbor_points", "neighbors", "voxels"}: left out by
-     limits, "worst_case_ms": for the largest scan that the limits allow,
-     estimated on this machine,
+   "cut": {"points", "neighbor_points", "neighbors", "voxels", "map_bytes"}:
+     left out by limits, and "deadline": whether time was up,
+   "worst_case_ms": for the largest scan that the limits allow, estimated on
+     this machine,
    "align_ms": measured, "points", "voxels", "variant", "convention": the same,
    "neighbors", "backend"}
   failed_limits names what did not hold: no_map, converged (it did not
@@ -75,7 +77,11 @@ def run(args: argparse.Namespace) -> int:
     T_guess = pose_from(args, "--guess") if args.guess is not None else np.eye(4)
     cloud, scan = read_scan(args.map), thinned(read_scan(args.scan), args.thin or None)
     with matcher_from(args) as matcher:
-        voxel_map = VoxelMap({args.map: voxel_cell(cloud, args.leaf)}, max_voxels=matcher.limits.voxels)
+        voxel_map = VoxelMap(
+            {args.map: voxel_cell(cloud, args.leaf)},
+            max_voxels=matcher.limits.voxels,
+            max_bytes=matcher.limits.most_map_bytes,
+        )
         matcher.set_map(matcher.prepare(voxel_map))
         begin = time.perf_counter()
         result = matcher.align(scan, T_guess)
@@ -99,6 +105,8 @@ def run(args: argparse.Namespace) -> int:
                 "neighbor_points": result.cut.neighbor_points,
                 "neighbors": result.cut.neighbors,
                 "voxels": result.cut.voxels,
+                "map_bytes": result.cut.map_bytes,
+                "deadline": result.cut.deadline,
             },
             "worst_case_ms": bound.total_ms,
             "align_ms": took_ms,
@@ -109,6 +117,9 @@ def run(args: argparse.Namespace) -> int:
             "neighbors": matcher.neighbors,
             "backend": matcher.backend_name,
         }
+        fault = matcher.fault
+    if fault is not None:
+        complain("shmmap-ndt", f"{document['backend']} went on without the device: {fault}")
     if args.json:
         print_json(document)
     else:
@@ -136,5 +147,7 @@ def _print(document: dict[str, Any], failed: list[str], bound: str) -> None:
         print(f"{name:24}{value:.6f}" if isinstance(value, float) else f"{name:24}{value}")
     print(f"{'trusted':24}{'no: ' + ', '.join(failed) if failed else 'yes'}")
     cut = {name: count for name, count in document["cut"].items() if count}
-    print(f"{'left out by limits':24}{', '.join(f'{n} {c}' for n, c in cut.items()) or 'nothing'}")
+    late = "the deadline ended it" if cut.pop("deadline", False) else ""
+    left = ", ".join([*(f"{n} {c}" for n, c in cut.items()), *([late] if late else [])])
+    print(f"{'left out by limits':24}{left or 'nothing'}")
     print(f"{'time':24}{document['align_ms']:.2f} ms; {bound}")

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from shmmap_clients.backend_options import add_scoring_options, scoring_settings
 from shmmap_clients.command_line import at_least, not_negative, positive
-from shmmap_clients.shared_options import add_backend_option, add_threads_option
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
@@ -58,8 +58,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         default=None,
         help="steps that do not oscillate between two places, as the originals' can (default: if --fine)",
     )
-    add_backend_option(group)
-    add_threads_option(group)
+    add_scoring_options(group)
     limits = parser.add_argument_group("limits (what exceeds one is left out and counted)")
     limits.add_argument(
         "--max-points", type=at_least(1), metavar="N", help="points of a scan (default: 131072)"
@@ -75,6 +74,20 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         type=at_least(1),
         metavar="N",
         help="voxels of the map; whole cells are left out (default: 1000000)",
+    )
+    limits.add_argument(
+        "--max-map-bytes",
+        type=at_least(1),
+        metavar="N",
+        help="memory that matching needs of the map; whole cells are left out (default: 96 for each voxel"
+        " that is allowed)",
+    )
+    limits.add_argument(
+        "--deadline",
+        type=positive,
+        metavar="SECONDS",
+        help="for one alignment: it ends then, not converged; a device that has not answered is not waited"
+        " for (default: none)",
     )
     trust = parser.add_argument_group("trust (a result beyond one of these limits is not trusted)")
     trust.add_argument(
@@ -99,7 +112,8 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
 def matcher_from(args: argparse.Namespace) -> NdtMatcher:
     """Return the matcher that the options ask for."""
     from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
-    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Settings
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
+    from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
 
     settings = Settings(
         variant=args.variant,
@@ -110,16 +124,17 @@ def matcher_from(args: argparse.Namespace) -> NdtMatcher:
         line_search=args.line_search,
         mode="coarse_fine" if args.fine else "single",
         steady=args.steady,
+        **scoring_settings(args),
     )
-    given = {
+    given: dict[str, Any] = {
         "source_points": args.max_points,
         "neighbors": args.max_neighbors,
         "voxels": args.max_voxels,
+        "map_bytes": args.max_map_bytes,
+        "deadline_s": args.deadline,
     }
     limits = Limits(**{name: value for name, value in given.items() if value is not None})
-    return NdtMatcher(
-        settings, limits=limits, trust=trust_from(args), backend=args.backend, threads=args.threads
-    )
+    return NdtMatcher(settings, limits=limits, trust=trust_from(args), threads=args.threads)
 
 
 def trust_from(args: argparse.Namespace) -> TrustLimits:

@@ -8,6 +8,7 @@ import contextlib
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from shmmap_clients.backend_options import scoring_settings
 from shmmap_clients.command_line import add_verb, announce_scans, connect, print_json, write_text
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, trust_from
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
@@ -72,7 +73,12 @@ def run(args: argparse.Namespace) -> int:
         prediction = _prediction(args, T_first, listener)
         matcher = stack.enter_context(matcher_from(args))
         rules = MapRules(
-            args.update_distance, args.map_radius, args.lidar_radius, args.leaf, matcher.limits.voxels
+            args.update_distance,
+            args.map_radius,
+            args.lidar_radius,
+            args.leaf,
+            matcher.limits.voxels,
+            max_bytes=matcher.limits.most_map_bytes,
         )
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(MapUpdater(client, rules, prepare=matcher.prepare))
@@ -98,8 +104,11 @@ def run(args: argparse.Namespace) -> int:
             if publisher is not None:
                 publisher.send(frame)
             report.frame(frame, client, matcher.trust, maps.too_slow, relocalizer)
+            report.fault(frame, matcher)
             scan = next(scans, None)
-    summary = statistics.summary(maps.statistics, maps.too_slow, matcher.trust)
+    summary = statistics.summary(
+        maps.statistics, maps.too_slow, matcher.trust, backend=matcher.backend_name, fault=matcher.fault
+    )
     if args.plot:
         write_text(args.plot, plot.svg())
     if args.json:
@@ -146,7 +155,11 @@ def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Reloc
     def initializer() -> PoseInitializer:
         client = stack.enter_context(connect(args, "shmmap-ndt (relocalization)"))
         made = PoseInitializer(
-            client, rules, trust=trust_from(args), backend=args.backend, threads=args.threads
+            client,
+            rules,
+            trust=trust_from(args),
+            threads=args.threads,
+            **scoring_settings(args),
         )
         return stack.enter_context(made)
 

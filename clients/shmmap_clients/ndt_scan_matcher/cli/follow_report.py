@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from shmmap import Client
     from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveSummary
     from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
     from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
     from shmmap_clients.pose_initializer import Relocalizer
 
@@ -44,6 +45,7 @@ class FollowReport:
         self._state = ""
         self._no_map_told = False
         self._error_told = ""
+        self._fault_told = False
 
     def __enter__(self) -> FollowReport:
         args = self._args
@@ -100,6 +102,13 @@ class FollowReport:
         self._tell_state(frame, trust, relocalizer)
         self._progress(frame)
 
+    def fault(self, frame: Frame, matcher: NdtMatcher) -> None:
+        """Say, once, that another backend goes on."""
+        if matcher.fault is not None and not self._fault_told:
+            self._fault_told = True
+            why = matcher.fault.message
+            self._say(f"the device failed at scan {frame.name}, {matcher.backend_name} goes on: {why}")
+
     def _say_no_map(self, frame: Frame, client: Client) -> None:
         from shmmap_clients.map_extent import map_extent
 
@@ -146,6 +155,10 @@ def print_summary(summary: DriveSummary) -> None:
         f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} trusted,"
         f" {s.cut_frames} shortened by the limits"
     )
+    if s.cut_by:
+        print(f"  shortened by  {', '.join(f'{name} ({count})' for name, count in s.cut_by.items())}")
+    if s.fault is not None:
+        print(f"backend         {s.backend} went on without the device: {s.fault}")
     if s.failed_limits:
         why = (f"{s.trust.describe(name)} ({count})" for name, count in s.failed_limits.items())
         print(f"  not trusted   {', '.join(why)}")

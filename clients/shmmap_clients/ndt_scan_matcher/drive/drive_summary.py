@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import RunningErrors, TrajectoryErrors
 from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
@@ -40,6 +41,13 @@ class DriveSummary:
         How often the map did not reach far enough any more.
     cut_frames
         Scans of which a limit left something out.
+    cut_by
+        How many scans each limit left something out of: ``points``, ``neighbors``, ``voxels``, ``map_bytes``,
+        ``deadline``.
+    backend
+        Which one computed last.
+    fault
+        Why that is the fallback; None where it is not.
     errors
         None where no truth was given.
     transform_probability, nvtl, iterations
@@ -66,6 +74,9 @@ class DriveSummary:
     waited: int
     too_slow: int
     cut_frames: int
+    cut_by: dict[str, int]
+    backend: str
+    fault: str | None
     errors: TrajectoryErrors | None
     transform_probability: Spread
     nvtl: Spread
@@ -95,6 +106,7 @@ class DriveStatistics:
         self.frames = self.trustworthy = self.no_map = 0
         self._converged = self._waited = self._cut = self._lost = self._relocalized = 0
         self._failed_limits: Counter[str] = Counter()
+        self._cut_by: Counter[str] = Counter()
         self._errors = RunningErrors()
         self._results = {name: RunningSpread() for name in ("transform_probability", "nvtl", "iterations")}
         self._times = {name: RunningSpread() for name in ("latency_s", "align_s", "thin_s", "map_s")}
@@ -109,6 +121,7 @@ class DriveStatistics:
         self._failed_limits.update(result.failed_limits)
         self._waited += frame.waited
         self._cut += bool(result.cut)
+        self._cut_by.update(result.cut.by)
         self._lost += frame.state == "lost"
         self._relocalized += frame.relocalized
         if frame.T_truth is not None:
@@ -119,8 +132,16 @@ class DriveStatistics:
             for name, running in self._times.items():
                 running.add(getattr(frame, name) * 1e3)
 
-    def summary(self, updates: UpdateStatistics, too_slow: int, trust: TrustLimits) -> DriveSummary:
-        """Return the drive so far, with what its map's updates were like and the limits of trust."""
+    def summary(
+        self,
+        updates: UpdateStatistics,
+        too_slow: int,
+        trust: TrustLimits,
+        *,
+        backend: str = "numba",
+        fault: DeviceError | None = None,
+    ) -> DriveSummary:
+        """Return the drive so far; what its map's updates were like, limits of trust, who computed."""
         return DriveSummary(
             frames=self.frames,
             converged=self._converged,
@@ -133,6 +154,9 @@ class DriveStatistics:
             waited=self._waited,
             too_slow=too_slow,
             cut_frames=self._cut,
+            cut_by=dict(self._cut_by),
+            backend=backend,
+            fault=None if fault is None else str(fault),
             errors=self._errors.errors,
             transform_probability=self._results["transform_probability"].spread,
             nvtl=self._results["nvtl"].spread,

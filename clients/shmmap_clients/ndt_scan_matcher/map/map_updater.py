@@ -43,8 +43,8 @@ class MapRules:
         How far the scanner sees, metres: the area should reach beyond that.
     leaf
         Edge of a voxel, metres.
-    max_voxels
-        Limit on the map, see `VoxelMap`.
+    max_voxels, max_bytes
+        Limits on the map, see `VoxelMap`.
     wait_s
         How long a map that has to be waited for may take.
     """
@@ -55,6 +55,7 @@ class MapRules:
     leaf: float = 2.0
     max_voxels: int | None = None
     wait_s: float = 60.0
+    max_bytes: int | None = None
 
     def __post_init__(self) -> None:
         if not (self.update_distance >= 0 and self.map_radius > 0 and self.lidar_radius >= 0):
@@ -297,6 +298,7 @@ class MapUpdater:
                 VoxelMap(
                     {key: voxels for key, (_, voxels) in known.items()},
                     max_voxels=self.rules.max_voxels,
+                    max_bytes=self.rules.max_bytes,
                     centre=(x, y),
                     previous=before[0] if before is not None else None,
                 )

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Cell, LayerTable, build_layer
+from shmmap import BadRequest
+
+if TYPE_CHECKING:
+    from shmmap import Cell, LayerTable
 
 __all__ = ["VoxelCell", "cell_from_layer", "voxel_cell"]
 
@@ -52,6 +55,11 @@ class VoxelCell:
     inverse: NDArray[np.float64]
     memory: object = None
 
+    @property
+    def map_bytes(self) -> int:
+        """Bytes that matching needs of it: lattice, means and inverse covariances."""
+        return self.lattice.nbytes + self.mean.nbytes + self.inverse.nbytes
+
 
 def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6) -> VoxelCell:
     """Compute the Gaussians of a cloud, as the daemon's ``ndt`` layer has them.
@@ -70,6 +78,8 @@ def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6)
     BadRequest, MapDataError
         As `shmmap.build_layer`.
     """
+    from shmmap import build_layer
+
     return cell_from_layer(build_layer(f"ndt(leaf={leaf!r},min_points={min_points})", points))
 
 
@@ -86,6 +96,8 @@ def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
     BadRequest
         It is no ``ndt`` layer.
     """
+    from shmmap import Cell
+
     lattice = layer.header.lattice if isinstance(layer, Cell) else layer.lattice
     if lattice is None or len(set(lattice.leaf)) != 1:
         raise BadRequest("this layer has no voxels of one edge length", hint="ask for ndt(leaf=...)")

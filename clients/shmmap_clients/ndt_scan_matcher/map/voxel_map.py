@@ -19,7 +19,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, voxel_covariances
+from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
 
 __all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
@@ -39,13 +39,15 @@ class VoxelMap:
     ----------
     cells
         By any key; their order is the order of summation.
-    max_voxels
-        Cells nearest to ``centre`` are taken until the next would exceed this; the others are left
-        out and counted.
+    max_voxels, max_bytes
+        Cells nearest to ``centre`` are taken until the next would exceed one of these; the others are left
+        out and counted.  Bytes are `VoxelCell.map_bytes`.
     centre
         (x, y), metres, map frame; by default the middle of all cells.
     previous
         A map whose derived tables are used again for the cells that both have.
+    derived
+        Inverse covariances, by a cell's key and their kind, that were computed elsewhere.
 
     Raises
     ------
@@ -58,25 +60,35 @@ class VoxelMap:
         cells: Mapping[str, VoxelCell],
         *,
         max_voxels: int | None = None,
+        max_bytes: int | None = None,
         centre: tuple[float, float] | None = None,
         previous: VoxelMap | None = None,
+        derived: Mapping[str, Inverses] | None = None,
     ) -> None:
         leaves = {cell.leaf for cell in cells.values()}
         if len(leaves) > 1:
             raise BadRequest(f"cells of one map must have one leaf size, these have {sorted(leaves)}")
         self.leaf: float = leaves.pop() if leaves else 1.0
-        kept, self.voxels_left_out = _within(cells, max_voxels, centre)
+        kept = _within(cells, max_voxels, max_bytes, centre)
+        left = [cell for key, cell in cells.items() if key not in kept]
         self.cells: dict[str, VoxelCell] = kept
         self.voxels = sum(len(cell.count) for cell in kept.values())
+        self.voxels_left_out = sum(len(cell.count) for cell in left)
+        self.bytes_left_out = sum(cell.map_bytes for cell in left)
         self.origins = np.array([cell.origin for cell in kept.values()]).reshape(-1, 3)
-        self._derived: dict[str, Inverses] = {}
+        self._derived: dict[str, Inverses] = {key: dict(known) for key, known in (derived or {}).items()}
         if previous is not None:
-            self._derived = {
+            self._derived |= {
                 key: previous._derived[key]
                 for key, cell in kept.items()
                 if previous.cells.get(key) is cell and key in previous._derived
             }
         self.box, self.column_start, self.column_cell = _directory(list(kept.values()))
+        self._rows: dict[Covariance, dict[str, list[int]]] = {}
+        if previous is not None:
+            same = [key for key, cell in kept.items() if previous.cells.get(key) is cell]
+            for covariance, rows in previous._rows.items():
+                self._rows[covariance] = {key: rows[key] for key in same if key in rows}
         self._tables: dict[Covariance, NDArray[np.int64]] = {}
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
@@ -86,6 +98,8 @@ class VoxelMap:
             return cell.inverse
         derived = self._derived.setdefault(key, {})
         if covariance not in derived:
+            from shmmap import voxel_covariances
+
             derived[covariance] = voxel_covariances(cell.count, cell.scatter, covariance)[1]
         return derived[covariance]
 
@@ -93,8 +107,11 @@ class VoxelMap:
         """Return the kernel's table, (C, `TABLE_COLUMNS`); valid as long as this map lives."""
         table = self._tables.get(covariance)
         if table is None:
-            rows = [_row(cell, self.inverses(key, covariance)) for key, cell in self.cells.items()]
-            table = np.array(rows, np.int64).reshape(-1, TABLE_COLUMNS)
+            rows = self._rows.setdefault(covariance, {})
+            for key, cell in self.cells.items():
+                if key not in rows:
+                    rows[key] = _row(cell, self.inverses(key, covariance))
+            table = np.array([rows[key] for key in self.cells], np.int64).reshape(-1, TABLE_COLUMNS)
             self._tables[covariance] = table
         return table
 
@@ -111,25 +128,24 @@ class VoxelMap:
 
 
 def _within(
-    cells: Mapping[str, VoxelCell], max_voxels: int | None, centre: tuple[float, float] | None
-) -> tuple[dict[str, VoxelCell], int]:
-    total = sum(len(cell.count) for cell in cells.values())
-    if max_voxels is None or total <= max_voxels:
-        return dict(cells), 0
+    cells: Mapping[str, VoxelCell],
+    max_voxels: int | None,
+    max_bytes: int | None,
+    centre: tuple[float, float] | None,
+) -> dict[str, VoxelCell]:
+    most = np.array([np.inf if limit is None else limit for limit in (max_voxels, max_bytes)])
+    sizes = np.array([(len(cell.count), cell.map_bytes) for cell in cells.values()]).reshape(-1, 2)
+    if (sizes.sum(axis=0) <= most).all():
+        return dict(cells)
     keys = list(cells)
     low = np.array([cell.lattice_origin[:2] for cell in cells.values()], np.float64)
     size = np.array([cell.lattice.shape[:2] for cell in cells.values()], np.float64)
     middle = (low + size / 2) * next(iter(cells.values())).leaf
     target = np.array(centre) if centre is not None else middle.mean(axis=0)
-    chosen: set[str] = set()
-    count = 0
-    for index in np.argsort(((middle - target) ** 2).sum(axis=1), kind="stable"):
-        size_here = len(cells[keys[index]].count)
-        if count + size_here > max_voxels:
-            break
-        count += size_here
-        chosen.add(keys[index])
-    return {key: cell for key, cell in cells.items() if key in chosen}, total - count
+    nearest = np.argsort(((middle - target) ** 2).sum(axis=1), kind="stable")
+    fits = (np.cumsum(sizes[nearest], axis=0) <= most).all(axis=1)
+    chosen = {keys[index] for index in nearest[np.logical_and.accumulate(fits)]}
+    return {key: cell for key, cell in cells.items() if key in chosen}
 
 
 def _directory(
@@ -137,7 +153,7 @@ def _directory(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
     """Return (i0, j0, ni, nj), where each column's cells start, and the cells."""
     boxes = [
-        (index, *map(int, cell.lattice_origin[:2]), *cell.lattice.shape[:2])
+        (index, *cell.lattice_origin[:2].tolist(), *cell.lattice.shape[:2])
         for index, cell in enumerate(cells)
         if len(cell.count)
     ]

@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["euler_derivatives", "matrix_from_pose", "pose_from_matrix"]
+__all__ = ["SMALL_ANGLE", "euler_derivatives", "matrix_from_pose", "pose_from_matrix"]
 
-_SMALL_ANGLE: Final = 10e-5  # below it the originals take the angle for zero in derivatives
+SMALL_ANGLE: Final = 10e-5  # below it the originals take the angle for zero in derivatives
 
 
 def _sines(pose: NDArray[np.float64], small: float) -> tuple[float, ...]:
@@ -62,7 +62,7 @@ def euler_derivatives(pose: NDArray[np.float64], pitch_sign: float = -1.0) -> ND
     (9, 3, 3) float64
         After roll, pitch, yaw; then roll-roll, roll-pitch, roll-yaw, pitch-pitch, pitch-yaw, yaw-yaw.
     """
-    cx, sx, cy, sy, cz, sz = _sines(pose, _SMALL_ANGLE)
+    cx, sx, cy, sy, cz, sz = _sines(pose, SMALL_ANGLE)
     a = (-sx * sz + cx * sy * cz, -sx * cz - cx * sy * sz, -cx * cy)
     b = (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy)
     d = (sx * cy * cz, -sx * cy * sz, sx * sy)

@@ -22,8 +22,15 @@ __all__ = [
     "AX",
     "BJ",
     "CHUNK_POINTS",
+    "CUT_NEIGHBOURS",
+    "CUT_POINTS",
+    "FOUND",
     "JBJ",
+    "NEAREST",
     "NEGLIGIBLE_EXPONENT",
+    "NEIGHBOURS",
+    "NOTHING",
+    "SCORE",
     "SUMS",
     "A",
     "B",
@@ -114,6 +121,10 @@ class Evaluation:
     def nvtl(self) -> float:
         """Nearest-voxel transformation likelihood; zero where no point has a neighbour."""
         return self.nearest / self.found if self.found else 0.0
+
+
+NOTHING: Final = Evaluation(0.0, np.zeros(6), np.zeros((6, 6)), 0.0, 0, 0, 0, 0)
+"""What a pose without any neighbour is worth."""
 
 
 def total(rows: NDArray[np.float64], pose: NDArray[np.float64], pitch_sign: float) -> Evaluation:

@@ -3,70 +3,35 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import TracebackType
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, Neighbors
+from shmmap_clients.ndt_scan_matcher.backends.fallback_backend import FallbackBackend
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS
-from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, ascend
+from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, climb, started
 from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
 from shmmap_clients.ndt_scan_matcher.matching.result import Result, covariance_of, oscillations
+from shmmap_clients.ndt_scan_matcher.matching.settings import Settings, rule_of
 from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 from shmmap_clients.ndt_scan_matcher.matching.variants import VARIANTS, Variant, variant_named
 
-__all__ = ["Mode", "NdtMatcher", "Settings"]
-
-Mode = Literal["single", "coarse_fine"]
+__all__ = ["NdtMatcher"]
 
 _REACH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
 _SHARED_PLACES: Final = 4  # at a corner of four cells each has its own voxel in one lattice place
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How to align; what is None is the variant's own default.
-
-    Attributes
-    ----------
-    variant
-        ``"autoware"``, ``"pclomp"`` or ``"pcl"``: covariances, stop rule and neighbours of that program.
-    neighbors
-        ``"direct1"``, ``"direct7"`` or ``"radius"`` (all voxels whose mean is within one leaf).
-    epsilon
-        Steps below this end the alignment; metres and radians, and square metres for ``pcl``.
-    max_iterations
-    step_size
-        Longest step, metres and radians.
-    line_search
-        More-Thuente's line search.
-    mode
-        ``"coarse_fine"``: when the variant's alignment has ended, continue from there with the voxels' true
-        covariances: the wide basin of the one and the accuracy of the other.
-    fine_epsilon
-        Where the fine part stops.
-    steady
-        Steps that never swing, see `StepRule`; default: not in ``"single"``, which equals the originals.
-    """
-
-    variant: str = "autoware"
-    neighbors: Neighbors | None = None
-    epsilon: float | None = None
-    max_iterations: int | None = None
-    step_size: float = 0.1
-    line_search: bool | None = None
-    mode: Mode = "single"
-    fine_epsilon: float = 0.002
-    steady: bool | None = None
 
 
 class NdtMatcher:
@@ -79,7 +44,7 @@ class NdtMatcher:
     trust
         What a result has to reach to be trusted.
     backend
-        ``"numba"`` or ``"numpy"``.
+        Another one than the settings name.
     threads
         Results do not depend on it.
 
@@ -87,6 +52,8 @@ class NdtMatcher:
     ------
     BadRequest
         A setting makes no sense.
+    DeviceError
+        There is no such device, or it cannot do what settings and limits ask for.
     """
 
     def __init__(
@@ -95,20 +62,28 @@ class NdtMatcher:
         *,
         limits: Limits | None = None,
         trust: TrustLimits | None = None,
-        backend: str = "numba",
+        backend: str | None = None,
         threads: int = 1,
     ) -> None:
         self.settings = settings if settings is not None else Settings()
         self.limits = limits if limits is not None else Limits()
         self._trust = trust if trust is not None else TrustLimits()
         self._variant = variant_named(self.settings.variant)
-        self._rule = _rule(self.settings, self._variant, self.limits)
+        self._rule = rule_of(self.settings, self._variant, self.limits)
         self._neighbors: Neighbors = self.settings.neighbors or self._variant.neighbors
         if self._neighbors not in ("direct1", "direct7", "radius"):
             raise BadRequest(
                 f"unknown neighbour search {self._neighbors!r}", hint="it is direct1, direct7 or radius"
             )
-        self._backend = backend_named(backend, self.limits, threads)
+        self._backend: Backend = backend_named(
+            self.settings.backend if backend is None else backend,
+            self.limits,
+            threads,
+            self.settings.device,
+            fallback=self.settings.fallback,
+        )
+        if self._backend.most_map_bytes < self.limits.most_map_bytes:
+            self.limits = replace(self.limits, map_bytes=self._backend.most_map_bytes)
         self._map = VoxelMap({})
 
     def __enter__(self) -> NdtMatcher:
@@ -127,6 +102,16 @@ class NdtMatcher:
     def backend_name(self) -> str:
         """Name of what computes."""
         return self._backend.name
+
+    @property
+    def on_device(self) -> bool:
+        """Whether the work is done elsewhere than in threads of this process."""
+        return self._backend.on_device
+
+    @property
+    def fault(self) -> DeviceError | None:
+        """Why the fallback computes; None as long as it does not."""
+        return self._backend.fault if isinstance(self._backend, FallbackBackend) else None
 
     @property
     def neighbors(self) -> Neighbors:
@@ -163,10 +148,12 @@ class NdtMatcher:
         self._backend.set_map(voxel_map)
 
     def prepare(self, voxel_map: VoxelMap) -> VoxelMap:
-        """Compute what alignments will need of a map, so that none of them waits for it."""
-        voxel_map.table(self._variant.covariance)
-        if self.settings.mode == "coarse_fine":
-            voxel_map.table("pcl")
+        """Compute what alignments will need of a map, so that none of them waits for it; from any thread."""
+        covariances: list[Covariance] = [self._variant.covariance]
+        if self.settings.mode == "coarse_fine" and "pcl" not in covariances:
+            covariances.append("pcl")
+        for covariance in covariances:
+            self._backend.prepare(voxel_map, neighbors=self._neighbors, covariance=covariance)
         return voxel_map
 
     def align(
@@ -191,56 +178,115 @@ class NdtMatcher:
         ------
         BadRequest
             Shapes are wrong, or the guess is not finite.
+        DeviceError
+            A device failed, or had not answered at the deadline, and there is no fallback.
         """
-        guess = np.array(T_guess, np.float64)
-        if guess.shape != (4, 4) or not np.isfinite(guess).all():
+        return self.align_many(points, [T_guess], regularization=regularization)[0]
+
+    def align_many(
+        self,
+        points: NDArray[np.floating],
+        T_guesses: Sequence[NDArray[np.floating]],
+        *,
+        regularization: Regularization | None = None,
+    ) -> list[Result]:
+        """Align from several guesses at once: the same results as one after the other, evaluated in batches.
+
+        Parameters and errors are those of `align`; the deadline is that of all together.
+        """
+        deadline_s = None if self.limits.deadline_s is None else time.monotonic() + self.limits.deadline_s
+        guesses = [np.array(T_guess, np.float64) for T_guess in T_guesses]
+        if any(guess.shape != (4, 4) or not np.isfinite(guess).all() for guess in guesses):
             raise BadRequest("a guess is a (4, 4) matrix of finite numbers")
         dropped = self._backend.set_source(points)
         used = len(points) - dropped
-        way = self._ascend(guess, self._variant, self._rule, regularization)
-        ways = [way]
-        if self.settings.mode == "coarse_fine" and way.last.found:
+        coarse = self._climb(guesses, self._rule, regularization, deadline_s)
+        ways = [[way] for way in coarse]
+        if self.settings.mode == "coarse_fine":
             fine = replace(
                 self._rule,
-                variant=VARIANTS["pcl"],
+                variant=replace(VARIANTS["pcl"], stop="step"),
                 epsilon=self.settings.fine_epsilon,
                 line_search=False,
             )
-            fine = replace(fine, variant=replace(fine.variant, stop="step"))
-            ways.append(self._ascend(way.transforms[-1], fine.variant, fine, regularization))
-        return self._result(ways, used, dropped)
+            on = [number for number, way in enumerate(coarse) if way.last.found and not way.time_is_up]
+            arrived = [coarse[number].transforms[-1] for number in on]
+            for number, way in zip(on, self._climb(arrived, fine, regularization, deadline_s), strict=True):
+                ways[number].append(way)
+        return [self._result(way, used, dropped) for way in ways]
 
     def evaluate(self, points: NDArray[np.floating], poses: NDArray[np.float64]) -> list[Evaluation]:
-        """Score a scan at several pose vectors, (k, 6), without moving them."""
+        """Score a scan at several pose vectors, (k, 6), without moving them; in batches of the limit."""
         self._backend.set_source(points)
-        return [self._evaluate(pose, self._variant, None, None) for pose in poses]
+        found: list[Evaluation] = []
+        for first in range(0, len(poses), self.limits.poses):
+            found += self._backend.evaluate_many(
+                np.asarray(poses[first : first + self.limits.poses], np.float64),
+                neighbors=self._neighbors,
+                covariance=self._variant.covariance,
+                pitch_sign=self._variant.pitch_sign,
+            )
+        return found
 
-    def _ascend(
+    def _climb(
         self,
-        T_guess: NDArray[np.float64],
-        variant: Variant,
+        guesses: Sequence[NDArray[np.float64]],
         rule: StepRule,
         regularization: Regularization | None,
-    ) -> Ascent:
-        def evaluate(pose: NDArray[np.float64], pitch_sign: float) -> Evaluation:
-            return self._evaluate(pose, variant, pitch_sign, regularization)
+        deadline_s: float | None,
+    ) -> list[Ascent]:
+        """Climb from all guesses side by side."""
+        ascents = [started(T_guess) for T_guess in guesses]
+        climbs = [climb(ascent, rule, self._step) for ascent in ascents]
+        # who still climbs, with the pose and the pitch sign that it wants evaluated next
+        wanted = {number: next(one) for number, one in enumerate(climbs)}
+        begun = False
+        while wanted:
+            if begun and deadline_s is not None and time.monotonic() >= deadline_s:
+                for number in wanted:
+                    ascents[number].time_is_up = True
+                break
+            begun = True
+            for number, at in self._evaluated(wanted, rule.variant, deadline_s):
+                pose = wanted[number][0]
+                if regularization is not None:
+                    at = regularization.applied(at, pose)
+                try:
+                    wanted[number] = climbs[number].send(at)
+                except StopIteration:
+                    del wanted[number]
+        return ascents
 
-        return ascend(T_guess, evaluate, rule)
+    def _evaluated(
+        self, wanted: dict[int, tuple[NDArray[np.float64], float]], variant: Variant, deadline_s: float | None
+    ) -> list[tuple[int, Evaluation]]:
+        if len(wanted) == 1:
+            ((number, (pose, sign)),) = wanted.items()
+            at = self._backend.evaluate(
+                pose,
+                neighbors=self._neighbors,
+                covariance=variant.covariance,
+                pitch_sign=sign,
+                deadline_s=deadline_s,
+            )
+            return [(number, at)]
+        found: list[tuple[int, Evaluation]] = []
+        for sign in sorted({sign for _, sign in wanted.values()}):
+            numbers = [number for number, (_, one) in wanted.items() if one == sign]
+            for first in range(0, len(numbers), self.limits.poses):
+                some = numbers[first : first + self.limits.poses]
+                evaluations = self._backend.evaluate_many(
+                    np.array([wanted[number][0] for number in some]),
+                    neighbors=self._neighbors,
+                    covariance=variant.covariance,
+                    pitch_sign=sign,
+                    deadline_s=deadline_s,
+                )
+                found += zip(some, evaluations, strict=True)
+        return found
 
-    def _evaluate(
-        self,
-        pose: NDArray[np.float64],
-        variant: Variant,
-        pitch_sign: float | None,
-        regularization: Regularization | None,
-    ) -> Evaluation:
-        found = self._backend.evaluate(
-            pose,
-            neighbors=self._neighbors,
-            covariance=variant.covariance,
-            pitch_sign=variant.pitch_sign if pitch_sign is None else pitch_sign,
-        )
-        return found if regularization is None else regularization.applied(found, pose)
+    def _step(self, at: Evaluation, steady: bool) -> NDArray[np.float64]:
+        return self._backend.step(at, steady=steady)
 
     def _result(self, ways: Sequence[Ascent], used: int, dropped: int) -> Result:
         last = ways[-1].last
@@ -264,7 +310,14 @@ class NdtMatcher:
             covariance=covariance_of(last.hessian),
             oscillations=swings,
             evaluations=len(evaluations),
-            cut=Cut(dropped, last.cut_points, last.cut_neighbours, self._map.voxels_left_out),
+            cut=Cut(
+                points=dropped,
+                neighbor_points=last.cut_points,
+                neighbors=last.cut_neighbours,
+                voxels=self._map.voxels_left_out,
+                map_bytes=self._map.bytes_left_out,
+                deadline=any(way.time_is_up for way in ways),
+            ),
             no_map=no_map,
             failed_limits=self.trust.failed(
                 no_map=no_map,
@@ -274,20 +327,3 @@ class NdtMatcher:
                 oscillations=swings,
             ),
         )
-
-
-def _rule(settings: Settings, variant: Variant, limits: Limits) -> StepRule:
-    epsilon = variant.epsilon if settings.epsilon is None else settings.epsilon
-    iterations = variant.max_iterations if settings.max_iterations is None else settings.max_iterations
-    if not epsilon > 0 or not settings.step_size > 0 or not settings.fine_epsilon > 0 or iterations < 1:
-        raise BadRequest(
-            "epsilon, step_size and max_iterations must be positive,"
-            f" they are {epsilon}, {settings.step_size} and {iterations}"
-        )
-    if settings.mode not in ("single", "coarse_fine"):
-        raise BadRequest(f"unknown mode {settings.mode!r}", hint="it is single or coarse_fine")
-    if limits.iterations is not None:
-        iterations = min(iterations, limits.iterations)
-    line_search = variant.line_search if settings.line_search is None else settings.line_search
-    steady = settings.mode == "coarse_fine" if settings.steady is None else settings.steady
-    return StepRule(variant, epsilon, settings.step_size, iterations, line_search, steady)

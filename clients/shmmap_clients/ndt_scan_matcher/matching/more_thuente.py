@@ -7,15 +7,16 @@ case, see `search_step`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-__all__ = ["MAX_TRIALS", "search_step"]
+__all__ = ["MAX_TRIALS", "line_search", "search_step"]
 
 MAX_TRIALS: Final = 10
+Search = Generator[float, tuple[float, float], tuple[float, int]]
 _MU: Final = 1e-4  # sufficient decrease, eq. 1.1
 _NU: Final = 0.9  # curvature, eq. 1.2
 
@@ -55,8 +56,37 @@ def search_step(
         Where the last trial has become the lower end: PCL 1.13 takes the cubic through the upper end,
         ndt_omp divides by zero.
     """
+    search = line_search(first, step_min, step_max, phi_0, slope_0, by_upper_end=by_upper_end)
+    a = next(search)
+    try:
+        while True:
+            a = search.send(phi(a))
+    except StopIteration as ended:
+        found: tuple[float, int] = ended.value
+        return found
+
+
+def line_search(
+    first: float,
+    step_min: float,
+    step_max: float,
+    phi_0: float,
+    slope_0: float,
+    *,
+    by_upper_end: bool,
+) -> Search:
+    """Search as `search_step`, for who has value and slope of each trial only later: yields the trials."""
+    search = _search(first, step_min, step_max, np.float64(phi_0), np.float64(slope_0), by_upper_end)
     with np.errstate(all="ignore"):
-        return _search(first, step_min, step_max, np.float64(phi_0), np.float64(slope_0), phi, by_upper_end)
+        trial = next(search)
+    while True:
+        value_and_slope = yield trial
+        try:
+            with np.errstate(all="ignore"):
+                trial = search.send(value_and_slope)
+        except StopIteration as ended:
+            found: tuple[float, int] = ended.value
+            return found
 
 
 def _search(
@@ -65,16 +95,15 @@ def _search(
     step_max: float,
     phi_0: np.float64,
     slope_0: np.float64,
-    phi: Callable[[float], tuple[float, float]],
     by_upper_end: bool,
-) -> tuple[float, int]:
+) -> Search:
     zero = np.float64(0.0)
     # psi(a) = phi(a) - phi(0) - mu phi'(0) a, eq. 2.1
     low = _Point(zero, zero, slope_0 - _MU * slope_0)
     high = _Point(zero, zero, slope_0 - _MU * slope_0)
     converged, opened = step_max - step_min < 0, True
     a = np.float64(_clip(first, step_min, step_max))
-    value, slope = phi(float(a))
+    value, slope = yield float(a)
     at_phi = _Point(a, np.float64(value), np.float64(slope))
     at_psi = _psi(at_phi, phi_0, slope_0)
     trials = 0
@@ -82,7 +111,7 @@ def _search(
         a = np.float64(
             _clip(_trial(low, high, at_psi if opened else at_phi, by_upper_end), step_min, step_max)
         )
-        value, slope = phi(float(a))
+        value, slope = yield float(a)
         at_phi = _Point(a, np.float64(value), np.float64(slope))
         at_psi = _psi(at_phi, phi_0, slope_0)
         if opened and at_psi.f <= 0 and at_psi.g >= 0:

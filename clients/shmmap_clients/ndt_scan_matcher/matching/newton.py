@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -11,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
-from shmmap_clients.ndt_scan_matcher.matching.more_thuente import search_step
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import NOTHING, Evaluation
+from shmmap_clients.ndt_scan_matcher.matching.more_thuente import line_search
+from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
 from shmmap_clients.ndt_scan_matcher.matching.variants import Variant
 
-__all__ = ["Ascent", "StepRule", "ascend"]
-
-# what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
-_SINGULAR: Final = 6 * np.finfo(np.float64).eps
+__all__ = ["Ascent", "Step", "StepRule", "ascend", "climb", "started"]
 
 _BACK: Final = 0.5  # negated cosine between steps of which one goes back on the other
 _MAY_LOSE: Final = 0.1  # of the score, by one steady step
-_FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
 
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
+Step = Callable[[Evaluation, bool], NDArray[np.float64]]
+Climb = Generator[tuple[NDArray[np.float64], float], Evaluation, None]
+"""Asks for evaluations, each at a pose vector and with a pitch sign, and gets them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +60,25 @@ class StepRule:
 
 @dataclass(slots=True)
 class Ascent:
-    """The way from the guess to the peak."""
+    """The way from the guess to the peak, as far as it has come."""
 
     pose: NDArray[np.float64]
-    last: Evaluation
-    evaluations: list[Evaluation]
-    transforms: list[NDArray[np.float64]] = field(default_factory=list)
+    transforms: list[NDArray[np.float64]]
+    last: Evaluation = NOTHING
+    evaluations: list[Evaluation] = field(default_factory=list)
     iterations: int = 0
     converged: bool = False
+    time_is_up: bool = False
 
 
-def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> Ascent:
+def started(T_guess: NDArray[np.float64]) -> Ascent:
+    """Return the beginning of a way."""
+    return Ascent(pose_from_matrix(T_guess), [T_guess])
+
+
+def ascend(
+    T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule, step_of: Step = numpy_step
+) -> Ascent:
     """Climb from a guess.
 
     Parameters
@@ -78,21 +87,34 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
     evaluate
         Gives an evaluation for a pose vector and a pitch sign.
     rule
+    step_of
+        Gives the step that an evaluation asks for, steady or not.
     """
-    pose = pose_from_matrix(T_guess)
-    at = evaluate(pose, rule.variant.pitch_sign)
-    ascent = Ascent(pose, at, [at], [T_guess])
+    ascent = started(T_guess)
+    way = climb(ascent, rule, step_of)
+    asked = next(way)
+    with suppress(StopIteration):
+        while True:
+            asked = way.send(evaluate(*asked))
+    return ascent
+
+
+def climb(ascent: Ascent, rule: StepRule, step_of: Step = numpy_step) -> Climb:
+    """Climb, one evaluation after the other; who gives them may climb many ways at once, or stop."""
+    at = yield ascent.pose, rule.variant.pitch_sign
+    ascent.last = at
+    ascent.evaluations.append(at)
     longest, before, settling = rule.max_step, np.zeros(6), False
     while True:
-        step = _upward_step(at) if rule.steady else _newton_step(at)
+        step = step_of(at, rule.steady)
         wanted = float(np.linalg.norm(step))
         if wanted == 0.0 or wanted != wanted:
             ascent.converged = wanted == 0.0 and at.found > 0
-            return ascent
+            return
         direction = step / wanted
         if rule.steady and not settling and float(direction @ before) < -_BACK:
             settling, longest = True, longest / 2
-        length, direction, reached = _take_step(ascent, at, wanted, direction, evaluate, rule, longest)
+        length, direction, reached = yield from _take_step(ascent, at, wanted, direction, rule, longest)
         may_lose = 0.0 if settling else _MAY_LOSE * abs(at.score)
         if rule.steady and reached.score < at.score - may_lose:
             longest = length / 2
@@ -108,32 +130,7 @@ def ascend(T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule) -> 
         ascent.iterations += 1
         if small or _is_last(ascent.iterations, rule):
             ascent.converged = small
-            return ascent
-
-
-def _newton_step(at: Evaluation) -> NDArray[np.float64]:
-    """Solve H step = -gradient in the least-squares sense, as JacobiSVD does."""
-    if not np.isfinite(at.hessian).all():
-        return np.full(6, np.nan)
-    u, s, vt = np.linalg.svd(at.hessian)
-    if not s[0] > 0:
-        return np.zeros(6)
-    usable = s > max(s[0] * _SINGULAR, np.finfo(np.float64).tiny)
-    coefficients = np.zeros(6)
-    coefficients[usable] = (u.T @ -at.gradient)[usable] / s[usable]
-    return np.asarray(vt.T @ coefficients, np.float64)
-
-
-def _upward_step(at: Evaluation) -> NDArray[np.float64]:
-    """Return the step to the peak of a paraboloid that curves down by the Hessian's magnitudes."""
-    if not np.isfinite(at.hessian).all():
-        return np.full(6, np.nan)
-    values, vectors = np.linalg.eigh(at.hessian)
-    curvature = np.abs(values)
-    if not curvature.max() > 0:
-        return np.zeros(6)
-    curvature = np.maximum(curvature, curvature.max() * _FLAT)
-    return np.asarray(vectors @ ((vectors.T @ at.gradient) / curvature), np.float64)
+            return
 
 
 def _take_step(
@@ -141,10 +138,9 @@ def _take_step(
     at: Evaluation,
     length: float,
     direction: NDArray[np.float64],
-    evaluate: Evaluate,
     rule: StepRule,
     longest: float,
-) -> tuple[float, NDArray[np.float64], Evaluation]:
+) -> Generator[tuple[NDArray[np.float64], float], Evaluation, tuple[float, NDArray[np.float64], Evaluation]]:
     """Return the step's length and direction, and the evaluation where it ends."""
     sign = rule.variant.pitch_sign
     slope = -float(at.gradient @ direction)
@@ -153,24 +149,25 @@ def _take_step(
     if slope > 0.0:  # away from the peak: the Hessian is not negative definite here
         slope, direction = -slope, -direction
     shortest = rule.epsilon / 2.0
-    start, latest = ascent.pose, at
-
-    def phi(a: float) -> tuple[float, float]:
-        nonlocal latest
-        latest = evaluate(start + direction * a, sign)
-        ascent.evaluations.append(latest)
-        return -latest.score, -float(latest.gradient @ direction)
-
+    start = ascent.pose
     if not rule.line_search:
         length = max(min(length, longest), shortest)
-        phi(length)
+        latest = yield start + direction * length, sign
+        ascent.evaluations.append(latest)
         return length, direction, latest
-    length, trials = search_step(
-        length, shortest, longest, -at.score, slope, phi, by_upper_end=rule.variant.name == "pcl"
-    )
+    search = line_search(length, shortest, longest, -at.score, slope, by_upper_end=rule.variant.name == "pcl")
+    trial = next(search)
+    while True:
+        latest = yield start + direction * trial, sign
+        ascent.evaluations.append(latest)
+        try:
+            trial = search.send((-latest.score, -float(latest.gradient @ direction)))
+        except StopIteration as ended:
+            length, trials = ended.value
+            break
     if trials and sign > 0:
         # ndt_omp computes the Hessian anew after a search, and there with the right sign
-        latest = evaluate(start + direction * length, -1.0)
+        latest = yield start + direction * length, -1.0
     return length, direction, latest
 
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,15 +14,15 @@ __all__ = ["ScanBuffer"]
 
 
 class ScanBuffer:
-    """Room for a scan of at most ``most`` points."""
+    """Room for a scan of at most ``most`` points, as numbers of ``dtype``."""
 
-    def __init__(self, most: int) -> None:
-        self._buffer = np.empty((most, 3))
+    def __init__(self, most: int, dtype: np.dtype[Any] | type = np.float64) -> None:
+        self._buffer: NDArray[Any] = np.empty((most, 3), dtype)
         self._count = 0
 
     @property
-    def points(self) -> NDArray[np.float64]:
-        """The scan, (N, 3) float64, metres."""
+    def points(self) -> NDArray[Any]:
+        """The scan, (N, 3), metres."""
         return self._buffer[: self._count]
 
     def take(self, points: NDArray[np.floating]) -> int:
@@ -34,7 +36,9 @@ class ScanBuffer:
         given, most = len(points), len(self._buffer)
         self._count = min(given, most)
         if given <= most:
-            self._buffer[:given] = points
+            with np.errstate(over="ignore"):
+                self._buffer[:given] = points
         else:
-            np.copyto(self._buffer, points[np.arange(most) * given // most])
+            with np.errstate(over="ignore"):
+                np.copyto(self._buffer, points[np.arange(most) * given // most], casting="same_kind")
         return given - self._count

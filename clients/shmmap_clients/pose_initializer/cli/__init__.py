@@ -7,11 +7,13 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from shmmap_clients.backend_options import add_scoring_options, scoring_settings
 from shmmap_clients.command_line import (
     add_allow_empty,
     add_daemon_options,
     add_json_option,
     at_least,
+    complain,
     connect,
     nothing_found,
     print_json,
@@ -19,14 +21,12 @@ from shmmap_clients.command_line import (
 )
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 from shmmap_clients.shared_options import (
-    add_backend_option,
     add_height_option,
     add_leaf_option,
     add_radius_option,
     add_scan_option,
     add_sigma_options,
     add_thin_option,
-    add_threads_option,
 )
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_thin_option(parser, default=1.0)
     add_leaf_option(parser)
     add_radius_option(parser)
-    add_backend_option(parser)
-    add_threads_option(parser)
+    add_scoring_options(parser, all_processors=True)
     add_allow_empty(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
@@ -108,7 +107,7 @@ def _run(args: argparse.Namespace) -> int:
     scan = thinned(read_scan(args.scan), args.thin or None)
     with (
         connect(args, _NAME) as client,
-        PoseInitializer(client, rules, backend=args.backend, threads=args.threads) as initializer,
+        PoseInitializer(client, rules, threads=args.threads, **scoring_settings(args)) as initializer,
     ):
         try:
             found = initializer.initialize(scan, rough)
@@ -116,6 +115,8 @@ def _run(args: argparse.Namespace) -> int:
             if args.json:
                 print_json(_document(None))
             return nothing_found(args, error.message, name=_NAME)
+        if initializer.fault is not None:
+            complain(_NAME, f"{args.fallback} went on without the device: {initializer.fault}")
     if args.json:
         print_json(_document(found))
     else:

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OpenCL devices of this machine: which there are, what they can do, which one is taken."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any, Final
+
+from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.opencl.drivers import make_drivers_known
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import NoDevice
+
+__all__ = ["NO_DRIVER_HINT", "Device", "DeviceInfo", "choose_device", "list_devices"]
+
+_VARIABLE: Final = "SHMMAP_OPENCL_DEVICE"
+NO_DRIVER_HINT: Final = (
+    "`apt install pocl-opencl-icd` brings one for processors, the vendor's package one for its GPU; in a"
+    " container, /etc/OpenCL/vendors must have the driver's .icd file, too; PoCL without a cache directory"
+    " that it can write (POCL_CACHE_DIR) shows no device"
+)
+_PREFERENCE: Final = ("GPU", "accelerator", "CPU", "other")
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """What a device says of itself.
+
+    Attributes
+    ----------
+    index
+        By which it can be chosen.
+    name, platform, driver
+    kind
+        ``"GPU"``, ``"accelerator"``, ``"CPU"`` or ``"other"``.
+    fp64
+        Whether it has double precision.
+    memory_bytes, most_bytes
+        Its memory, and the most that one buffer may have.
+    unified
+        Whether that is the processor's memory, too.
+    svm_system
+        Whether it reads all memory of the process (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
+    unusable
+        Why it cannot be used; empty if it can.
+    """
+
+    index: int
+    name: str
+    platform: str
+    driver: str
+    kind: str
+    fp64: bool
+    memory_bytes: int
+    most_bytes: int
+    unified: bool
+    svm_system: bool
+    unusable: str
+
+    def describe(self) -> str:
+        """Return one line for people."""
+        able = [
+            self.kind,
+            f"driver {self.platform} {self.driver}",
+            "double" if self.fp64 else "float only",
+            f"{self.memory_bytes / 2**30:.1f} GiB{' shared with the processor' if self.unified else ''}",
+        ]
+        able.append("reads segments in place" if self.svm_system else "map is copied")
+        return f"{self.index}  {self.name}: {', '.join(able)}; {self.unusable or 'usable'}"
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """A device that was chosen, ready to use.
+
+    Attributes
+    ----------
+    info
+    handle
+        The ``pyopencl.Device``.
+    double
+        Whether it computes in double precision.
+    in_place
+        Whether it reads the map's segments where they lie.
+    """
+
+    info: DeviceInfo
+    handle: Any
+    double: bool
+    in_place: bool
+
+    @property
+    def is_processor(self) -> bool:
+        """Whether its work-items are a processor's threads."""
+        return self.info.kind == "CPU"
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return all devices, in the order of their indices.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        pyopencl is not installed.
+    """
+    return [info for info, _ in _found()]
+
+
+def choose_device(options: DeviceOptions) -> Device:
+    """Return the device that is asked for; never another one.
+
+    Raises
+    ------
+    NoDevice
+        There is none, or it cannot do what is asked.
+    ModuleNotFoundError
+        pyopencl is not installed.
+    """
+    found = _found()
+    if not found:
+        raise NoDevice(
+            "no OpenCL device: no driver is installed, or none of them has a device", hint=NO_DRIVER_HINT
+        )
+    wanted = options.device if options.device is not None else os.environ.get(_VARIABLE) or None
+    info, handle = _first_preferred(found) if wanted is None else _named(found, wanted)
+    if info.unusable:
+        raise NoDevice(f"device {info.name!r} cannot be used: {info.unusable}")
+    if options.precision == "double" and not info.fp64:
+        raise NoDevice(
+            f"device {info.name!r} has no double precision (cl_khr_fp64)",
+            hint="--precision float asks for less",
+        )
+    double = info.fp64 if options.precision == "auto" else options.precision == "double"
+    if options.memory == "svm" and not double:
+        raise NoDevice(
+            "segments have double precision: a program that computes with floats cannot read them in place",
+            hint="--memory copy, or --precision double",
+        )
+    in_place = double and (options.memory == "svm" or (options.memory == "auto" and info.svm_system))
+    return Device(info, handle, double, in_place)
+
+
+def _named(found: list[tuple[DeviceInfo, Any]], wanted: str) -> tuple[DeviceInfo, Any]:
+    for info, handle in found:
+        if wanted == str(info.index) or (not wanted.isdigit() and wanted.lower() in info.name.lower()):
+            return info, handle
+    have = "; ".join(f"{info.index} {info.name}" for info, _ in found)
+    raise NoDevice(f"no OpenCL device {wanted!r}", hint=f"by index or part of the name: {have}")
+
+
+def _first_preferred(found: list[tuple[DeviceInfo, Any]]) -> tuple[DeviceInfo, Any]:
+    usable = [one for one in found if not one[0].unusable] or found
+    return min(usable, key=lambda one: _PREFERENCE.index(one[0].kind))
+
+
+def _found() -> list[tuple[DeviceInfo, Any]]:
+    os.environ.setdefault(
+        "PYOPENCL_NO_CACHE", "1"
+    )  # a cache of its own, which fails where it cannot be written
+    make_drivers_known()
+    import pyopencl as cl
+
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # "platform not found": there is no driver at all
+        return []
+    found = []
+    for platform in platforms:
+        try:
+            handles = platform.get_devices()
+        except cl.Error:
+            continue
+        found += [(platform, handle) for handle in handles]
+    return [(_info(cl, index, platform, handle), handle) for index, (platform, handle) in enumerate(found)]
+
+
+def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
+    def asked(name: str, otherwise: Any) -> Any:
+        try:
+            return getattr(handle, name)
+        except cl.Error:  # an older driver does not know the question
+            return otherwise
+
+    kinds = {
+        cl.device_type.GPU: "GPU",
+        cl.device_type.ACCELERATOR: "accelerator",
+        cl.device_type.CPU: "CPU",
+    }
+    kind = next((word for bit, word in kinds.items() if handle.type & bit), "other")
+    unusable = ""
+    if not handle.available or not handle.compiler_available:
+        unusable = "its driver has no compiler" if handle.available else "it is not available"
+    elif not handle.endian_little:
+        unusable = "its numbers are big-endian"
+    elif handle.max_work_group_size < 128:
+        unusable = f"its work-groups have at most {handle.max_work_group_size} work-items, 128 are needed"
+    svm = asked("svm_capabilities", 0)
+    return DeviceInfo(
+        index=index,
+        name=handle.name.strip(),
+        platform=platform.name.strip(),
+        driver=handle.driver_version.strip(),
+        kind=kind,
+        fp64="cl_khr_fp64" in handle.extensions.split() or bool(asked("double_fp_config", 0)),
+        memory_bytes=int(handle.global_mem_size),
+        most_bytes=int(handle.max_mem_alloc_size),
+        unified=bool(asked("host_unified_memory", False)),
+        svm_system=bool(svm & cl.device_svm_capabilities.FINE_GRAIN_SYSTEM) and handle.address_bits == 64,
+        unusable=unusable,
+    )

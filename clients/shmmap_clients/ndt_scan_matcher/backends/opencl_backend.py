@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The backend for any device with an OpenCL driver: GPUs, accelerators, and processors.
+
+The map's Gaussians lie on the device, or are read where they lie in shared memory; a batch of poses is one
+launch.  All buffers are made once, as large as the limits allow.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, choose_device
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceHung, DeviceMemory, device_errors
+from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool, PlacedMap
+from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
+from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import CHUNK_POINTS, SUMS, Evaluation, gauss_for
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
+from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
+    derivatives_of_poses,
+    evaluations_of,
+    matrices_from_poses,
+)
+from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
+from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
+
+__all__ = ["OpenclBackend"]
+
+_POSE: Final = 40  # numbers of a pose in the kernel
+_LAUNCH_ROWS: Final = 4096  # chunks in a launch of many poses: 256 poses of 2048 points
+_TABLES_BYTES: Final = 18 << 20  # of one map, at most: VoxelMap's directory and the table of its cells
+
+
+class OpenclBackend:
+    """`Backend` on a device.
+
+    Parameters
+    ----------
+    limits
+        What its buffers are made for.
+    threads
+        Not used: a device has its own.
+    options
+        Which device, and how.
+
+    Raises
+    ------
+    DeviceError
+        There is no such device, or it cannot do what the limits and options ask for.
+    """
+
+    name = "opencl"
+    on_device = True
+
+    def __init__(self, limits: Limits, threads: int = 1, options: DeviceOptions | None = None) -> None:
+        del threads
+        self.device: Device = choose_device(options if options is not None else DeviceOptions())
+        import pyopencl as cl
+
+        self._cl = cl
+        device = self.device
+        self._limits = limits
+        self._real = np.dtype(np.float64 if device.double else np.float32)
+        self._source = ScanBuffer(limits.source_points, self._real)
+        self._source_is_new = False
+        self._map = VoxelMap({})
+        chunks = -(-limits.source_points // CHUNK_POINTS)
+        self._most_rows = max(chunks, _LAUNCH_ROWS)
+        self._rows = np.empty((self._most_rows, SUMS), self._real)
+        self._poses = np.zeros((limits.poses, _POSE), self._real)
+        self._places = np.zeros((limits.poses, 3), np.int32)
+        self._kernels: dict[Neighbors, Any] = {}
+        self._arguments: dict[Neighbors, tuple[PlacedMap, int]] = {}
+        self._running: Any = None
+        self._waiting = Waiting(device.info.name)
+        with device_errors(device.info.name, "start"):
+            self._context = cl.Context([device.handle])
+            self._queue = cl.CommandQueue(self._context, device.handle)
+        self.most_map_bytes = self._room_for_maps()
+        with device_errors(device.info.name, "allocate buffers for scans and results"):
+            flags = cl.mem_flags
+            size = self._real.itemsize
+            self._source_buffer = cl.Buffer(self._context, flags.READ_ONLY, limits.source_points * 3 * size)
+            self._poses_buffer = cl.Buffer(self._context, flags.READ_ONLY, self._poses.nbytes)
+            # all zero, and never written again, where coordinates are doubles
+            self._places_buffer = cl.Buffer(
+                self._context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=self._places
+            )
+            self._rows_buffer = cl.Buffer(self._context, flags.WRITE_ONLY, self._rows.nbytes)
+        capacity = 2 * _TABLES_BYTES + (0 if device.in_place else 2 * self.most_map_bytes)
+        self.pool = MapPool(self._context, device, capacity)
+
+    def _room_for_maps(self) -> int:
+        """Return the most bytes that a map may have: as limited, or half of the largest buffer."""
+        wanted = self._limits.most_map_bytes
+        if self.device.in_place:
+            return wanted
+        room = self.device.info.most_bytes // 2 - _TABLES_BYTES
+        if room <= 0:
+            raise DeviceMemory(
+                f"device {self.device.info.name!r} allocates at most {self.device.info.most_bytes} bytes at"
+                " once, too little for a map"
+            )
+        return min(wanted, room)
+
+    def close(self) -> None:
+        """Give back the device's memory; what a hung device still uses stays until the process ends."""
+        self._running = None
+        self._kernels.clear()
+        self._arguments.clear()
+
+    def set_map(self, voxel_map: VoxelMap) -> None:
+        """Match against this map from now on; the work was done in `prepare`, or is done when it is used."""
+        self._map = voxel_map
+        self._arguments.clear()
+
+    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+        """Write the map to the device beside the one in use, and build the program; from any thread."""
+        if neighbors not in self._kernels:
+            self._kernels.setdefault(neighbors, self._built(neighbors))
+        self.pool.prepare(voxel_map, covariance)
+
+    def set_source(self, points: NDArray[np.floating]) -> int:
+        """Take a scan; returns how many points the limit left out."""
+        self._check_idle()
+        dropped = self._source.take(points)
+        self._source_is_new = True
+        return dropped
+
+    def evaluate(
+        self,
+        pose: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        T: NDArray[np.float64] | None = None,
+        deadline_s: float | None = None,
+    ) -> Evaluation:
+        """Return score, gradient and Hessian at a pose vector."""
+        poses = np.asarray(pose, np.float64)[None]
+        matrices = matrices_from_poses(poses) if T is None else np.asarray(T, np.float64)[None]
+        return self._evaluated(poses, matrices, neighbors, covariance, pitch_sign, deadline_s)[0]
+
+    def evaluate_many(
+        self,
+        poses: NDArray[np.float64],
+        *,
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float = -1.0,
+        deadline_s: float | None = None,
+    ) -> list[Evaluation]:
+        """Return the same as `evaluate` for each of (k, 6) poses, in one launch where memory allows."""
+        check_batch(poses, self._limits.poses)
+        found: list[Evaluation] = []
+        each = max(self._most_rows // max(-(-len(self._source.points) // CHUNK_POINTS), 1), 1)
+        for first in range(0, len(poses), each):
+            part = np.asarray(poses[first : first + each], np.float64)
+            matrices = matrices_from_poses(part)
+            found += self._evaluated(part, matrices, neighbors, covariance, pitch_sign, deadline_s)
+        return found
+
+    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+        """Return the step that an evaluation asks for; computed here, it is small."""
+        return numpy_step(at, steady)
+
+    def _evaluated(
+        self,
+        poses: NDArray[np.float64],
+        matrices: NDArray[np.float64],
+        neighbors: Neighbors,
+        covariance: Covariance,
+        pitch_sign: float,
+        deadline_s: float | None,
+    ) -> list[Evaluation]:
+        derivatives = derivatives_of_poses(poses, pitch_sign)
+        points = len(self._source.points)
+        chunks = -(-points // CHUNK_POINTS)
+        if not points:
+            return evaluations_of(np.empty((len(poses), 0, SUMS)), derivatives)
+        self._check_idle()
+        kernel = self._kernel(neighbors, covariance)
+        number = len(poses)
+        records, places = self._poses[:number], self._places[:number]
+        translation = matrices[:, :3, 3]
+        if not self.device.double:
+            # floats hold coordinates relative to the lattice place that the vehicle is in
+            with np.errstate(invalid="ignore"):
+                places[:] = np.floor(translation * (1.0 / self._map.leaf)).clip(-(2**30), 2**30)
+            translation = translation - places * self._map.leaf
+        records[:, :12] = np.concatenate([matrices[:, :3, :3], translation[:, :, None]], axis=2).reshape(
+            -1, 12
+        )
+        records[:, 12:39] = derivatives[:, :3].reshape(-1, 27)
+        cl, queue, device = self._cl, self._queue, self.device
+        rows = self._rows[: number * chunks]
+        items = (chunks, number) if device.is_processor else (chunks * CHUNK_POINTS, number)
+        with device_errors(device.info.name, "evaluate"):
+            # who lets go of a copy's event waits for it: they are kept until all is done
+            inputs = [cl.enqueue_copy(queue, self._poses_buffer, records, is_blocking=False)]
+            if self._source_is_new:
+                points_here = self._source.points
+                inputs.append(cl.enqueue_copy(queue, self._source_buffer, points_here, is_blocking=False))
+                self._source_is_new = False
+            if not device.double:
+                inputs.append(cl.enqueue_copy(queue, self._places_buffer, places, is_blocking=False))
+            cl.enqueue_nd_range_kernel(
+                queue, kernel, items, (1, 1) if device.is_processor else (CHUNK_POINTS, 1)
+            )
+            self._running = cl.enqueue_copy(queue, rows, self._rows_buffer, is_blocking=False)
+            queue.flush()
+            self._waiting.until(self._running, deadline_s)
+        self._running = None
+        inputs.clear()
+        return evaluations_of(rows.reshape(number, chunks, SUMS), derivatives)
+
+    def _check_idle(self) -> None:
+        """Refuse to touch buffers that a device which did not answer in time still uses."""
+        if self._running is None:
+            return
+        if self._running.command_execution_status > 0:
+            raise DeviceHung(
+                f"device {self.device.info.name!r} is still busy with what it did not finish in time"
+            )
+        self._running = None
+
+    def _built(self, neighbors: Neighbors) -> Any:
+        return build_kernel(self._context, self.device, neighbors, self._limits.neighbors)
+
+    def _kernel(self, neighbors: Neighbors, covariance: Covariance) -> Any:
+        """Return the kernel with all its arguments: they are set once for a map and a scan."""
+        if neighbors not in self._kernels:
+            self._kernels.setdefault(neighbors, self._built(neighbors))
+        kernel = self._kernels[neighbors]
+        placed = self.pool.use(self._map, covariance)
+        points = len(self._source.points)
+        if self._arguments.get(neighbors) == (placed, points):
+            return kernel
+        real, integer, offset = self._real.type, np.int32, np.int64
+        leaf, gauss = self._map.leaf, gauss_for(self._map.leaf)
+        box = self._map.box.tolist()
+        kernel.set_args(
+            self._source_buffer,
+            integer(points),
+            self._poses_buffer,
+            self._places_buffer,
+            self._rows_buffer,
+            self.pool.buffer,
+            *(offset(at) for at in placed.offsets),
+            *(integer(side) for side in (*box, *placed.lead, placed.squares)),
+            real(leaf),
+            real(1.0 / leaf),
+            # one leaf: every neighbour in reach of the radius lies in the 27 cells around the point
+            real(leaf**2 if neighbors == "radius" else math.inf),
+            real(gauss.d1),
+            real(gauss.d2),
+        )
+        self._arguments[neighbors] = (placed, points)
+        return kernel

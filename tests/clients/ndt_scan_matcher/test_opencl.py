@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The OpenCL backend gives what the compiled one gives: sums, alignments, bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import (
+    DeviceOptions,
+    Evaluation,
+    Limits,
+    NdtMatcher,
+    Result,
+    Settings,
+    VoxelMap,
+    matrix_from_pose,
+)
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
+from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
+from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
+from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
+
+from tests.clients.ndt_scan_matcher.references import clouds, reference_rows, settings_of, target
+from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+from tests.support.opencl_device import as_if, need_device
+
+TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
+NEAR = TRUTH + np.array([0.2, -0.15, 0.1, 0.01, 0.02, -0.03])
+SVM = DeviceOptions(memory="svm")
+COPY = DeviceOptions(memory="copy")
+FLOAT = DeviceOptions(precision="float")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def device() -> None:
+    need_device()
+
+
+@pytest.fixture(params=["CPU", "GPU"])
+def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A work-item for each chunk of points, or for each point."""
+    as_if(monkeypatch, kind=request.param)
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def points() -> NDArray[np.float64]:
+    return street()
+
+
+@pytest.fixture(scope="module")
+def scan() -> NDArray[np.float64]:
+    return scan_from(street(seed=7), TRUTH, 1500)
+
+
+def ready(
+    name: str,
+    voxel_map: VoxelMap,
+    scan: NDArray[np.floating],
+    *,
+    limits: Limits | None = None,
+    options: DeviceOptions | None = None,
+) -> Backend:
+    backend = backend_named(name, limits or Limits(source_points=4096), 1, options)
+    backend.set_map(voxel_map)
+    backend.set_source(scan)
+    return backend
+
+
+def counts(at: Evaluation) -> tuple[int, int, int, int]:
+    return at.found, at.neighbours, at.cut_points, at.cut_neighbours
+
+
+def off(found: Evaluation, wanted: Evaluation) -> float:
+    """The largest difference, relative to the largest element."""
+    pairs = ((found.gradient, wanted.gradient), (found.hessian, wanted.hessian))
+    scores = [abs(found.score / wanted.score - 1), abs(found.nearest / wanted.nearest - 1)]
+    return max(*scores, *(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs))
+
+
+def same_bits(a: Evaluation, b: Evaluation) -> bool:
+    plain = (a.score, a.nearest, *counts(a)) == (b.score, b.nearest, *counts(b))
+    return plain and bool((a.gradient == b.gradient).all()) and bool((a.hessian == b.hessian).all())
+
+
+@pytest.mark.parametrize("neighbors", ["direct1", "direct7", "radius"])
+@pytest.mark.parametrize("memory", ["copy", "svm"])
+def test_sums_and_counts_are_those_of_the_compiled_backend(
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, memory: str, neighbors: str
+) -> None:
+    # cells of 7 m with voxels of 2 m: most borders cut voxels, and both halves count
+    voxel_map = map_of(points, 2.0, edge=7.0)
+    for most in (32, 3, 1):
+        limits = Limits(source_points=4096, neighbors=most)
+        here = ready("numba", voxel_map, scan, limits=limits)
+        there = ready("opencl", voxel_map, scan, limits=limits, options=replace(COPY, memory=memory))  # type: ignore[arg-type]
+        for covariance in ("autoware", "pclomp", "pcl"):
+            for sign in (-1.0, 1.0):
+                how: dict[str, Any] = {"neighbors": neighbors, "covariance": covariance, "pitch_sign": sign}
+                wanted, found = here.evaluate(NEAR, **how), there.evaluate(NEAR, **how)
+                assert counts(found) == counts(wanted), (most, covariance)
+                assert off(found, wanted) <= 1e-12, (most, covariance)
+                if most == 1:
+                    assert wanted.cut_points > 0
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_floats_are_as_good_far_from_the_origin(
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, shift: float
+) -> None:
+    moved = np.array([89_571.0, 42_301.0, 0.0]) * shift
+    voxel_map = map_of(points + moved, 2.0)
+    pose = NEAR + np.r_[moved, np.zeros(3)]
+    here = ready("numba", voxel_map, scan)
+    there = ready("opencl", voxel_map, scan, options=FLOAT)
+    for neighbors in ("direct1", "direct7", "radius"):
+        for covariance in ("autoware", "pcl"):
+            how: dict[str, Any] = {"neighbors": neighbors, "covariance": covariance}
+            assert off(there.evaluate(pose, **how), here.evaluate(pose, **how)) < 1e-4
+
+
+@pytest.mark.parametrize("options", [COPY, SVM, FLOAT])
+def test_repeats_and_poses_in_a_batch_have_the_same_bits(
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, options: DeviceOptions
+) -> None:
+    # so few rows that a batch takes several launches
+    there = ready("opencl", map_of(points, 2.0), scan, options=options)
+    assert isinstance(there, OpenclBackend)
+    there._most_rows = 40
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    poses = NEAR + np.random.default_rng(4).normal(0.0, 0.3, (17, 6)) * [1, 1, 0.2, 0.05, 0.05, 0.3]
+    batch = there.evaluate_many(poses, **how)
+    assert len(batch) == len(poses)
+    for pose, among_others in zip(poses, batch, strict=True):
+        assert same_bits(there.evaluate(pose, **how), among_others)
+    first = there.evaluate(NEAR, **how)
+    assert all(same_bits(there.evaluate(NEAR, **how), first) for _ in range(20))
+    assert there.evaluate_many(poses[:0], **how) == []
+
+
+def test_a_pose_may_come_with_its_matrix(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    there = ready("opencl", map_of(points, 2.0), scan)
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    assert same_bits(there.evaluate(NEAR, T=matrix_from_pose(NEAR), **how), there.evaluate(NEAR, **how))
+
+
+@pytest.mark.parametrize("options", [COPY, SVM, FLOAT])
+def test_points_that_are_nowhere_find_nothing(
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, options: DeviceOptions
+) -> None:
+    nowhere = np.array(
+        [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300], [1e9, 0, 0], [0, -5e8, 0], [0, 0, 1e12]]
+    )
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    voxel_map = map_of(points, 2.0)
+    alone = ready("opencl", voxel_map, scan[:100], options=options).evaluate(NEAR, **how)
+    with_them = ready("opencl", voxel_map, np.concatenate([scan[:100], nowhere]), options=options)
+    assert same_bits(with_them.evaluate(NEAR, **how), alone)
+    for empty in (
+        ready("opencl", VoxelMap({}), scan, options=options),
+        ready("opencl", voxel_map, scan[:0], options=options),
+    ):
+        none = empty.evaluate(NEAR, **how)
+        assert (none.score, none.found, none.nvtl) == (0.0, 0, 0.0)
+
+
+def aligned(settings: Settings, voxel_map: VoxelMap, scan: NDArray[np.floating], guess: Any) -> Result:
+    with NdtMatcher(settings) as matcher:
+        matcher.set_map(matcher.prepare(voxel_map))
+        return matcher.align(scan, guess)
+
+
+def assert_same_way(found: Result, wanted: Result, t: float, R: float, tp: float) -> None:
+    assert found.iterations == wanted.iterations
+    assert found.converged == wanted.converged
+    np.testing.assert_allclose(found.T_map_base[:3, 3], wanted.T_map_base[:3, 3], atol=t, rtol=0)
+    np.testing.assert_allclose(found.T_map_base[:3, :3], wanted.T_map_base[:3, :3], atol=R, rtol=0)
+    assert found.transform_probability == pytest.approx(wanted.transform_probability, abs=tp)
+    assert found.nvtl == pytest.approx(wanted.nvtl, abs=tp)
+    assert found.cut == wanted.cut
+
+
+@pytest.mark.parametrize("variant", ["autoware", "pclomp", "pcl"])
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_alignments_take_the_same_way(
+    points: NDArray[np.float64], scan: NDArray[np.float64], variant: str, shift: float
+) -> None:
+    moved = np.array([89_571.0, 42_301.0, 0.0]) * shift
+    voxel_map = map_of(points + moved, 2.0)
+    guess = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]) + np.r_[moved, 0, 0, 0])
+    for mode in ("single", "coarse_fine"):
+        for neighbors in ("direct1", "direct7", "radius"):
+            settings = Settings(variant, neighbors, mode=mode)
+            wanted = aligned(settings, voxel_map, scan, guess)
+            for options in (COPY, SVM):
+                found = aligned(replace(settings, backend="opencl", device=options), voxel_map, scan, guess)
+                assert_same_way(found, wanted, 1e-9, 1e-9, 1e-9)
+    settings = Settings("autoware", backend="opencl", device=FLOAT)
+    wanted = aligned(Settings("autoware"), voxel_map, scan, guess)
+    assert_same_way(aligned(settings, voxel_map, scan, guess), wanted, 1e-4, 2e-5, 2e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "to_originals", "to_numba"),
+    [
+        (COPY, (1e-4, 1e-5, 1e-4), (1e-9, 1e-9, 1e-9)),
+        (SVM, (1e-4, 1e-5, 1e-4), (1e-9, 1e-9, 1e-9)),
+        (FLOAT, (2e-4, 3e-5, 2.1e-3), (1e-4, 2e-5, 2e-3)),
+    ],
+    ids=["copy", "svm", "float"],
+)
+def test_all_reference_alignments(
+    data_dir: Path,
+    options: DeviceOptions,
+    to_originals: tuple[float, float, float],
+    to_numba: tuple[float, float, float],
+) -> None:
+    folder = data_dir / "ndt"
+    cases = reference_rows(folder)
+    assert len(cases) == 32 + 78
+    for row in cases:
+        settings, guess, iterations, T, probability = settings_of(row)
+        voxel_map, scan = target(folder, row["dataset"], row["leaf"]), clouds(folder, row["dataset"])[1]
+        found = aligned(replace(settings, backend="opencl", device=options), voxel_map, scan, guess)
+        assert found.iterations == iterations, row
+        np.testing.assert_allclose(found.T_map_base[:3, 3], T[:3, 3], atol=to_originals[0], err_msg=str(row))
+        np.testing.assert_allclose(
+            found.T_map_base[:3, :3], T[:3, :3], atol=to_originals[1], err_msg=str(row)
+        )
+        assert found.transform_probability == pytest.approx(probability, abs=to_originals[2]), row
+        assert_same_way(found, aligned(settings, voxel_map, scan, guess), *to_numba)
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("kind_of_device", ["CPU", "GPU"])
+def test_the_program_builds_without_a_warning(
+    monkeypatch: pytest.MonkeyPatch, double: bool, kind_of_device: str
+) -> None:
+    import pyopencl as cl
+
+    as_if(monkeypatch, kind=kind_of_device)
+    backend = OpenclBackend(Limits(), options=COPY if double else FLOAT)
+    for neighbors in ("direct1", "direct7", "radius"):
+        kernel = build_kernel(backend._context, backend.device, neighbors, 32, extra=["-Werror"])
+        program = kernel.program
+        assert program.get_build_info(backend.device.handle, cl.program_build_info.LOG).strip() == ""
+
+
+def test_many_guesses_are_aligned_as_one_by_one(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
+    voxel_map = map_of(points, 2.0)
+    offsets = np.random.default_rng(5).normal(0.0, 0.3, (7, 6)) * [1, 1, 0.3, 0.05, 0.05, 0.2]
+    guesses = [matrix_from_pose(TRUTH + off) for off in offsets]
+    for backend in ("numba", "numpy", "opencl"):
+        for variant, mode in (("autoware", "coarse_fine"), ("pclomp", "single")):
+            settings = Settings(variant, mode=mode, backend=backend)  # type: ignore[arg-type]
+            with NdtMatcher(settings, limits=Limits(poses=3)) as matcher:
+                matcher.set_map(matcher.prepare(voxel_map))
+                together = matcher.align_many(scan, guesses)
+                for guess, one in zip(guesses, together, strict=True):
+                    alone = matcher.align(scan, guess)
+                    assert (alone.T_map_base == one.T_map_base).all(), backend
+                    assert (alone.iterations, alone.evaluations) == (one.iterations, one.evaluations)
+                    assert (alone.transform_probability, alone.nvtl) == (one.transform_probability, one.nvtl)
+                assert matcher.align_many(scan, []) == []
+
+
+def test_cells_are_written_once_and_the_old_map_stays(
+    points: NDArray[np.float64], scan: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cells = cells_of(points, 2.0, edge=10.0)
+    names = list(cells)
+    first = VoxelMap({name: cells[name] for name in names[:-4]})
+    second = VoxelMap({name: cells[name] for name in names[2:]}, previous=first)
+    there = ready("opencl", first, scan, options=COPY)
+    assert isinstance(there, OpenclBackend)
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    there.prepare(first, **how)
+    before = there.evaluate(NEAR, **how)
+    statistics = there.pool.statistics
+    written = statistics.written_bytes
+    assert written >= sum(cell.map_bytes for cell in first.cells.values())
+    there.prepare(second, **how)
+    new = [cells[name] for name in names[-4:]]
+    tables = second.private_bytes + 88 * len(second.cells) + 64 * (2 * len(new) + 4)
+    assert 0 < statistics.written_bytes - written <= sum(cell.map_bytes for cell in new) + tables
+    assert same_bits(there.evaluate(NEAR, **how), before), "the map in use is untouched"
+    writes = statistics.writes
+    there.set_map(second)
+    after = there.evaluate(NEAR, **how)
+    assert statistics.writes == writes, "all was done in advance"
+    assert off(after, ready("numba", second, scan).evaluate(NEAR, **how)) <= 1e-12
+    # one step back: the map that was given up is written anew, and nothing has been left behind
+    there.prepare(first, **how)
+    there.set_map(first)
+    assert same_bits(there.evaluate(NEAR, **how), before)
+
+
+def test_a_map_in_place_is_not_copied(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    voxel_map = map_of(points, 2.0)
+    for cell in voxel_map.cells.values():
+        for array in (cell.lattice, cell.mean, cell.inverse):
+            array.flags.writeable = False
+    there = ready("opencl", voxel_map, scan, options=SVM)
+    assert isinstance(there, OpenclBackend)
+    there.evaluate(NEAR, neighbors="radius", covariance="autoware")
+    tables = voxel_map.private_bytes + 4 * 64
+    assert there.pool.statistics.written_bytes <= tables < 16_384
