@@ -40,6 +40,7 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
     with shmmap.connect(one.endpoint, name="somebody") as client:
         client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, intent=shmmap.Intent(1.5, 2.0))
         one.send(signal.SIGSTOP)
+        os.waitid(os.P_PID, one.pid, os.WSTOPPED)
         answer = program.told("statistics", one.instance, one.shm_dir)
         python = read_statistics(one.instance, one.shm_dir)
         one.send(signal.SIGCONT)

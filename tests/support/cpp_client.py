@@ -83,7 +83,8 @@ class CppProgram:
         """Say something; `answer` is to be called for it."""
         assert self.process.stdin is not None
         if self._dropped:
-            dropped, self._dropped = self._dropped, []
+            dropped = self._dropped.copy()
+            del self._dropped[: len(dropped)]  # in place: it is this list that cells append to
             self._write("drop", *dropped)
             self.answer()
         self._write(*words)

@@ -4,7 +4,8 @@
 A service is two topics: requests are read, replies are written, and every client reads all replies and takes
 its own. Reader and writer say in their user data that they belong together (``serviceid=``), and so do a
 client's (``clientid=``). A reply is written only when the client's reader is known: one that is not known yet
-would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does.
+would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does; the first time that a client
+asks up to a second, for on a busy machine the two find each other later.
 
 Other implementations of ROS send no ``clientid=``. They carry the number of a request outside of the message,
 where neither can read the other's, and their clients wait for ever: they are `strangers`.
@@ -33,6 +34,7 @@ from shmmap_clients.ros_bridge.participant import endpoint_qos
 
 __all__ = ["Request", "Requester", "ServiceServer"]
 
+_KNOWN_AT_FIRST_S: Final = 1.0
 _KNOWN_WITHIN_S: Final = 0.1
 _LOOK_EVERY_S: Final = 0.01
 _KEPT: Final = 1024
@@ -108,6 +110,7 @@ class ServiceServer:
         self._lock = threading.Lock()  # one thread takes requests, another one replies
         self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
         self._readers: dict[int, str] = {}  # clientid by DDS's number of the reader of replies
+        self._waited_for: set[int] = set()  # those that were given longer to be found
 
     def __repr__(self) -> str:
         return f"<ServiceServer {self.name}>"
@@ -132,17 +135,20 @@ class ServiceServer:
         with self._lock:
             for handle in self._requesters.keys() - handles:
                 del self._requesters[handle]
+            self._waited_for &= handles
             for handle in self._readers.keys() - readers:
                 del self._readers[handle]
         return [found for one in handles if (found := self._requester(one)) is not None]
 
     def present(self, request: Request) -> bool:
-        """Whether the client can hear the reply; waits up to 100 ms for its reader to be found."""
+        """Whether the client can hear the reply; waits a moment for its reader to be found."""
         name = request.requester.name
         with self._lock:
             if request.requester.stranger or name in self._readers.values():
                 return True
-        until_s = time.monotonic() + _KNOWN_WITHIN_S
+            is_first = request.handle not in self._waited_for
+            self._waited_for.add(request.handle)
+        until_s = time.monotonic() + (_KNOWN_AT_FIRST_S if is_first else _KNOWN_WITHIN_S)
         while not self._hears(name):
             if self.gone(request) or time.monotonic() >= until_s:
                 return False
