@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
+    DeviceError,
     DeviceOptions,
     Evaluation,
     Limits,
@@ -19,6 +20,7 @@ from shmmap_clients.ndt_scan_matcher import (
     Settings,
     VoxelMap,
     matrix_from_pose,
+    voxel_cell,
 )
 from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
 from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
@@ -300,6 +302,45 @@ def test_cells_are_written_once_and_the_old_map_stays(
     there.prepare(first, **how)
     there.set_map(first)
     assert same_bits(there.evaluate(NEAR, **how), before)
+
+
+def test_a_cell_without_voxels_does_no_harm(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    cells = cells_of(points, 2.0)
+    empty = voxel_cell(points[:3], 2.0)
+    assert len(empty.count) == 0
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    for options in (COPY, SVM, FLOAT):
+        there = ready("opencl", VoxelMap(cells), scan, options=options)
+        without = there.evaluate(NEAR, **how)
+        for some in ({"empty": empty, **cells}, {**cells, "empty": empty}, {"empty": empty}):
+            voxel_map = VoxelMap(some)
+            there.prepare(voxel_map, **how)
+            there.set_map(voxel_map)
+            found = there.evaluate(NEAR, **how)
+            assert same_bits(found, without) if len(some) > 1 else found.found == 0
+
+
+def test_a_write_that_fails_leaves_nothing_behind(
+    points: NDArray[np.float64], scan: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    there = ready("opencl", VoxelMap({}), scan, options=COPY)
+    assert isinstance(there, OpenclBackend)
+    there.evaluate(NEAR, **how)
+    used = there.pool.used_bytes
+    voxel_map = map_of(points, 2.0)
+
+    def fails(parts: object) -> None:
+        raise DeviceError("it fails")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(there.pool, "_write", fails)
+        with pytest.raises(DeviceError):
+            there.prepare(voxel_map, **how)
+    assert there.pool.used_bytes == used
+    there.prepare(voxel_map, **how)
+    there.set_map(voxel_map)
+    assert off(there.evaluate(NEAR, **how), ready("numba", voxel_map, scan).evaluate(NEAR, **how)) <= 1e-12
 
 
 def test_a_map_in_place_is_not_copied(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:

@@ -79,6 +79,7 @@ class OpenclBackend:
         self._kernels: dict[Neighbors, Any] = {}
         self._arguments: dict[Neighbors, tuple[PlacedMap, int]] = {}
         self._running: Any = None
+        self._closed = False
         self._waiting = Waiting(device.info.name)
         with device_errors(device.info.name, "start"):
             self._context = cl.Context([device.handle])
@@ -112,9 +113,16 @@ class OpenclBackend:
 
     def close(self) -> None:
         """Give back the device's memory; what a hung device still uses stays until the process ends."""
-        self._running = None
+        if self._closed or (self._running is not None and self._running.command_execution_status > 0):
+            return
+        self._closed = True
         self._kernels.clear()
         self._arguments.clear()
+        self.pool.close()
+        for buffer in (
+            self._source_buffer, self._poses_buffer, self._places_buffer, self._rows_buffer,
+        ):  # fmt: skip
+            buffer.release()
 
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on; the work was done in `prepare`, or is done when it is used."""

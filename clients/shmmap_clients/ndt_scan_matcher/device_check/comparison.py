@@ -7,7 +7,7 @@ Bounds are those between programs in double precision, and what floats can hold:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, get_args
 
 import numpy as np
@@ -238,8 +238,3 @@ def _same(a: Evaluation, b: Evaluation) -> bool:
         and bool((a.gradient == b.gradient).all())
         and bool((a.hessian == b.hessian).all())
     )
-
-
-def with_precision(device: DeviceOptions, precision: str, memory: str) -> DeviceOptions:
-    """Return the options for one way to use a device."""
-    return replace(device, precision=precision, memory=memory)  # type: ignore[arg-type]

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Final
 
 __all__ = ["ALIGNMENT", "FreeList", "rounded"]
@@ -44,6 +46,22 @@ class FreeList:
                     self._free[index] = (offset + needed, length - needed)
                 return offset
         return None
+
+    def take_all(self, sizes: Sequence[int]) -> list[int] | None:
+        """Return the offsets of new blocks, side by side where there is room; None, and no block, else."""
+        lengths = [rounded(nbytes) for nbytes in sizes]
+        first = self.take(sum(lengths)) if lengths else 0
+        if first is not None:
+            return [first + end - length for end, length in zip(accumulate(lengths), lengths, strict=True)]
+        found: list[int] = []
+        for nbytes in sizes:
+            offset = self.take(nbytes)
+            if offset is None:
+                for taken, length in zip(found, lengths, strict=False):
+                    self.give(taken, length)
+                return None
+            found.append(offset)
+        return found
 
     def give(self, offset: int, nbytes: int) -> None:
         """Take a block back."""

@@ -75,6 +75,7 @@ class _Tables:
 
 
 _Key = tuple[int, str]
+_Part = tuple[int, int, list[NDArray[Any]]]  # offset, bytes, and the arrays that lie there
 
 
 class MapPool:
@@ -122,6 +123,10 @@ class MapPool:
     def used_bytes(self) -> int:
         """Bytes that maps take at present."""
         return self._free.capacity - self._free.free_bytes
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self.buffer.release()
 
     def prepare(self, voxel_map: VoxelMap, covariance: Covariance) -> None:
         """Write what is new of a map beside the one in use; where it does not fit, `use` will.
@@ -207,7 +212,6 @@ class MapPool:
     def _place(self, voxel_map: VoxelMap, covariance: Covariance, found: _Tables) -> PlacedMap | None:
         """Find room and write; None, and nothing has changed, where there is no room."""
         tables = found.arrays
-        new: dict[_Key, _Block] = {}
         wanted: list[tuple[_Key, int, object]] = []
         if not self._device.in_place:
             size = self._real.itemsize
@@ -217,36 +221,51 @@ class MapPool:
                 wanted.append(((id(cell), covariance), 6 * size * count, cell))
         starts = np.cumsum([0, *(rounded(table.nbytes) for table in tables)]).tolist()
         wanted.append(((id(voxel_map), f"tables {covariance}"), starts[-1], voxel_map))
-        for key, nbytes, owner in wanted:
-            if key not in self._blocks:
-                offset = self._free.take(nbytes)
-                if offset is None:
-                    for block in new.values():
-                        self._free.give(block.offset, block.nbytes)
-                    return None
-                new[key] = _Block(offset, nbytes, owner)
+        missing = [one for one in wanted if one[0] not in self._blocks]
+        offsets = self._free.take_all([nbytes for _, nbytes, _ in missing])
+        if offsets is None:
+            return None
+        new = {key: _Block(at, size, owner) for (key, size, owner), at in zip(missing, offsets, strict=True)}
         self._blocks.update(new)
+        try:
+            self._write(self._parts(voxel_map, covariance, tables, starts, new))
+        except BaseException:
+            # what may not have been written is no copy of anything
+            for key, block in new.items():
+                del self._blocks[key]
+                self._free.give(block.offset, block.nbytes)
+            raise
+        base = self._blocks[(id(voxel_map), f"tables {covariance}")].offset
+        table_at, origins_at, start_at, cell_at = (base + start for start in starts[:4])
+        placed = PlacedMap(voxel_map, (table_at, origins_at, start_at, cell_at), found.lead, found.squares)
+        self._placed[(id(voxel_map), covariance)] = placed
+        return placed
+
+    def _parts(
+        self,
+        voxel_map: VoxelMap,
+        covariance: Covariance,
+        tables: list[NDArray[Any]],
+        starts: list[int],
+        new: dict[_Key, _Block],
+    ) -> list[_Part]:
+        """Return what has to be written for new blocks."""
         if not self._device.in_place:
             tables = [self._addressed(voxel_map, covariance, tables[0]), *tables[1:]]
         names = {id(cell): name for name, cell in voxel_map.cells.items()}
-        parts: list[tuple[int, list[NDArray[np.generic]]]] = []
+        parts: list[_Part] = []
         for (at, part), block in new.items():
             if part.startswith("tables "):
                 parts += [
-                    (block.offset + start, [table]) for start, table in zip(starts, tables, strict=False)
+                    (block.offset + start, table.nbytes, [table])
+                    for start, table in zip(starts, tables, strict=False)
                 ]
             elif part == "voxels":
-                parts.append((block.offset, self._voxels(voxel_map.cells[names[at]])))
+                parts.append((block.offset, block.nbytes, self._voxels(voxel_map.cells[names[at]])))
             else:
                 inverse = voxel_map.inverses(names[at], covariance)
-                parts.append((block.offset, [inverse.astype(self._real, copy=False)]))
-        self._write(parts)
-        base = self._blocks[(id(voxel_map), f"tables {covariance}")].offset
-        table_at, origins_at, start_at, cell_at = (base + start for start in starts[:4])
-        offsets = (table_at, origins_at, start_at, cell_at)
-        placed = PlacedMap(voxel_map, offsets, found.lead, found.squares)
-        self._placed[(id(voxel_map), covariance)] = placed
-        return placed
+                parts.append((block.offset, block.nbytes, [inverse.astype(self._real, copy=False)]))
+        return parts
 
     def _addressed(
         self, voxel_map: VoxelMap, covariance: Covariance, table: NDArray[np.generic]
@@ -266,21 +285,21 @@ class MapPool:
             mean = (mean + (cell.origin - cell.lattice_origin * cell.leaf)).astype(np.float32)
         return [mean, cell.lattice.T]
 
-    def _write(self, parts: list[tuple[int, list[NDArray[np.generic]]]]) -> None:
+    def _write(self, parts: list[_Part]) -> None:
         """Write arrays to their places: what lies side by side, together."""
         import pyopencl as cl
 
         with device_errors(self._device.info.name, "write a map"):
             for stretch in _stretches(parts):
-                first, last = stretch[0][0], _end(stretch[-1])
+                first, last = stretch[0][0], stretch[-1][0] + stretch[-1][1]
                 # one piece of memory for all stretches; a cell that is larger than that has one of its own
                 large = last - first > len(self._staging)
                 staged = np.empty(last - first, np.uint8) if large else self._staging[: last - first]
                 pieces, at = [], first
-                for offset, arrays in stretch:
+                for offset, nbytes, arrays in stretch:
                     pieces.append(_NOTHING[: offset - at])
                     pieces += [array.reshape(-1).view(np.uint8) for array in arrays]
-                    at = offset + sum(array.nbytes for array in arrays)
+                    at = offset + nbytes
                 np.concatenate(pieces, out=staged)
                 written = cl.enqueue_copy(
                     self._queue, self.buffer, staged, dst_offset=first, is_blocking=False
@@ -297,22 +316,16 @@ def _row(cell: VoxelCell) -> list[int]:
     return [0, 0, 0, *cell.lattice_origin.tolist(), nk, 1, ni, ni * nj, len(cell.count)]
 
 
-def _end(part: tuple[int, list[NDArray[np.generic]]]) -> int:
-    return part[0] + sum(array.nbytes for array in part[1])
-
-
-def _stretches(
-    parts: list[tuple[int, list[NDArray[np.generic]]]],
-) -> list[list[tuple[int, list[NDArray[np.generic]]]]]:
+def _stretches(parts: list[_Part]) -> list[list[_Part]]:
     """Group what lies side by side, but for the roundings, into pieces that are staged at once."""
-    found: list[list[tuple[int, list[NDArray[np.generic]]]]] = []
-    for part in sorted(parts, key=lambda one: one[0]):
-        if (
-            found
-            and part[0] <= rounded(_end(found[-1][-1]))
-            and _end(part) - found[-1][0][0] <= _STRETCH_BYTES
-        ):
+    found: list[list[_Part]] = []
+    begin = end = -1
+    for part in sorted((part for part in parts if part[1]), key=lambda one: one[0]):
+        offset, nbytes, _ = part
+        if offset == end and offset + nbytes - begin <= _STRETCH_BYTES:
             found[-1].append(part)
         else:
             found.append([part])
+            begin = offset
+        end = offset + rounded(nbytes)
     return found
