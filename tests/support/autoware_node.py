@@ -10,11 +10,12 @@ from typing import Final
 
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import ROOT
-from tests.support.rosidl_messages import generated_messages
+from tests.support.rosidl_messages import GENERATORS, generated_messages
 
 __all__ = ["NODE", "TYPES", "AutowareNode", "compiled_with"]
 
-TYPES: Final = ("plain", "generated")
+TYPES: Final = ("generated",) if GENERATORS.is_dir() else ("plain",)
+"""The program's own types where ROS 2's generator is missing."""
 NODE: Final = ROOT / "tests" / "support" / "autoware_node.cpp"
 
 
