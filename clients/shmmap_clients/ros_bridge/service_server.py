@@ -5,7 +5,7 @@ A service is two topics: requests are read, replies are written, and every clien
 its own. Reader and writer say in their user data that they belong together (``serviceid=``), and so do a
 client's (``clientid=``). A reply is written only when the client's reader is known: one that is not known yet
 would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does; the first time that a client
-asks up to a second, for on a busy machine the two find each other later.
+asks until a second after it was found, for on a busy machine its two ends may be found apart.
 
 Other implementations of ROS send no ``clientid=``. They carry the number of a request outside of the message,
 where neither can read the other's, and their clients wait for ever: they are `strangers`.
@@ -17,7 +17,7 @@ import re
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState
@@ -56,11 +56,14 @@ class Requester:
         It has none.
     vendor
         Whose DDS it speaks; empty where that cannot be told.
+    found_s
+        When it was found, on the clock of `time.monotonic`.
     """
 
     name: str
     stranger: bool
     vendor: str
+    found_s: float = field(default=0.0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +113,6 @@ class ServiceServer:
         self._lock = threading.Lock()  # one thread takes requests, another one replies
         self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
         self._readers: dict[int, str] = {}  # clientid by DDS's number of the reader of replies
-        self._waited_for: set[int] = set()  # those that were given longer to be found
 
     def __repr__(self) -> str:
         return f"<ServiceServer {self.name}>"
@@ -135,7 +137,6 @@ class ServiceServer:
         with self._lock:
             for handle in self._requesters.keys() - handles:
                 del self._requesters[handle]
-            self._waited_for &= handles
             for handle in self._readers.keys() - readers:
                 del self._readers[handle]
         return [found for one in handles if (found := self._requester(one)) is not None]
@@ -146,9 +147,8 @@ class ServiceServer:
         with self._lock:
             if request.requester.stranger or name in self._readers.values():
                 return True
-            is_first = request.handle not in self._waited_for
-            self._waited_for.add(request.handle)
-        until_s = time.monotonic() + (_KNOWN_AT_FIRST_S if is_first else _KNOWN_WITHIN_S)
+        found_s = request.requester.found_s  # many that nobody can answer share this second
+        until_s = max(time.monotonic() + _KNOWN_WITHIN_S, found_s + _KNOWN_AT_FIRST_S)
         while not self._hears(name):
             if self.gone(request) or time.monotonic() >= until_s:
                 return False
@@ -189,7 +189,7 @@ class ServiceServer:
                 return None
             client_id = _client_id(found)
             vendor = _VENDORS.get(int.from_bytes(found.key.bytes[:2], "big"), "")
-            one = Requester(client_id or found.key.hex, not client_id, vendor)
+            one = Requester(client_id or found.key.hex, not client_id, vendor, time.monotonic())
             self._requesters[handle] = one
             return one
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -27,7 +28,7 @@ _AGAIN_S: Final = 0.2
 Answer = tuple[Content, Callable[[], None]]
 
 
-class Worker:
+class Worker(ABC):
     """Answers requests and does what comes up regularly.
 
     Parameters
@@ -52,17 +53,17 @@ class Worker:
         self._log = log
         self._away = ""
 
+    @abstractmethod
     def answer(self, message: Any, request: Request) -> Answer:
         """Return a reply, and what to call when it was sent."""
-        raise NotImplementedError
 
+    @abstractmethod
     def empty(self, message: Any) -> Content:
         """Return the reply that has nothing."""
-        raise NotImplementedError
 
+    @abstractmethod
     def tick(self) -> None:
         """Do what comes up regularly."""
-        raise NotImplementedError
 
     def run(self) -> None:
         """Work until the program ends."""
