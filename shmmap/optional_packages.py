@@ -14,6 +14,9 @@ __all__ = ["needed_packages"]
 _PACKAGES: Final = {"lzf": "python-neo-lzf", "yaml": "PyYAML", "zmq": "pyzmq", "open3d": "open3d-cpu"}
 """Packages that are not called as the module they bring."""
 
+_OPTIONAL: Final = frozenset({"cyclonedds", "laspy", "pyopencl", "tifffile", "zstandard"})
+"""Packages that no ordinary install brings: `project.optional-dependencies`."""
+
 _OURS: Final = ("shmmap", "shmmap_clients")
 
 
@@ -43,8 +46,12 @@ def needed_packages(what: str) -> Iterator[None]:
         if not module or module in _OURS:
             raise
         package = _PACKAGES.get(module, module)
+        all_others = (
+            ""
+            if package in _OPTIONAL
+            else ("; after a client-only install, `pip install .` in the checkout brings all packages")
+        )
         raise PackageMissing(
             f"{what} needs the package {package}, which is not installed",
-            hint=f"pip install {package}; after a client-only install, `pip install .` in the checkout brings"
-            " all packages",
+            hint=f"pip install {package}{all_others}",
         ) from None

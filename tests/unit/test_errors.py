@@ -86,6 +86,12 @@ def test_a_package_that_is_missing_is_one_line(module: str, package: str) -> Non
     assert missing.value.__suppress_context__
 
 
+def test_a_package_that_no_ordinary_install_brings_has_to_be_installed_by_name() -> None:
+    with pytest.raises(PackageMissing) as missing, needed_packages("shmmap-ndt"):
+        raise ModuleNotFoundError("No module named 'pyopencl'", name="pyopencl")
+    assert missing.value.hint == "pip install pyopencl"
+
+
 def test_a_module_of_ours_that_is_missing_is_a_defect() -> None:
     with pytest.raises(ModuleNotFoundError) as missing, needed_packages("shmmap-ndt"):
         __import__("shmmap.nowhere")

@@ -56,6 +56,9 @@ struct Sides {
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
 };
 
+/// A number as it is in a message of Autoware's.
+inline double as_float(double value) { return static_cast<double>(static_cast<float>(value)); }
+
 /// The smallest rectangle around an area; a square's has what Autoware's float messages make of it.
 inline Sides bounds(const Area& area) {
   if (const auto* box = std::get_if<Box>(&area)) return {box->min_x, box->min_y, box->max_x, box->max_y};
@@ -64,8 +67,7 @@ inline Sides bounds(const Area& area) {
   };
   if (const auto* circle = std::get_if<Circle>(&area)) return around(circle->x, circle->y, circle->radius);
   const auto& square = std::get<Square>(area);
-  const auto rounded = [](double value) { return static_cast<double>(static_cast<float>(value)); };
-  return around(rounded(square.x), rounded(square.y), rounded(square.radius));
+  return around(as_float(square.x), as_float(square.y), as_float(square.radius));
 }
 
 inline double distance_to(const Sides& box, double x, double y) {
@@ -106,10 +108,9 @@ inline bool overlaps(const Area& area, const Sides& cell) {
     return cell.min_x <= box->max_x && cell.max_x >= box->min_x && cell.min_y <= box->max_y &&
            cell.max_y >= box->min_y;
   const auto& square = std::get<Square>(area);
-  const auto rounded = [](double value) { return static_cast<double>(static_cast<float>(value)); };
-  const double x = rounded(square.x), y = rounded(square.y), radius = rounded(square.radius);
-  return rounded(cell.min_x) - radius <= x && x <= rounded(cell.max_x) + radius &&
-         rounded(cell.min_y) - radius <= y && y <= rounded(cell.max_y) + radius;
+  const double x = as_float(square.x), y = as_float(square.y), radius = as_float(square.radius);
+  return as_float(cell.min_x) - radius <= x && x <= as_float(cell.max_x) + radius &&
+         as_float(cell.min_y) - radius <= y && y <= as_float(cell.max_y) + radius;
 }
 
 inline void check_circle(double x, double y, double radius) {
