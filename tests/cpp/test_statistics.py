@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -109,6 +110,20 @@ def test_a_segment_of_which_any_byte_was_changed(
         if answer[0][0] == "error":
             refused += answer[0][1] == "segment_corrupt"
     assert refused == 128
+
+
+def test_tables_of_more_bytes_than_can_be_counted(
+    daemon: DaemonFactory, program: CppProgram, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    one = daemon(divided_map.root)
+    whole = bytearray(Path(one.shm_dir, f"shmmap.{one.instance}.statistics").read_bytes())
+    # together they are 2^64 and 65536: in 64 bits as few as there are
+    for count, histograms, row in ((2**31, 2**31 + 65536, 2**32 - 65535), (2**32 - 1, 2**32 - 1, 0)):
+        whole[20:28] = struct.pack("<II", count, row)
+        whole[64:68] = struct.pack("<I", histograms)
+        (tmp_path / "shmmap.other.statistics").write_bytes(whole)
+        ((kind, code, _),) = program.ask("statistics", "other", tmp_path)
+        assert (kind, code) == ("error", "segment_corrupt")
 
 
 def test_a_segment_that_ends_too_early(

@@ -184,7 +184,8 @@ inline StatisticsHeader read_statistics_header(const StatisticsFile& file) {
   StatisticsHeader header;
   header.identity = u32(28), header.identity_bytes = u32(32), header.state = u32(36), header.state_bytes = u32(40);
   header.table = u32(44), header.rows = u32(48), header.row_bytes = u32(52), header.max_rows = u32(56);
-  if (descriptions < 128 || row < 160) damaged(file.path(), "it has another layout");
+  if (descriptions < 128 || row < 160 || row > file.size() || count + histograms > file.size() / row)
+    damaged(file.path(), "its tables lie outside of it");
   const std::string described = file.bytes(descriptions, (count + histograms) * row);
   const auto sum = [&](std::size_t at, std::uint64_t first, std::uint64_t rows) {
     return crc32(start.substr(at, 60) + described.substr(first * row, rows * row), 60 + rows * row) == u32(at + 60);
