@@ -77,6 +77,15 @@ class Circle(msgspec.Struct, frozen=True):
         """Where distance is measured from."""
         return self.x, self.y
 
+    @property
+    def reach(self) -> float:
+        """How far its farthest point is from its center."""
+        return self.radius
+
+    def around(self, x: float, y: float) -> Circle:
+        """Return the same area around another place."""
+        return Circle(x, y, self.radius, self.z)
+
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Whether a circle lies wholly in this one, border included."""
         return math.hypot(x - self.x, y - self.y) + radius <= self.radius
@@ -118,6 +127,15 @@ class AutowareSquare(msgspec.Struct, frozen=True):
     def center(self) -> tuple[float, float]:
         """Where distance is measured from."""
         return self.x, self.y
+
+    @property
+    def reach(self) -> float:
+        """How far its farthest point is from its center."""
+        return math.sqrt(2.0) * self.radius
+
+    def around(self, x: float, y: float) -> AutowareSquare:
+        """Return the same area around another place."""
+        return AutowareSquare(x, y, self.radius, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Whether a circle lies wholly in the square, as far as float32 lets one be sure."""
@@ -165,6 +183,16 @@ class Box(msgspec.Struct, frozen=True):
     def center(self) -> tuple[float, float]:
         """Where distance is measured from."""
         return (self.min_x + self.max_x) / 2, (self.min_y + self.max_y) / 2
+
+    def around(self, x: float, y: float) -> Box:
+        """Return the same area around another place."""
+        dx, dy = 0.5 * (self.max_x - self.min_x), 0.5 * (self.max_y - self.min_y)
+        return Box(x - dx, y - dy, x + dx, y + dy, self.z)
+
+    @property
+    def reach(self) -> float:
+        """How far its farthest point is from its center."""
+        return 0.5 * math.hypot(self.max_x - self.min_x, self.max_y - self.min_y)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Whether a circle lies wholly in the rectangle, border included."""

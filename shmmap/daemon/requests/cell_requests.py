@@ -28,7 +28,7 @@ from shmmap.errors import BadRequest, NoSession
 from shmmap.geometry import Area
 from shmmap.protocol import messages
 
-__all__ = ["CellRequests", "note_area"]
+__all__ = ["CellRequests"]
 
 MAX_WAIT_S: Final = 3600.0
 MOST_AT_ONCE: Final = 4096
@@ -78,9 +78,9 @@ class CellRequests:
         """All cells that touch an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        note_area(session, area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
+        session.asks(area, layers, self._now_s())
         found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         cells = [(index, layer) for index in cache.at_height(found.tolist(), area.z) for layer in layers]
@@ -112,9 +112,9 @@ class CellRequests:
         limits.check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        note_area(session, area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
+        session.asks(area, layers, self._now_s())
         found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         if len(layers) == 1 and area.z is None and covered and len(found) <= MOST_AT_ONCE:
@@ -303,11 +303,3 @@ class CellRequests:
 def _check_wait(wait_s: float | None) -> None:
     if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
         raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
-
-
-def note_area(session: Session, area: Area) -> None:
-    """A session asks for an area: in the middle of it is where it is, unless it says."""
-    session.area = area
-    if not session.says_where:
-        session.intent = messages.Intent(*area.center)
-        session.sessions.moved[session] = None

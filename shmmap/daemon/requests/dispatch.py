@@ -12,7 +12,7 @@ from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
-from shmmap.daemon.requests.limits import bounded_intent
+from shmmap.daemon.requests.limits import check_intent
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
@@ -82,8 +82,8 @@ class Dispatch:
         session.last_request_s = now_s
         if isinstance(message, messages.Differential | messages.Area | messages.Selected):
             if message.intent is not None:
-                session.intent, session.says_where = bounded_intent(message.intent), True
-                session.sessions.moved[session] = None
+                check_intent(message.intent)
+                session.says(message.intent, now_s)
             if isinstance(message, messages.Differential):
                 return self.cells.differential(session, message)
             if isinstance(message, messages.Area):

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -17,7 +16,7 @@ from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest, parts
-from shmmap.daemon.transport.sessions import ROUTE_VERTICES, Session
+from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layer, canonical_layers
 from shmmap.protocol import messages
@@ -27,7 +26,7 @@ __all__ = [
     "MOST_CELLS",
     "SessionQuota",
     "admitted_layers",
-    "bounded_intent",
+    "check_intent",
     "check_count",
     "check_held",
     "check_queue",
@@ -121,21 +120,17 @@ def layers_named(message: messages.Area | messages.Differential | messages.Selec
     return tuple(map(canonical_layer, message.layers))
 
 
-def bounded_intent(intent: messages.Intent) -> messages.Intent:
-    """Return what the daemon remembers of an intent: of a route only its beginning.
+def check_intent(intent: messages.Intent) -> None:
+    """Refuse an intent that has no order by distance: it would mix up everybody's evictions and loads.
 
     Raises
     ------
     BadRequest
-        A number in it is not finite: it has no order by distance, and would mix up everybody's
-        evictions and loads.
+        A number in it is not finite.
     """
-    if len(intent.route) > ROUTE_VERTICES:
-        intent = msgspec.structs.replace(intent, route=intent.route[:ROUTE_VERTICES])
     numbers = (intent.x, intent.y, intent.vx, intent.vy, intent.heading or 0.0, *chain(*intent.route))
     if not all(map(math.isfinite, numbers)):
         raise BadRequest("intent: every number in it must be finite")
-    return intent
 
 
 @dataclass(eq=False, slots=True)

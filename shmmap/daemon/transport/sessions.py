@@ -4,35 +4,29 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import secrets
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
 from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.connection import Connection, Peer
+from shmmap.daemon.travel.motion import Motion
+from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_of
 from shmmap.geometry import Area
 from shmmap.logfmt import escaped
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["Places", "Session", "Sessions", "predicted_path", "squares_of"]
+__all__ = ["Session", "Sessions"]
 
-LOOK_AHEAD_S: Final = 5
-ROUTE_VERTICES: Final = 64
-SQUARE_M: Final = 16.0
-"""Where clients are and will be counts to the square of this grid."""
-SQUARES_ORIGIN: Final = 1 << 22
-"""Column and row of the square at the map's origin; what is farther away counts at the grid's edge."""
-GRID_M: Final = (SQUARES_ORIGIN - 1) * SQUARE_M
 MOVES_AT_ONCE: Final = 16
 """Sessions whose paths are looked at at a time: less than a millisecond."""
-FIRST_STEP_M: Final = 32.0
-"""Along its path a client's places are so far apart at first, then each twice as far away as the last."""
 
 
 @dataclass(eq=False, slots=True)
@@ -43,8 +37,8 @@ class Session:
     naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``exclusive_bytes`` are
     those that no other session holds.  ``says_where`` tells
     an ``intent`` (where the client is and is going to be) that it stated from one that was guessed from
-    ``area``, the last one it asked for; whoever sets it notes the session in `Sessions.moved`.  ``squares``
-    are those of `Places` that it counts to.  ``asker`` is whose turn its requests and loads count for: the
+    ``area``, the last one it asked for, in ``layers``.  ``motion`` is what is known of how it moves, and
+    ``places`` where it will be.  ``asker`` is whose turn its requests and loads count for: the
     process's, else the session's own.
     """
 
@@ -57,9 +51,11 @@ class Session:
     held_bytes: int = 0
     exclusive_bytes: int = 0
     intent: Intent | None = None
-    squares: frozenset[int] = frozenset()
+    motion: Motion = field(default_factory=Motion)
+    places: Places = NOWHERE
     says_where: bool = False
     area: Area | None = None
+    layers: tuple[str, ...] = ()
     requests: int = 0
     last_request_s: float = 0.0
     asker: int = 0
@@ -78,6 +74,23 @@ class Session:
         """The session has no connection; what it said of where it is does not count any more."""
         self.connection.session = self.intent = self.area = None
         self.says_where = False
+        self.motion = Motion()
+        self.sessions.moved[self] = None
+
+    def says(self, intent: Intent, now_s: float) -> None:
+        """The client says where it is and is going to be."""
+        self.motion.told(intent, now_s)
+        # of a route, as long as it may be, the motion keeps what it needs
+        self.intent = msgspec.structs.replace(intent, route=()) if intent.route else intent
+        self.says_where = True
+        self.sessions.moved[self] = None
+
+    def asks(self, area: Area, layers: tuple[str, ...], now_s: float) -> None:
+        """The client asks for an area: in the middle of it is where it is, unless it says."""
+        self.area, self.layers = area, layers
+        if not self.says_where:
+            self.intent = Intent(*area.center)
+            self.motion.seen(*area.center, now_s)
         self.sessions.moved[self] = None
 
     def hold(self, residents: Iterable[Resident]) -> None:
@@ -143,75 +156,6 @@ class Session:
         )
 
 
-def predicted_path(intent: Intent) -> list[tuple[float, float]]:
-    """Where a client is, and where it says it will be: along its route, else straight on.
-
-    Positions every second of the next five; of a route its first vertices, as long as it may be.
-    """
-    path = [(intent.x, intent.y)]
-    if intent.route:
-        path += intent.route[:ROUTE_VERTICES]
-    elif intent.vx or intent.vy:
-        path += [(intent.x + s * intent.vx, intent.y + s * intent.vy) for s in range(1, LOOK_AHEAD_S + 1)]
-    return path
-
-
-def squares_of(path: Sequence[tuple[float, float]]) -> frozenset[int]:
-    """Squares in which a client is at the begin of its path, along it and at its end.
-
-    The farther ahead the farther apart: what is needed soon counts exactly, and a path of any length gives
-    a few squares.  A square is ``column << 32 | row``.
-    """
-    (x, y), *ahead = [(_within_grid(x), _within_grid(y)) for x, y in path]
-    if not ahead:
-        return frozenset((_square(x, y),))
-    squares = {_square(x, y)}
-    come_m, next_m = 0.0, FIRST_STEP_M
-    for to_x, to_y in ahead:
-        step_m = math.hypot(to_x - x, to_y - y)
-        while come_m + step_m >= next_m:
-            share = (next_m - come_m) / step_m
-            squares.add(_square(x + share * (to_x - x), y + share * (to_y - y)))
-            next_m *= 2.0
-        come_m, x, y = come_m + step_m, to_x, to_y
-    squares.add(_square(x, y))
-    return frozenset(squares)
-
-
-def _within_grid(metres: float) -> float:
-    return metres if -GRID_M < metres < GRID_M else math.copysign(GRID_M, metres)
-
-
-def _square(x: float, y: float) -> int:
-    return int(x // SQUARE_M) + SQUARES_ORIGIN << 32 | int(y // SQUARE_M) + SQUARES_ORIGIN
-
-
-class Places:
-    """Squares in which any client is or will be.
-
-    Attributes
-    ----------
-    squares : dict
-        To how many clients' paths each belongs.
-    version : int
-        Another one after each change.
-    """
-
-    def __init__(self) -> None:
-        self.squares: dict[int, int] = {}
-        self.version = 0
-
-    def move(self, old: frozenset[int], new: frozenset[int]) -> None:
-        """One client is and will be elsewhere."""
-        for square in new - old:
-            self.squares[square] = self.squares.get(square, 0) + 1
-        for square in old - new:
-            count = self.squares.pop(square) - 1
-            if count:
-                self.squares[square] = count
-        self.version += 1
-
-
 def command_of(pid: int) -> str:
     """Command name of a process, empty where it cannot be read."""
     if pid <= 0:
@@ -231,10 +175,10 @@ class Sessions:
     ----------
     departed : dict
         By slot, those whose connection has ended and who may still map what they were handed.
-    places
-        Where the clients are and are going to be, as of the last `follow_moves`.
     moved : dict
-        Whose intent is another one since then.
+        Who has moved, or asked for another area, since the last `follow_moves`.
+    places_version : int
+        Another one after each change of `places`.
     """
 
     LIMIT = 4096
@@ -242,8 +186,8 @@ class Sessions:
     def __init__(self) -> None:
         self._by_slot: dict[int, Session] = {}
         self.departed: dict[int, Session] = {}
-        self.places = Places()
         self.moved: dict[Session, None] = {}
+        self.places_version = 0
 
     def __len__(self) -> int:
         return len(self._by_slot)
@@ -297,10 +241,13 @@ class Sessions:
         for session in list(islice(self.moved, MOVES_AT_ONCE)):
             self._follow(session)
 
+    def places(self) -> Places:
+        """Where the clients are and are going to be, as of the last `follow_moves`."""
+        return merged_places(session.places for session in self if len(session.places))
+
     def _follow(self, session: Session) -> None:
         self.moved.pop(session, None)
-        intent = session.intent
-        squares = squares_of(predicted_path(intent)) if intent is not None else frozenset()
-        if squares != session.squares:
-            self.places.move(session.squares, squares)
-            session.squares = squares
+        where = session.intent is not None
+        reach_m = 0.0 if session.area is None else session.area.reach
+        session.places = places_of(session.motion, reach_m) if where else NOWHERE
+        self.places_version += 1

@@ -1,71 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which segments to retire first when memory is short: one small interface, two policies.
+"""Which segments to retire first when memory is short: one small interface, three policies.
 
 A policy scores segments; pins, waiting requests, the budget and when to score anew are not its business.
+Whether a segment was asked for, fetched ahead or computed makes no difference: when it will be needed does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from typing import Final, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.records import Resident
-from shmmap.daemon.transport.sessions import SQUARE_M, SQUARES_ORIGIN
+from shmmap.daemon.travel.places import Places, until_needed
 
-__all__ = ["MOST_PLACES", "POLICIES", "EvictionPolicy", "by_distance", "by_last_use", "places_of"]
+__all__ = ["POLICIES", "EvictionPolicy", "by_distance", "by_last_use", "by_time_until_needed", "score_of"]
 
-Places: TypeAlias = NDArray[np.float64]
-"""(P, 2): where clients are or will be, metres, map frame."""
-EvictionPolicy: TypeAlias = Callable[[Sequence[Resident], Places], NDArray[np.float64]]
-"""Scores segments, (N,), given where the clients are or will be: the highest goes first, among equals the
-one that was not used longest."""
-
-MOST_PLACES: Final = 128
-"""With more of them, those near each other count as one: scoring takes time for each."""
+EvictionPolicy: TypeAlias = Callable[[Sequence[Resident], Places, float], NDArray[np.float64]]
+"""Scores segments, (N,), given where the clients are and will be, and the time: the highest goes first, among
+equals the one that was not used longest."""
 
 
-def by_last_use(candidates: Sequence[Resident], places: Places) -> NDArray[np.float64]:
+def by_last_use(candidates: Sequence[Resident], places: Places, now_s: float) -> NDArray[np.float64]:
     """Least recently used first."""
-    del places
+    del places, now_s
     return np.array([-resident.last_use_s for resident in candidates], dtype=np.float64)
 
 
-def by_distance(candidates: Sequence[Resident], places: Places) -> NDArray[np.float64]:
+def by_distance(candidates: Sequence[Resident], places: Places, now_s: float) -> NDArray[np.float64]:
     """Farthest from every client first.
 
-    The distance to the *nearest* client counts, weighted by the square root of the size: a large far cell
-    goes before a small one.  Without any place it is `by_last_use`.
+    The distance to the *nearest* place where a client is or will be counts, weighted by the square root of
+    the size: a large far cell goes before a small one.  Without any place it is `by_last_use`.
     """
     if not len(places):
-        return by_last_use(candidates, places)
-    boxes = np.array([resident.box for resident in candidates]).reshape(-1, 4)
-    x, y = places.T[:, :, np.newaxis]
+        return by_last_use(candidates, places, now_s)
+    boxes = _boxes(candidates)
+    x, y = places.T[:2, :, np.newaxis]
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
-    nearest = np.sqrt((dx * dx + dy * dy).min(axis=0))
-    nbytes = np.array([resident.nbytes for resident in candidates], dtype=np.float64)
-    scores: NDArray[np.float64] = nearest * np.sqrt(nbytes)
+    return score_of(np.sqrt((dx * dx + dy * dy).min(axis=0)), _sizes(candidates))
+
+
+def by_time_until_needed(candidates: Sequence[Resident], places: Places, now_s: float) -> NDArray[np.float64]:
+    """Needed last first, weighted by the square root of the size.
+
+    Without any place it is `by_last_use`.
+    """
+    if not len(places):
+        return by_last_use(candidates, places, now_s)
+    return score_of(until_needed(_boxes(candidates), places, now_s), _sizes(candidates))
+
+
+def score_of(far: NDArray[np.float64] | float, nbytes: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Return the score of cells that are so far away, in time or space, and so large.
+
+    The square root: of the powers tried, this saved most bytes of loading where sizes differ.
+    """
+    scores: NDArray[np.float64] = np.asarray(far * np.sqrt(nbytes))
     return scores
 
 
-def places_of(squares: Collection[int]) -> Places:
-    """Return the middles of squares (`shmmap.daemon.transport.sessions.Places`), at most `MOST_PLACES`.
-
-    With more, larger squares stand for those in them.
-    """
-    found = np.fromiter(squares, np.int64, len(squares))
-    columns, rows, side = found >> 32, found & 0xFFFFFFFF, 1
-    while len(columns) > MOST_PLACES:
-        shift = 1 if len(columns) < 16 * MOST_PLACES else 3  # far too many: not all sizes are tried
-        columns, rows, side = columns >> shift, rows >> shift, side << shift
-        merged = np.sort(columns << 32 | rows)
-        merged = merged[np.append(True, merged[1:] != merged[:-1])]  # np.unique takes ten times as long
-        columns, rows = merged >> 32, merged & 0xFFFFFFFF
-    middles = (np.stack([columns, rows], axis=1) + 0.5) * side
-    return (middles - SQUARES_ORIGIN) * SQUARE_M
+def _boxes(candidates: Sequence[Resident]) -> NDArray[np.float64]:
+    return np.array([resident.box for resident in candidates]).reshape(-1, 4)
 
 
-POLICIES: dict[str, EvictionPolicy] = {"distance": by_distance, "lru": by_last_use}
+def _sizes(candidates: Sequence[Resident]) -> NDArray[np.float64]:
+    return np.array([resident.nbytes for resident in candidates], dtype=np.float64)
+
+
+POLICIES: dict[str, EvictionPolicy] = {
+    "time": by_time_until_needed,
+    "distance": by_distance,
+    "lru": by_last_use,
+}

@@ -13,7 +13,7 @@ from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.eviction.eviction_order import BATCH, Score
-from shmmap.daemon.cache.eviction.eviction_policy import EvictionPolicy, places_of
+from shmmap.daemon.cache.eviction.eviction_policy import EvictionPolicy
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, SHARE_S, Reclaimer
 from shmmap.daemon.records import Resident
 
@@ -57,7 +57,7 @@ class Evictor:
     _new_ones: bool = False
 
     def __post_init__(self) -> None:
-        self._score = self._score_at(0)
+        self._score = self._score_at(0, 0.0)
 
     def free(self, shortage: int, now_s: float) -> bool:
         """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
@@ -145,12 +145,11 @@ class Evictor:
         sessions = self.reclaimer.sessions
         if sessions.moved:
             sessions.follow_moves()
-        places = sessions.places
-        if places.version != self._score.version and now_s - self._placed_s >= PLACES_S:
+        if sessions.places_version != self._score.version and now_s - self._placed_s >= PLACES_S:
             self._placed_s = now_s
-            self._score = self._score_at(places.version)
+            self._score = self._score_at(sessions.places_version, now_s)
         return self._score
 
-    def _score_at(self, version: int) -> Score:
-        policy, places = self.policy, places_of(self.reclaimer.sessions.places.squares)
-        return Score(lambda some: policy(some, places), version)
+    def _score_at(self, version: int, now_s: float) -> Score:
+        policy, places = self.policy, self.reclaimer.sessions.places()
+        return Score(lambda some: policy(some, places, now_s), version)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long loads take, and whether whatever they read from answers at all; without any I/O."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+__all__ = ["OriginHealth"]
+
+LOADS: Final = 64
+"""Loads that the estimate of their time is made of."""
+IN_A_ROW: Final = 4
+"""So many loads that failed, one after the other, are no matter of single files."""
+PROBE_S: Final = 0.5
+"""How often it is then tried whether one succeeds."""
+
+
+@dataclass(eq=False, slots=True)
+class OriginHealth:
+    """What loads tell of their origin.
+
+    Attributes
+    ----------
+    failed_in_a_row
+        Loads that failed since the last one that succeeded.
+    """
+
+    failed_in_a_row: int = 0
+    _took_s: deque[float] = field(default_factory=lambda: deque(maxlen=LOADS))
+    _slow_s: float = 0.0
+    _mean_s: float = 0.0
+    _tried_s: float = -math.inf
+
+    @property
+    def is_out(self) -> bool:
+        """Whether nothing can be loaded just now."""
+        return self.failed_in_a_row >= IN_A_ROW
+
+    @property
+    def slow_s(self) -> float:
+        """Time that few of the last loads exceeded (5 %)."""
+        return self._slow_s
+
+    @property
+    def mean_s(self) -> float:
+        """Mean time of the last loads; 0 before the first."""
+        return self._mean_s
+
+    def next_try_s(self) -> float:
+        """Until when nothing is tried: minus infinity unless nothing can be loaded."""
+        return self._tried_s + PROBE_S if self.is_out else -math.inf
+
+    def tried(self, now_s: float) -> None:
+        """A load begins."""
+        self._tried_s = now_s
+
+    def ended(self, took_s: float, *, failed: bool) -> bool:
+        """A load ended; whether that tells that loads succeed again, after they did not."""
+        if failed:
+            self.failed_in_a_row += 1
+            return False
+        again, self.failed_in_a_row = self.is_out, 0
+        self._took_s.append(took_s)
+        ordered = sorted(self._took_s)
+        self._slow_s = ordered[(len(ordered) * 19) // 20]
+        self._mean_s = sum(ordered) / len(ordered)
+        return again

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When will a cell be needed? Of all clients, the one that comes to it first counts.
+
+Each client gives a few *places*: where it is, where it will be along its route, and from where on nobody
+knows.  From a place, cells within its reach are needed when the client is there; those beyond it later, the
+farther away the later.  `until_needed` takes the least over all places.
+
+A client without a route may go anywhere, rather ahead than back: its only place is where it is, and the time
+to a cell is multiplied by 1 for one straight ahead, 2 for one behind it.  One with a route needs what lies
+along it when it comes there; all else after the route's end, but for what is just beside it now.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.daemon.travel.motion import Motion
+
+__all__ = ["MOST_PLACES", "NOWHERE", "Places", "merged_places", "places_of", "until_needed"]
+
+Places: TypeAlias = NDArray[np.float64]
+"""(P, 8): x, y, when the client is there (s), its reach (m), how far beyond that the place says anything (m),
+seconds per metre beyond its reach, and the unit vector of its heading, 0 if unknown."""
+
+NOWHERE: Final = np.empty((0, 8))
+MOST_PLACES: Final = 256
+"""Scoring takes time for each: with more of them, of those near each other the first counts."""
+MOST_OF_A_CLIENT: Final = 128
+"""Places along a route; the longer it is, the farther apart they are."""
+SLOWEST_MPS: Final = 3.0
+"""A client that stands still may drive off."""
+STAY_M: Final = 20.0
+"""What is just beyond a client's reach stays, whatever its route says: it may turn round or leave it."""
+FIRST_SIDE_M: Final = 16.0
+"""Places in one square of this side count as one at first, where there are too many."""
+
+
+def places_of(motion: Motion, reach_m: float) -> Places:
+    """Return the places of one client.
+
+    Parameters
+    ----------
+    reach_m
+        Within so many metres around it it needs the map.
+    """
+    speed = max(motion.speed_mps, SLOWEST_MPS)
+    pace = 1.0 / speed
+    here = [motion.x, motion.y, motion.told_s, reach_m]
+    heading = [motion.vx / speed, motion.vy / speed] if motion.speed_mps >= SLOWEST_MPS else [0.0, 0.0]
+    route = motion.route
+    if route is None or route.length_m <= motion.along_m:
+        return np.array([[*here, math.inf, pace, *heading]])
+    speed = max(motion.fastest_mps, SLOWEST_MPS)
+    left_m = route.length_m - motion.along_m
+    count = min(MOST_OF_A_CLIENT - 2, max(1, math.ceil(left_m / max(reach_m / 4.0, 10.0))))
+    ahead_m = np.linspace(0.0, left_m, count + 1)[1:]
+    found = np.zeros((count + 2, 8))
+    found[0] = [*here, STAY_M, pace, *heading]
+    found[1:-1, :2] = route.at(motion.along_m + ahead_m)
+    # what comes into reach between two places is needed before the client is at the second
+    found[1:-1, 2] = motion.told_s + (ahead_m - 0.5 * left_m / count) / speed
+    found[1:-1, 3] = reach_m
+    found[1:-1, 4] = 0.25 * left_m / count
+    found[-1] = [*found[-2, :2], motion.told_s + left_m / speed, reach_m, math.inf, pace, 0.0, 0.0]
+    return found
+
+
+def merged_places(some: Iterable[Places]) -> Places:
+    """Return the places of many clients as one table of at most `MOST_PLACES`.
+
+    Where there are more, the earliest of those in one square stands for all of them.
+    """
+    tables = list(some)
+    if not tables:
+        return NOWHERE
+    thin = max(1, len(tables) * MOST_OF_A_CLIENT // (64 * MOST_PLACES))
+    if thin > 1:  # very many: of each its first place, its last and some between them
+        tables = [table if len(table) < 3 else table[:: min(thin, len(table) - 1)] for table in tables]
+    found = np.concatenate(tables)
+    side = FIRST_SIDE_M
+    while len(found) > MOST_PLACES:
+        found = found[np.argsort(found[:, 2], kind="stable")]
+        squares = np.floor(np.clip(found[:, :2] / side, -(2.0**30), 2.0**30)).astype(np.int64)
+        keys = squares[:, 0] << 32 | squares[:, 1] & 0xFFFFFFFF
+        keys = keys << 1 ^ np.isinf(found[:, 4])  # from a place that is open anything may be reached
+        _, first = np.unique(keys, return_index=True)
+        found, side = found[np.sort(first)], 2.0 * side
+    return found
+
+
+def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> NDArray[np.float64]:
+    """Return in how many seconds each cell will be needed, (N,), 0 for now.
+
+    Parameters
+    ----------
+    boxes
+        (N, 4) ``min_x, min_y, max_x, max_y``, metres, map frame.
+    places
+        At least one of them open, or a cell may never be needed: infinity.
+    """
+    x, y, at_s, reach, limit, pace, hx, hy = places.T[:, :, np.newaxis]
+    dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
+    dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
+    gap = np.maximum(np.sqrt(dx * dx + dy * dy) - reach, 0.0)
+    cx, cy = 0.5 * (boxes[:, 0] + boxes[:, 2]) - x, 0.5 * (boxes[:, 1] + boxes[:, 3]) - y
+    cosine = (cx * hx + cy * hy) / np.maximum(np.sqrt(cx * cx + cy * cy), 1e-9)
+    times = np.maximum(at_s - now_s, 0.0) + gap * pace * (1.5 - 0.5 * cosine)
+    least: NDArray[np.float64] = np.where(gap <= limit, times, np.inf).min(axis=0)
+    return least
