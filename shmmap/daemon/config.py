@@ -40,7 +40,12 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
-    "eviction": (lambda value: value in ("distance", "lru"), "distance or lru"),
+    "eviction": (lambda value: value in ("time", "distance", "lru"), "time, distance or lru"),
+    "ride_out_s": (lambda value: 0 <= value <= 3600, "seconds, 0 to 3600"),
+    "prefetch_share": (
+        lambda value: 0 <= value <= 1,
+        "a part of the budget, 0 to 1; 0: nothing is fetched ahead",
+    ),
 }
 """Which values a setting may have, and the hint for who gives another."""
 _NOT_SETTINGS: Final = "SHMMAP_TEST_"
@@ -91,7 +96,12 @@ class DaemonConfig:
     cache_bytes
         Most disk space of computed and prepared layers; 0: none are kept.
     eviction
-        ``distance`` or ``lru``.
+        ``time``: what will be needed last goes first; ``distance`` or ``lru``.
+    ride_out_s
+        For so long the map's files may be out of reach without a moving client's noticing: it decides how far
+        ahead cells are fetched.
+    prefetch_share
+        Part of the budget that may be taken by what was fetched ahead and not asked for yet; 0: nothing is.
     live
         The live maps that are kept.
     live_budget_bytes
@@ -119,7 +129,9 @@ class DaemonConfig:
     watch: bool = False
     cache_dir: str = ""
     cache_bytes: int = 8 << 30
-    eviction: str = "distance"
+    eviction: str = "time"
+    ride_out_s: float = 10.0
+    prefetch_share: float = 0.5
     live: tuple[LiveSettings, ...] = ()
     live_budget_bytes: int = 0
     live_shm_dir: str = ""

@@ -105,7 +105,14 @@ class MapInMemory:
         parent.start()  # it imports what loaders need while this process gets ready
         pool = WorkerPool(config.loaders(), directory, parent, config.load_timeout_s, self.watched)
         self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(self.cache, self.map_switch, pool, clock=time.monotonic)
+        self.scheduler = Scheduler(
+            self.cache,
+            self.map_switch,
+            pool,
+            clock=time.monotonic,
+            prefetch_share=config.prefetch_share,
+            ride_out_s=config.ride_out_s,
+        )
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
         self.cache.tell_all()
         self.watched.watch(reclaimer.closer.fd, self.scheduler.hear_of_freed, "memory")

@@ -33,8 +33,9 @@ class Resident:
     """A published segment and what the daemon knows of its use.
 
     ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
-    their checksums: until then nobody is handed it.  ``handle`` and ``stale_handle`` are encoded once,
-    to be used in every reply; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
+    their checksums: until then nobody is handed it.  ``prefetched`` is true for one that was fetched before
+    anybody asked for it, until somebody does.  ``handle`` and ``stale_handle`` are encoded once, to be used in
+    every reply; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
     among all segments of its size.
     """
 
@@ -52,6 +53,7 @@ class Resident:
     load_ns: int = 0
     hits: int = 0
     checked: bool = True
+    prefetched: bool = False
     sessions: set[int] = field(default_factory=set)
     place: int = -1
 
@@ -82,6 +84,7 @@ class Load:
     that makes, when a worker was given the job.  ``computed`` says that it is a layer that is computed, which
     may take long.  ``payer`` is whose turn was used for it, ``charged_s`` the loader's time that it was taken
     to need, and ``spent_s`` the time that it did; ``losses`` counts loaders that were lost without its doing.
+    ``prefetch`` says that nobody has asked for it yet.
     """
 
     key: Key
@@ -102,6 +105,7 @@ class Load:
     spent_s: float = 0.0
     losses: int = 0
     computed: bool = False
+    prefetch: bool = False
 
 
 @dataclass(slots=True)

@@ -98,6 +98,15 @@ COUNTERS: Final = (
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
+    Counter("cells_late", "counter", "", "Cells that a client on its way asked for and had to wait for"),
+    Counter("prefetch_started", "counter", "", "Loads begun before anybody asked for the cell"),
+    Counter("prefetch_used", "counter", "", "Segments fetched ahead that somebody then asked for"),
+    Counter(
+        "prefetch_in_vain", "counter", "", "Segments fetched ahead that left memory before anybody asked"
+    ),
+    Counter("prefetch_overtaken", "counter", "", "Cells asked for while they were being fetched ahead"),
+    Counter("bytes_prefetched", "gauge", "bytes", "Memory of what was fetched ahead and not asked for yet"),
+    Counter("bytes_used", "counter", "bytes", "Segment bytes handed out for the first time"),
     Counter(
         "live_restarts", "counter", "", "Times the process that keeps live maps ended, and was started anew"
     ),

@@ -116,8 +116,21 @@ def add_parser(subparsers: Subparsers) -> None:
     limits.add_argument(
         "--eviction",
         metavar="POLICY",
-        help="which cells go first when memory is needed: distance (farthest from all clients; the "
-        "default) or lru (longest unused)",
+        help="which cells go first when memory is needed: time (those that clients will need last; the "
+        "default), distance (farthest from all clients) or lru (longest unused)",
+    )
+    limits.add_argument(
+        "--ride-out",
+        metavar="SECONDS",
+        dest="ride_out_s",
+        help="for so long the map's files may be out of reach without a moving client's noticing: cells are "
+        "fetched so far ahead (default: 10)",
+    )
+    limits.add_argument(
+        "--prefetch-share",
+        metavar="PART",
+        help="part of the budget that cells fetched ahead may take until somebody asks for them; 0: none "
+        "are (default: 0.5)",
     )
     parser.add_argument(
         "--cache-dir",

@@ -292,6 +292,7 @@ class CellCache:
         """Nobody finds it any more; its bytes still show."""
         self.tell(self.events.retired, resident, why)
         self.used.discard(resident)
+        self.statistics.add("prefetch_in_vain", resident.prefetched)
         self.warm.note_retired(resident)
         index = self.index_of(resident.key.cell_id)
         if index is not None and self.warm.get(index, resident.key.layer) is resident:

@@ -80,6 +80,8 @@ class Ledger:
         Bytes of retired segments that nobody had open at the last look.
     overhead_bytes
         What the daemon itself keeps in shared memory (its statistics); counts as used.
+    prefetched_bytes
+        Memory of what was fetched before anybody asked for it, and nobody has asked for yet.
     unchecked_count
         How many residents are of an earlier life and not yet checked.
     """
@@ -96,6 +98,7 @@ class Ledger:
         self.condemned_bytes = 0
         self.reserved_bytes = 0
         self.overhead_bytes = 0
+        self.prefetched_bytes = 0
         self.unchecked_count = 0
         self._by_name: ShardedDict[str, Resident] = ShardedDict()
         self._needed: dict[Key, int] = {}
@@ -179,6 +182,7 @@ class Ledger:
         self._layers[resident.key.layer] += 1
         self.resident_bytes += resident.nbytes
         self.unchecked_count += not resident.checked
+        self.prefetched_bytes += resident.nbytes * resident.prefetched
         self.segments.add(resident)
         self.order.new[resident] = None
         if old is not None:
@@ -190,6 +194,12 @@ class Ledger:
         resident.checked = True
         self.unchecked_count -= 1
 
+    def asked_for(self, resident: Resident) -> None:
+        """Somebody asked for what was fetched ahead."""
+        if resident.prefetched and self._by_name.get(resident.name) is resident:
+            self.prefetched_bytes -= resident.nbytes
+        resident.prefetched = False
+
     # --- leaving --------------------------------------------------------------------------------
 
     def _leave_service(self, resident: Resident) -> None:
@@ -198,6 +208,7 @@ class Ledger:
         if not self._layers[resident.key.layer]:
             del self._layers[resident.key.layer]
         self.unchecked_count -= not resident.checked
+        self.prefetched_bytes -= resident.nbytes * resident.prefetched
         self.resident_bytes -= resident.nbytes
         self.order.leave(resident)
         self.retired_bytes += resident.nbytes

@@ -25,6 +25,8 @@ __all__ = ["BACKGROUND", "LoadQueue", "Loads"]
 
 BACKGROUND: Final = 1e12
 """From this priority on a load is one that nobody waits for."""
+PREFETCH: Final = 2.0 * BACKGROUND
+"""From this priority on a load is one that nobody has asked for yet; and who asks for those."""
 FIRST_RETRY_S: Final = 1.0
 LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
@@ -182,11 +184,18 @@ class Loads:
             load = self.by_key[key] = Load(
                 key, estimate, priority, self._numbers, asker=asker, computed=key.layer != LAYER
             )
-        elif load.running:
+        load.prefetch = False
+        if load.running:
             load.wanted = True
             return load
         load.wanted, load.priority = True, min(load.priority, priority)
         self._queue.push(load, priority, asker)
+        return load
+
+    def prefetch(self, key: Key, estimate: int, needed_in_s: float) -> Load:
+        """Queue a load that nobody has asked for yet, behind everything that somebody asks for."""
+        load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH)
+        load.wanted, load.prefetch = False, True
         return load
 
     def is_promised(self, key: Key) -> bool:
@@ -274,6 +283,12 @@ class Loads:
         """Forget standing failures for lack of memory: there may be room now."""
         for code in SPACE_CODES:
             for key in self._keys_failed.pop(code, ()):
+                self._forget_failure(key, code)
+
+    def forget_failures(self) -> None:
+        """Forget all other standing failures: what all of them came from has passed."""
+        for code in [code for code in self._keys_failed if code not in SPACE_CODES]:
+            for key in self._keys_failed.pop(code):
                 self._forget_failure(key, code)
 
     def _forget_failure(self, key: Key, code: str) -> None:

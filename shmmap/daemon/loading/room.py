@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load
@@ -29,11 +30,18 @@ class Room:
     cache: CellCache
     loads: Loads
     pool: WorkerPool
+    prefetcher: Prefetcher
     hungry: dict[int, tuple[Worker, int]] = field(default_factory=dict)
 
     def refusal(self, load: Load, shortage: int, now_s: float) -> str:
         """Make room for a load; why there is none, or nothing where it is on its way."""
         ledger = self.cache.ledger
+        if load.prefetch:
+            return (
+                ""
+                if self.prefetcher.make_room(load, shortage, now_s)
+                else "it will be needed later than others"
+            )
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
@@ -54,7 +62,11 @@ class Room:
                 granted = self.loads.grow(load, nbytes)
                 if not granted and nbytes + ledger.overhead_bytes <= ledger.budget_bytes:
                     shortage = ledger.shortage(nbytes - load.reserved)
-                    if self.cache.evictor.free(shortage, now_s) or self._may_be_given_back():
+                    if load.prefetch:
+                        freed = self.prefetcher.make_room(load, shortage, now_s)
+                    else:
+                        freed = self.cache.evictor.free(shortage, now_s) or self._may_be_given_back()
+                    if freed:
                         continue
                 self.pool.answer(worker, Decision(granted))
             del self.hungry[number]

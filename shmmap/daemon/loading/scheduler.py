@@ -22,6 +22,7 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
+from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
@@ -47,19 +48,28 @@ class Scheduler:
     ----------
     clock
         The serving loop's clock, seconds.
+    prefetch_share, ride_out_s
+        See `Prefetcher`.
 
     Attributes
     ----------
     loads
         What is wanted, queued and under way, and what failed.
-    room, lost
-        Asks the cache for room; replaces workers.
+    prefetcher, room, lost
+        Wishes for what nobody has asked for yet; asks the cache for room; replaces workers.
     on_settled
         Called with a key when its load ended, in whichever way.
     """
 
     def __init__(
-        self, cache: CellCache, map_switch: MapSwitch, pool: WorkerPool, *, clock: Callable[[], float]
+        self,
+        cache: CellCache,
+        map_switch: MapSwitch,
+        pool: WorkerPool,
+        *,
+        clock: Callable[[], float],
+        prefetch_share: float = 0.0,
+        ride_out_s: float = 0.0,
     ) -> None:
         self._cache = cache
         self._map_switch = map_switch
@@ -71,7 +81,8 @@ class Scheduler:
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
         self._job_numbers, self._unfinished = 0, False
-        self.room = Room(cache, self.loads, pool)
+        self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
+        self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
     # --- being asked ----------------------------------------------------------------------------
@@ -124,7 +135,8 @@ class Scheduler:
         self._drop_some()
         end_s = time.thread_time() + HAND_OUT_S
         for _ in range(LOOKS_A_PUMP):
-            self._unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
+            due = len(self.loads) > 0 or self.prefetcher.is_due(now_s)
+            self._unfinished = due and self._hand_out_one(now_s)
             if not self._unfinished or time.thread_time() > end_s:
                 break
 
@@ -132,14 +144,16 @@ class Scheduler:
         """See to the load that comes next; False if there is none, or it has to wait."""
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         if (load := self.loads.next_queued(points=points, layers=layers)) is None:
-            return False
+            return self.prefetcher.wish(now_s)
         if (job := self._job(load, self._job_numbers + 1)) is None:
             self._end(load)
             return True
         shortage = self._cache.ledger.shortage(load.estimate)
         if load.estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, now_s)
-            if refusal:
+            if refusal and load.prefetch:
+                self._end(load)
+            elif refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
             return bool(refusal)
         self.loads.start(load, now_s)
@@ -151,6 +165,7 @@ class Scheduler:
             return True
         if taken:
             self._jobs[job.number] = load
+            self.prefetcher.started(load)
             self._statistics.add("loads_started", isinstance(job, Job))
         else:
             self.loads.requeue(load)
@@ -202,7 +217,7 @@ class Scheduler:
         if self._doubtful or self._unfinished:
             return 0.0
         sweep_s, room_s = self._cache.reclaimer.next_sweep_s(), self._cache.evictor.wake_s
-        return min(sweep_s, room_s, self.pool.next_deadline_s())
+        return min(sweep_s, room_s, self.pool.next_deadline_s(), self.prefetcher.next_s)
 
     # --- what workers say -----------------------------------------------------------------------
 
@@ -276,13 +291,14 @@ class Scheduler:
         resident = Resident(
             name="", key=key, version=done.version, nbytes=0, points=done.points,
             box=cache.catalogue.box(index), z_min=done.z_min, z_max=done.z_max, last_use_s=now_s,
-            load_ns=done.load_ns,
+            load_ns=done.load_ns, prefetched=load.prefetch,
         )  # fmt: skip
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
             self._fail(load, failure_code(error), f"cannot publish: {error.strerror}", None, now_s)
             return
+        self.prefetcher.heard(load, "", now_s)
         cache.tell(cache.events.loaded, resident, int((now_s - load.started_s) * 1e9), replaces)
         self._statistics.add("loads_from_cache", done.cached)
         self._statistics.add("layers_computed", not done.cached and key.layer != LAYER)
@@ -331,6 +347,10 @@ class Scheduler:
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return
+        self.prefetcher.heard(load, code, now_s)
+        if code in SPACE_CODES and load.prefetch:
+            self._end(load)
+            return
         if code in SPACE_CODES:
             self._statistics.add("refused_over_budget")
         else:
@@ -347,4 +367,5 @@ class Scheduler:
     def _end(self, load: Load, failure: Failure | None = None) -> None:
         """A load ended; whoever waits for it is told."""
         self.loads.finish(load, failure)
+        self.prefetcher.over(load)
         self.on_settled(load.key)

@@ -138,6 +138,13 @@ class WorkerPool:
         found = self._least_busy(computed=computed) is not None
         return found or self._may_start or (not computed and self._may_start_one_for_points)
 
+    @property
+    def idle(self) -> int:
+        """How many jobs could be begun at once."""
+        waiting = sum(not worker.queue and not worker.for_points for worker in self._workers.values())
+        count = sum(not worker.for_points for worker in self._workers.values())
+        return waiting + max(0, self.limit - count - len(self._ending))
+
     def _least_busy(self, *, computed: bool) -> Worker | None:
         """Who should have the next job of a kind; None if nobody has room for it."""
         able = [

@@ -123,9 +123,16 @@ class CellReplies:
 
     def hand_out(self, session: Session, answer: Answer, now_s: float) -> Iterator[None]:
         """Note who has been given what."""
+        first_used = 0
         for resident in answer.residents:
             resident.last_use_s = now_s  # from now on it is spared for as long as opening it takes
+            if not resident.hits:
+                first_used += resident.nbytes
+                if resident.prefetched:
+                    self.cache.ledger.asked_for(resident)
+                    self.cache.statistics.add("prefetch_used")
             resident.hits += 1
+        self.cache.statistics.add("bytes_used", first_used)
         self.cache.used.update(answer.residents)
         self.cache.statistics.add("handles_sent", len(answer.handles))
         for number, residents in enumerate(parts(answer.residents)):

@@ -80,7 +80,7 @@ class CellRequests:
         area = messages.area_from_message(message.area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        session.asks(area, layers, self._now_s())
+        self._note_area(session, area, layers)
         found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         cells = [(index, layer) for index in cache.at_height(found.tolist(), area.z) for layer in layers]
@@ -114,7 +114,7 @@ class CellRequests:
         area = messages.area_from_message(message.area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        session.asks(area, layers, self._now_s())
+        self._note_area(session, area, layers)
         found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         if len(layers) == 1 and area.z is None and covered and len(found) <= MOST_AT_ONCE:
@@ -129,6 +129,11 @@ class CellRequests:
                 self._statistics.add("hits", len(answer.handles))
                 return self._answers.hand_out(session, answer, self._now_s())
         return self._serve_lacking(lacking(cache, session, message, area, layers), message.wait)
+
+    def _note_area(self, session: Session, area: Area, layers: tuple[str, ...]) -> None:
+        """Whoever asks for an area may go on from there."""
+        session.asks(area, layers, self._now_s())
+        self._scheduler.prefetcher.follow(session)
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these."""
@@ -198,13 +203,18 @@ class CellRequests:
             boxes = cache.catalogue.boxes[np.array([index for index, _ in part], dtype=np.intp)]
             for (index, layer), distance in zip(part, wanted.distances_m(boxes).tolist(), strict=True):
                 key = Key(cache.catalogue.id(index), layer)
-                if (
-                    key not in wanted.refused
-                    and cache.warm.get(index, layer) is None  # it may have come for somebody else
-                    and self._scheduler.want(index, layer, distance, now_s, wanted.session.asker)
-                    and note
-                ):
+                if key in wanted.refused or cache.warm.get(index, layer) is not None:
+                    continue  # it may have come for somebody else
+                self._note_late(wanted, key)
+                if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
                     self._patient.wait_for(wanted, key)
+
+    def _note_late(self, wanted: PendingRequest, key: Key) -> None:
+        """Count what a client that moves on has to wait for: somebody could have known that it would come."""
+        load = self._scheduler.loads.by_key.get(key)
+        if load is None or load.prefetch:
+            self._statistics.add("cells_late", wanted.session.motion.travelled_m > 0.0)
+            self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:
         """A load ended: answer the requests it was the last one for."""
@@ -282,7 +292,8 @@ class CellRequests:
         self.tidy()
 
     def forget(self, session: Session) -> None:
-        """The session ended: nobody waits for its requests any more."""
+        """The session ended: nobody waits for its requests any more, nor for what it would have asked for."""
+        self._scheduler.prefetcher.leave(session)
         for wanted in self._patient.of(session):
             self._patient.remove(wanted)
             self._patient.let_go(wanted)

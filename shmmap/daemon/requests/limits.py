@@ -26,9 +26,9 @@ __all__ = [
     "MOST_CELLS",
     "SessionQuota",
     "admitted_layers",
-    "check_intent",
     "check_count",
     "check_held",
+    "check_intent",
     "check_queue",
     "layers_named",
 ]

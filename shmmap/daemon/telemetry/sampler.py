@@ -98,6 +98,7 @@ class Sampler:
         set_value("segments_pinned", cache.survey.usage.count)
         set_value("bytes_reserved", ledger.reserved_bytes)
         set_value("bytes_statistics", cache.statistics.size_bytes)
+        set_value("bytes_prefetched", ledger.prefetched_bytes)
         set_value("budget_bytes", ledger.budget_bytes)
         set_value("evictions", cache.evictor.evicted_count)
         set_value("map_cells", len(cache.catalogue))

@@ -52,7 +52,7 @@ class Session:
     exclusive_bytes: int = 0
     intent: Intent | None = None
     motion: Motion = field(default_factory=Motion)
-    places: Places = NOWHERE
+    places: Places = field(default_factory=lambda: NOWHERE)
     says_where: bool = False
     area: Area | None = None
     layers: tuple[str, ...] = ()

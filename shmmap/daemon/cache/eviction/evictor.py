@@ -59,10 +59,15 @@ class Evictor:
     def __post_init__(self) -> None:
         self._score = self._score_at(0, 0.0)
 
-    def free(self, shortage: int, now_s: float) -> bool:
+    def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> bool:
         """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
 
         True also means that calling again at ``wake_s`` helps.
+
+        Parameters
+        ----------
+        rather_than
+            What the room is for, if nobody has asked for it: what would go after that is left alone.
         """
         ledger = self.reclaimer.ledger
         self.wake_s = math.inf
@@ -71,7 +76,11 @@ class Evictor:
             return True
         self._refresh_until_s = now_s + PRESSURE_S
         order, looks = ledger.order, 0
-        first = order.front(self._scored(now_s), now_s)
+        score = self._scored(now_s)
+        first = order.front(score, now_s)
+        if rather_than is not None:
+            least, *scores = score.of([rather_than, *first])
+            first = [resident for resident, its in zip(first, scores, strict=True) if its > least]
         for resident in first:
             graced_s = resident.last_use_s + HAND_OUT_GRACE_S
             if ledger.is_needed(resident.key):
@@ -92,6 +101,8 @@ class Evictor:
         if first:
             self.wake_s = now_s
             return True
+        if rather_than is not None:
+            return ledger.coming_bytes >= shortage
         return self._is_any_soon_free(now_s) or ledger.coming_bytes >= shortage
 
     def _is_any_soon_free(self, now_s: float) -> bool:
