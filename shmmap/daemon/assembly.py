@@ -129,6 +129,7 @@ class Service:
         )
         chores: deque[tuple[str, Chore]] = deque()
         chores += [("usage", cache.survey), ("map", memory.map_switch)]
+        chores += [("memory", scheduler.prefetcher)]
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
         self._handshake = handshake
         self._loop = ServingLoop(

@@ -115,9 +115,11 @@ class MapInMemory:
         )
         Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
         self.cache.tell_all()
-        self.watched.watch(reclaimer.closer.fd, self.scheduler.hear_of_freed, "memory")
+        self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
         if pins.fd >= 0:
-            self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(time.monotonic()), "memory")
+            self.watched.watch(
+                pins.fd, lambda: self.scheduler.room.hear_of_closes(time.monotonic()), "memory"
+            )
         if self.cache.names.fd >= 0:
             self.watched.watch(
                 self.cache.names.fd, lambda: self.cache.hear_of_names(time.monotonic()), "memory"

@@ -34,8 +34,8 @@ class Resident:
 
     ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
     their checksums: until then nobody is handed it.  ``prefetched`` is true for one that was fetched before
-    anybody asked for it, until somebody does.  ``handle`` and ``stale_handle`` are encoded once, to be used in
-    every reply; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
+    anybody asked for it, until somebody does.  ``handle`` and ``stale_handle`` are encoded once, for all
+    replies; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
     among all segments of its size.
     """
 

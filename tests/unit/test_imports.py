@@ -83,8 +83,8 @@ PARTS = {
 """What stands below what; a dotted name allows that module or package alone."""
 ROOMS = [
     {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
-    {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"map", "pins"},
-    {"host", "service_manager"}, {"config"}, {"config_file", "config_live", "records"},
+    {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel"},
+    {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_file", "config_live", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 MOST_MODULES = 12

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -11,7 +11,7 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
-from shmmap.daemon.records import Load
+from shmmap.daemon.records import Load, Resident
 from shmmap.quantities import format_bytes
 
 __all__ = ["Room"]
@@ -32,6 +32,21 @@ class Room:
     pool: WorkerPool
     prefetcher: Prefetcher
     hungry: dict[int, tuple[Worker, int]] = field(default_factory=dict)
+
+    def hear_of_closes(self, now_s: float) -> None:
+        """The kernel reports that segments were closed."""
+        if self.cache.reclaimer.hear(now_s):
+            self.loads.forget_refusals()
+
+    def hear_of_freed(self) -> None:
+        """Memory is back with the kernel."""
+        if self.cache.reclaimer.collect():
+            self.loads.forget_refusals()
+
+    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
+        """Somebody dropped these: what was refused for lack of memory may fit now."""
+        self.cache.reclaimer.let_go(residents, now_s)
+        self.loads.forget_refusals()
 
     def refusal(self, load: Load, shortage: int, now_s: float) -> str:
         """Make room for a load; why there is none, or nothing where it is on its way."""

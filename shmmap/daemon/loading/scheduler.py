@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads from the queue to their end: room is made, a worker is given the job, its word is heard.
 
-Requests ask the cache; what is absent they ask the scheduler, which asks the cache for room and publishes
-into it.  Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long
-is replaced, and the jobs behind the one it died of go back into the queue.
-
-A segment of an earlier life of the daemon is checked by a worker before it is handed out, as a load that
-costs no memory; when it is not what it should be, the cell is loaded like any other.  So is the file of a
-cell that failed: only workers look at files, because a look may take as long as a file system hangs.
+Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is replaced,
+and the jobs behind the one it died of go back into the queue.  A segment of an earlier life of the daemon is
+checked by a worker before it is handed out, and the file of a cell that failed is looked at by one, as loads
+that cost no memory: a look may take as long as a file system hangs.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -135,8 +132,7 @@ class Scheduler:
         self._drop_some()
         end_s = time.thread_time() + HAND_OUT_S
         for _ in range(LOOKS_A_PUMP):
-            due = len(self.loads) > 0 or self.prefetcher.is_due(now_s)
-            self._unfinished = due and self._hand_out_one(now_s)
+            self._unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
             if not self._unfinished or time.thread_time() > end_s:
                 break
 
@@ -144,16 +140,14 @@ class Scheduler:
         """See to the load that comes next; False if there is none, or it has to wait."""
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         if (load := self.loads.next_queued(points=points, layers=layers)) is None:
-            return self.prefetcher.wish(now_s)
+            return False
         if (job := self._job(load, self._job_numbers + 1)) is None:
             self._end(load)
             return True
         shortage = self._cache.ledger.shortage(load.estimate)
         if load.estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, now_s)
-            if refusal and load.prefetch:
-                self._end(load)
-            elif refusal:
+            if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
             return bool(refusal)
         self.loads.start(load, now_s)
@@ -165,7 +159,8 @@ class Scheduler:
             return True
         if taken:
             self._jobs[job.number] = load
-            self.prefetcher.started(load)
+            if load.prefetch:
+                self.prefetcher.started(load)
             self._statistics.add("loads_started", isinstance(job, Job))
         else:
             self.loads.requeue(load)
@@ -197,27 +192,12 @@ class Scheduler:
             tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in around),
         )  # fmt: skip
 
-    def hear_of_closes(self, now_s: float) -> None:
-        """The kernel reports that segments were closed."""
-        if self._cache.reclaimer.hear(now_s):
-            self.loads.forget_refusals()
-
-    def hear_of_freed(self) -> None:
-        """Memory is back with the kernel."""
-        if self._cache.reclaimer.collect():
-            self.loads.forget_refusals()
-
-    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Somebody dropped these: what was refused for lack of memory may fit now."""
-        self._cache.reclaimer.let_go(residents, now_s)
-        self.loads.forget_refusals()
-
     def next_event_s(self) -> float:
         """When there is something to do although nothing arrives; infinity for never."""
         if self._doubtful or self._unfinished:
             return 0.0
-        sweep_s, room_s = self._cache.reclaimer.next_sweep_s(), self._cache.evictor.wake_s
-        return min(sweep_s, room_s, self.pool.next_deadline_s(), self.prefetcher.next_s)
+        cache = self._cache
+        return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())
 
     # --- what workers say -----------------------------------------------------------------------
 
@@ -298,7 +278,6 @@ class Scheduler:
         except OSError as error:
             self._fail(load, failure_code(error), f"cannot publish: {error.strerror}", None, now_s)
             return
-        self.prefetcher.heard(load, "", now_s)
         cache.tell(cache.events.loaded, resident, int((now_s - load.started_s) * 1e9), replaces)
         self._statistics.add("loads_from_cache", done.cached)
         self._statistics.add("layers_computed", not done.cached and key.layer != LAYER)
@@ -347,8 +326,8 @@ class Scheduler:
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return
-        self.prefetcher.heard(load, code, now_s)
         if code in SPACE_CODES and load.prefetch:
+            self.prefetcher.full(now_s)
             self._end(load)
             return
         if code in SPACE_CODES:
@@ -366,6 +345,6 @@ class Scheduler:
 
     def _end(self, load: Load, failure: Failure | None = None) -> None:
         """A load ended; whoever waits for it is told."""
+        self.prefetcher.ended.append((load, load.running, load.spent_s, failure is not None))
         self.loads.finish(load, failure)
-        self.prefetcher.over(load)
         self.on_settled(load.key)

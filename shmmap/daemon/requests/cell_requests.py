@@ -80,7 +80,7 @@ class CellRequests:
         area = messages.area_from_message(message.area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        self._note_area(session, area, layers)
+        _note_area(session, area, layers)
         found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         cells = [(index, layer) for index in cache.at_height(found.tolist(), area.z) for layer in layers]
@@ -114,7 +114,7 @@ class CellRequests:
         area = messages.area_from_message(message.area)
         cache = self._cache
         layers = limits.admitted_layers(cache, message.layers)
-        self._note_area(session, area, layers)
+        _note_area(session, area, layers)
         found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
         limits.check_count(len(found) * len(layers))
         if len(layers) == 1 and area.z is None and covered and len(found) <= MOST_AT_ONCE:
@@ -130,14 +130,9 @@ class CellRequests:
                 return self._answers.hand_out(session, answer, self._now_s())
         return self._serve_lacking(lacking(cache, session, message, area, layers), message.wait)
 
-    def _note_area(self, session: Session, area: Area, layers: tuple[str, ...]) -> None:
-        """Whoever asks for an area may go on from there."""
-        session.asks(area, layers, self._now_s())
-        self._scheduler.prefetcher.follow(session)
-
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these."""
-        self._scheduler.let_go(residents, self._now_s())
+        self._scheduler.room.let_go(residents, self._now_s())
 
     # --- loading and waiting --------------------------------------------------------------------
 
@@ -210,10 +205,10 @@ class CellRequests:
                     self._patient.wait_for(wanted, key)
 
     def _note_late(self, wanted: PendingRequest, key: Key) -> None:
-        """Count what a client that moves on has to wait for: somebody could have known that it would come."""
+        """Count what nobody fetched ahead: if the client was on its way, it is late."""
         load = self._scheduler.loads.by_key.get(key)
         if load is None or load.prefetch:
-            self._statistics.add("cells_late", wanted.session.motion.travelled_m > 0.0)
+            wanted.session.cold_cells += 1
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:
@@ -292,8 +287,7 @@ class CellRequests:
         self.tidy()
 
     def forget(self, session: Session) -> None:
-        """The session ended: nobody waits for its requests any more, nor for what it would have asked for."""
-        self._scheduler.prefetcher.leave(session)
+        """The session ended: nobody waits for its requests any more."""
         for wanted in self._patient.of(session):
             self._patient.remove(wanted)
             self._patient.let_go(wanted)
@@ -314,3 +308,11 @@ class CellRequests:
 def _check_wait(wait_s: float | None) -> None:
     if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
         raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
+
+
+def _note_area(session: Session, area: Area, layers: tuple[str, ...]) -> None:
+    """A session asks for an area: in the middle of it is where it is, unless it says."""
+    session.area, session.layers = area, layers
+    if not session.says_where:
+        session.intent = session.told = messages.Intent(*area.center)
+    session.sessions.moved[session] = None

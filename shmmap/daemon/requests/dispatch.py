@@ -83,7 +83,9 @@ class Dispatch:
         if isinstance(message, messages.Differential | messages.Area | messages.Selected):
             if message.intent is not None:
                 check_intent(message.intent)
-                session.says(message.intent, now_s)
+                session.intent = session.told = message.intent
+                session.says_where = True
+                session.sessions.moved[session] = None
             if isinstance(message, messages.Differential):
                 return self.cells.differential(session, message)
             if isinstance(message, messages.Area):

@@ -37,8 +37,9 @@ class Session:
     naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``exclusive_bytes`` are
     those that no other session holds.  ``says_where`` tells
     an ``intent`` (where the client is and is going to be) that it stated from one that was guessed from
-    ``area``, the last one it asked for, in ``layers``.  ``motion`` is what is known of how it moves, and
-    ``places`` where it will be.  ``asker`` is whose turn its requests and loads count for: the
+    ``area``, the last one it asked for, in ``layers``.  ``motion`` is what is known of how it moves,
+    ``told`` what it does not know yet, and ``places`` where it will be.  ``cold_cells`` were asked
+    for since then and are not in memory.  ``asker`` is whose turn its requests and loads count for: the
     process's, else the session's own.
     """
 
@@ -56,6 +57,8 @@ class Session:
     says_where: bool = False
     area: Area | None = None
     layers: tuple[str, ...] = ()
+    told: Intent | None = None
+    cold_cells: int = 0
     requests: int = 0
     last_request_s: float = 0.0
     asker: int = 0
@@ -72,25 +75,9 @@ class Session:
 
     def disconnect(self) -> None:
         """The session has no connection; what it said of where it is does not count any more."""
-        self.connection.session = self.intent = self.area = None
+        self.connection.session = self.intent = self.told = self.area = None
         self.says_where = False
         self.motion = Motion()
-        self.sessions.moved[self] = None
-
-    def says(self, intent: Intent, now_s: float) -> None:
-        """The client says where it is and is going to be."""
-        self.motion.told(intent, now_s)
-        # of a route, as long as it may be, the motion keeps what it needs
-        self.intent = msgspec.structs.replace(intent, route=()) if intent.route else intent
-        self.says_where = True
-        self.sessions.moved[self] = None
-
-    def asks(self, area: Area, layers: tuple[str, ...], now_s: float) -> None:
-        """The client asks for an area: in the middle of it is where it is, unless it says."""
-        self.area, self.layers = area, layers
-        if not self.says_where:
-            self.intent = Intent(*area.center)
-            self.motion.seen(*area.center, now_s)
         self.sessions.moved[self] = None
 
     def hold(self, residents: Iterable[Resident]) -> None:
@@ -236,10 +223,12 @@ class Sessions:
         self._by_slot.pop(session.slot, None)
         self.departed.pop(session.slot, None)
 
-    def follow_moves(self) -> None:
-        """Bring `places` up to date, for a bounded number of sessions that moved."""
-        for session in list(islice(self.moved, MOVES_AT_ONCE)):
+    def follow_moves(self) -> list[Session]:
+        """Bring motions and `places` of some sessions that moved up to date, and return these."""
+        some = list(islice(self.moved, MOVES_AT_ONCE))
+        for session in some:
             self._follow(session)
+        return some
 
     def places(self) -> Places:
         """Where the clients are and are going to be, as of the last `follow_moves`."""
@@ -247,7 +236,13 @@ class Sessions:
 
     def _follow(self, session: Session) -> None:
         self.moved.pop(session, None)
-        where = session.intent is not None
-        reach_m = 0.0 if session.area is None else session.area.reach
-        session.places = places_of(session.motion, reach_m) if where else NOWHERE
+        told, session.told = session.told, None
+        if told is not None:
+            session.motion.told(told, session.last_request_s)
+            if told.route:  # of a route, as long as it may be, the motion keeps what it needs
+                session.intent = msgspec.structs.replace(told, route=())
+        if session.intent is None:
+            session.places = NOWHERE
+        else:
+            session.places = places_of(session.motion, 0.0 if session.area is None else session.area.reach)
         self.places_version += 1

@@ -14,11 +14,12 @@ import os
 import random
 import sys
 import time
+from typing import Any
 
 SIGMA = 0.8
 
 
-def _slow_down(plan: dict) -> None:
+def _slow_down(plan: dict[str, Any]) -> None:
     from shmmap.daemon.loading import worker_main
 
     outages = plan.get("outages", [])

@@ -109,8 +109,8 @@ class InnerDaemon:
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
         self.loads = self.scheduler.loads
-        self.watched.watch(self.reclaimer.closer.fd, self.scheduler.hear_of_freed)
-        self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(self.now_s()))
+        self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.hear_of_freed)
+        self.watched.watch(pins.fd, lambda: self.scheduler.room.hear_of_closes(self.now_s()))
         self.hold_answers = False
         self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []

@@ -154,8 +154,6 @@ class Evictor:
     def _scored(self, now_s: float) -> Score:
         """How segments are scored, by where clients are (if they move, were a moment ago)."""
         sessions = self.reclaimer.sessions
-        if sessions.moved:
-            sessions.follow_moves()
         if sessions.places_version != self._score.version and now_s - self._placed_s >= PLACES_S:
             self._placed_s = now_s
             self._score = self._score_at(sessions.places_version, now_s)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Carries out what `Prefetch` wishes for, with loaders and memory that nobody asks for just now.
 
-A wish becomes a load like any other, behind everything that somebody asks for.  One loader is kept free, so
-that a demand need not wait for a wish; and there is never more than one wish in the queue, so none is
-out of date.  Memory: a wish takes the place of what will be needed later than itself, never of what will
+A wish becomes a load like any other when nothing else is queued: so there is never more than one, none is out
+of date, and what somebody asks for comes first.  One loader is kept free, so that a demand need not wait for
+a wish.  Memory: a wish takes the place of what will be needed later than itself, never of what will
 be needed sooner or is in use, and what was fetched ahead and not asked for yet takes its share of the
 budget at most.
 """
@@ -11,6 +11,7 @@ budget at most.
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -18,13 +19,15 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.prefetch.prefetch import Prefetch
 from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
 from shmmap.daemon.loading.worker_pool import WorkerPool
-from shmmap.daemon.records import SPACE_CODES, Key, Load, Resident
+from shmmap.daemon.records import Key, Load, Resident
 from shmmap.daemon.transport.sessions import Session
 
 __all__ = ["Prefetcher"]
 
 MOST_WAYS: Final = 256
 """Clients for which cells are fetched ahead; each costs a look at every wish."""
+MOST_ENDED: Final = 1024
+"""Loads that ended between two turns; of more the first are forgotten."""
 FULL_S: Final = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 
@@ -38,69 +41,80 @@ class Prefetcher:
         Part of the budget that may be taken by what nobody has asked for yet; 0: nothing is fetched ahead.
     ride_out_s
         See `Prefetch`.
+
+    Attributes
+    ----------
+    ended
+        Loads that have ended, whether they ran, the loader's time and whether they failed; filled by who ends
+        them.
     """
 
     def __init__(
         self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, ride_out_s: float
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
+        self._sessions = cache.reclaimer.sessions
+        self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MOST_ENDED)
         self.share = share
         self.prefetch = Prefetch(self._is_absent, ride_out_s)
         self._now_s = 0.0
         self._next_s = -math.inf
         self._full_until_s = -math.inf
-        self._queued: Load | None = None
         self._running: dict[Load, int] = {}
 
     # --- clients ----------------------------------------------------------------------------------
 
-    def follow(self, session: Session) -> None:
-        """A client asked for an area, and may go on from there."""
+    def _follow(self, session: Session) -> None:
+        """A client has moved, or asked for another area; or is no more."""
         ways = self.prefetch.ways
         way = ways.get(session)
-        if self._next_s == math.inf:  # what it was handed may have been what took the memory
-            self._next_s = -math.inf
         if session.area is None or not self.share:
-            return
-        if way is not None and way.motion is session.motion:
+            ways.pop(session, None)
+        elif way is not None and way.motion is session.motion:
             way.asks(session.area, session.layers)
         elif way is not None or len(ways) < MOST_WAYS:
-            self._next_s = -math.inf
             ways[session] = WayAhead(session.motion, session.area, session.layers)
 
-    def leave(self, session: Session) -> None:
-        """A client does not go on."""
-        self.prefetch.ways.pop(session, None)
+    # --- a chore of the serving loop --------------------------------------------------------------
 
-    # --- loads ------------------------------------------------------------------------------------
+    @property
+    def next_s(self) -> float:
+        """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
+        if self._sessions.moved or self.ended:
+            return -math.inf
+        return self._next_s if self.prefetch.ways else math.inf
 
-    def is_due(self, now_s: float) -> bool:
-        """Whether `wish` may find something."""
-        return now_s >= self._next_s
-
-    def wish(self, now_s: float) -> bool:
-        """Queue what is needed first of what nobody has asked for yet; whether to look again at once."""
+    def turn(self, now_s: float) -> None:
+        """Follow some clients that moved, and wish for what is needed first of what nobody asks for."""
         self._now_s = now_s
+        for session in self._sessions.follow_moves():
+            self._follow(session)
+            cold, session.cold_cells = session.cold_cells, 0
+            if session.motion.travelled_m > 0.0:  # else it has just come, or jumped: nobody could know
+                self._cache.statistics.add("cells_late", cold)
+        while self.ended:
+            self._learn(*self.ended.popleft())
         if now_s < self._full_until_s:
             self._next_s = self._full_until_s
-            return False
-        if not self._may_begin():
+        elif not self._may_begin():
             self._next_s = math.inf  # until a load ends, or somebody asks for something
-            return False
+        else:
+            self._wish(now_s)
+
+    def _wish(self, now_s: float) -> None:
         cache, prefetch = self._cache, self.prefetch
         wish = prefetch.next(cache.catalogue, now_s)
-        if wish is None:
-            self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
-            return prefetch.more
-        key = Key(cache.catalogue.id(wish.cell), wish.layer)
-        self._queued = self._loads.prefetch(key, cache.estimate(wish.cell, wish.layer), wish.needed_in_s)
-        return True
+        if wish is not None:
+            key, nbytes = (
+                Key(cache.catalogue.id(wish.cell), wish.layer),
+                cache.estimate(wish.cell, wish.layer),
+            )
+            self._loads.prefetch(key, nbytes, wish.needed_in_s)
+        self._next_s = now_s if wish is not None or prefetch.more else prefetch.next_s(now_s)
 
     def _may_begin(self) -> bool:
         """Whether a loader has nothing to do but wait for demands, and there is memory for a wish."""
-        queued, self._queued = self._queued, None
-        if queued is not None and queued.prefetch and not queued.running and queued.key in self._loads.by_key:
-            self._queued = queued
+        if len(self._loads):
             return False
         ledger, spare = self._cache.ledger, 1 if self._pool.limit > 1 else 0
         taken = ledger.prefetched_bytes + sum(self._running.values())
@@ -113,6 +127,8 @@ class Prefetcher:
         failure = self._loads.failures.get(key)
         return failure is None or self._now_s >= failure.retry_at_s
 
+    # --- loads ------------------------------------------------------------------------------------
+
     def make_room(self, load: Load, shortage: int, now_s: float) -> bool:
         """Have memory freed for a wish; False if all there is will be needed sooner, or is in use."""
         index = self._cache.index_of(load.key.cell_id)
@@ -121,30 +137,20 @@ class Prefetcher:
             wished = Resident("", load.key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=now_s)
             if self._cache.evictor.free(shortage, now_s, rather_than=wished):
                 return True
-        self._full_until_s = now_s + FULL_S
+        self.full(now_s)
         return False
 
+    def full(self, now_s: float) -> None:
+        """There is no memory for a wish just now."""
+        self._full_until_s = now_s + FULL_S
+
     def started(self, load: Load) -> None:
-        """A load was handed to a loader."""
-        if load.prefetch and load not in self._running:
-            self._cache.statistics.add("prefetch_started")
-        if load.prefetch:
-            self._running[load] = load.estimate
+        """A wish was handed to a loader."""
+        self._cache.statistics.add("prefetch_started", load not in self._running)
+        self._running[load] = load.estimate
 
-    def heard(self, load: Load, failed: str, now_s: float) -> None:
-        """A loader is done with a load; ``failed`` is the code, if it could not do it."""
-        if failed in SPACE_CODES:
-            if load.prefetch:
-                self._full_until_s = now_s + FULL_S
-        elif self.prefetch.health.ended(load.spent_s, failed=bool(failed)):
-            self._loads.forget_failures()
-
-    def over(self, load: Load) -> None:
-        """There is no such load any more."""
+    def _learn(self, load: Load, ran: bool, took_s: float, failed: bool) -> None:
+        """A load has ended: what that tells of where it comes from."""
         self._running.pop(load, None)
-        self._next_s = -math.inf
-
-    @property
-    def next_s(self) -> float:
-        """When to look again though nothing happens."""
-        return self._next_s if self.prefetch.ways else math.inf
+        if ran and load.sources and self.prefetch.health.ended(took_s, failed=failed):
+            self._loads.forget_failures()

@@ -86,7 +86,7 @@ def test_looking_for_room_where_others_map_everything_comes_to_an_end(
             while one.evictor.free(1 << 30, one.now_s()):
                 looks += 1
                 assert looks < 10
-                one.scheduler.hear_of_closes(one.now_s())
+                one.scheduler.room.hear_of_closes(one.now_s())
 
 
 def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(

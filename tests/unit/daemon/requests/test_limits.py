@@ -8,7 +8,6 @@ import math
 import pytest
 
 from shmmap.daemon.requests import limits
-from shmmap.daemon.transport.sessions import ROUTE_VERTICES
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers import versions as layer_versions
 from shmmap.protocol.messages import Area, Differential, HeldCell, Intent, Selected
@@ -89,14 +88,11 @@ def test_a_layer_that_would_look_into_too_many_cells(
 
 
 def test_intents() -> None:
-    route = tuple((float(n), 0.0) for n in range(1000))
-    assert len(limits.bounded_intent(Intent(0.0, 0.0, route=route)).route) == ROUTE_VERTICES
-    short = Intent(1.0, 2.0, route=((3.0, 4.0),))
-    assert limits.bounded_intent(short) is short
+    limits.check_intent(Intent(1.0, 2.0, route=((3.0, 4.0),)))
     for wrong in (
         Intent(math.nan, 0.0),
         Intent(0.0, 0.0, heading=math.inf),
         Intent(0.0, 0.0, route=((0.0, math.nan),)),
     ):
         with pytest.raises(BadRequest, match="finite"):
-            limits.bounded_intent(wrong)
+            limits.check_intent(wrong)

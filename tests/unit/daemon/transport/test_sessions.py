@@ -5,25 +5,15 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.cell_requests import note_area
 from shmmap.daemon.transport.connection import Peer
-from shmmap.daemon.transport.sessions import (
-    MOVES_AT_ONCE,
-    ROUTE_VERTICES,
-    SQUARE_M,
-    SQUARES_ORIGIN,
-    Session,
-    Sessions,
-    command_of,
-    predicted_path,
-    squares_of,
-)
-from shmmap.geometry import Circle
+from shmmap.daemon.transport.sessions import MOVES_AT_ONCE, Session, Sessions, command_of
+from shmmap.daemon.travel.places import MOST_OF_A_CLIENT
 from shmmap.protocol.messages import Intent
 from tests.support import connections
 
@@ -110,11 +100,12 @@ def test_a_session_and_its_connections() -> None:
     assert session.client == "x" * 64
     assert session.command == command_of(os.getpid()) != ""
     assert first.session is sessions.by_slot(session.slot) is session
-    note_area(session, Circle(1.0, 2.0, 5.0))
+    move(session, Intent(1.0, 2.0))
     session.connect(second)
     assert [first.session, second.session] == [None, session]
     assert session.connection is second
-    assert sessions.places.squares == {}
+    sessions.follow_moves()
+    assert len(sessions.places()) == 0
     sessions.departed[session.slot] = session
     sessions.close(session)
     assert [second.session, sessions.by_slot(session.slot), sessions.departed] == [None, None, {}]
@@ -157,8 +148,9 @@ def test_who_gives_way() -> None:
     assert sessions.spare() is busy
 
 
-def move(session: Session, intent: Intent) -> None:
-    session.intent = intent
+def move(session: Session, intent: Intent, at_s: float = 0.0) -> None:
+    session.intent = session.told = intent
+    session.last_request_s = at_s
     session.sessions.moved[session] = None
 
 
@@ -167,74 +159,68 @@ def test_many_moves_are_followed_a_few_at_a_time() -> None:
     for number in range(3 * MOVES_AT_ONCE):
         move(sessions.open(connections.of(), "", 0.0), Intent(100.0 * number, 0.0))
     for count in (1, 2, 3):
-        sessions.follow_moves()
-        assert len(sessions.places.squares) == count * MOVES_AT_ONCE
+        assert len(sessions.follow_moves()) == MOVES_AT_ONCE
+        assert len(sessions.places()) == count * MOVES_AT_ONCE
     assert sessions.moved == {}
+    assert sessions.follow_moves() == []
 
 
-def middles(sessions: Sessions) -> set[tuple[float, float]]:
-    """Middles of the squares in which clients are or will be."""
+def places(sessions: Sessions) -> set[tuple[float, float]]:
+    """Where clients are or will be."""
     sessions.follow_moves()
-    return {
-        (
-            ((square >> 32) - SQUARES_ORIGIN + 0.5) * SQUARE_M,
-            ((square & 0xFFFFFFFF) - SQUARES_ORIGIN + 0.5) * SQUARE_M,
-        )
-        for square in sessions.places.squares
-    }
-
-
-def test_where_a_client_is() -> None:
-    """The middle of what it asks for, until it says so itself."""
-    sessions = Sessions()
-    session = sessions.open(connections.of(), "", 0.0)
-    sessions.open(connections.of(), "", 0.0)
-    assert middles(sessions) == set()
-    for at, middle in (((1.0, 2.0), (8.0, 8.0)), ((300.0, -4.0), (296.0, -8.0))):
-        note_area(session, Circle(*at, 5.0))
-        assert middles(sessions) == {middle}
-    move(session, Intent(70.0, 8.0))
-    session.says_where = True
-    note_area(session, Circle(1.0, 1.0, 5.0))
-    assert middles(sessions) == {(72.0, 8.0)}
-
-
-def test_where_a_client_is_going_counts() -> None:
-    still = Intent(1.0, 2.0)
-    assert predicted_path(still) == [(1.0, 2.0)]
-    straight = predicted_path(Intent(1.0, 2.0, vx=10.0, vy=-1.0))
-    assert straight == [(1.0, 2.0), *((1.0 + 10.0 * s, 2.0 - s) for s in (1, 2, 3, 4, 5))]
-    route = tuple((float(i), 0.0) for i in range(100))
-    known = predicted_path(Intent(1.0, 2.0, vx=10.0, route=route[:9]))
-    assert known == [(1.0, 2.0), *route[:9]], "all of the route, and nothing that the velocity says"
-    assert predicted_path(Intent(1.0, 2.0, route=route)) == [(1.0, 2.0), *route[:ROUTE_VERTICES]]
-    assert len(route) > ROUTE_VERTICES
+    return {(x, y) for x, y, *_ in sessions.places().tolist()}
 
 
 def test_eviction_is_told_where_clients_are_going() -> None:
-    """All clients together, each square once; who stays in its square changes nothing."""
     sessions = Sessions()
     one, other = (sessions.open(connections.of(), "", 0.0) for _ in range(2))
-    move(one, Intent(1.0, 2.0, route=((60.0, 2.0), (140.0, 2.0))))
-    assert middles(sessions) == {(8.0, 8.0), (40.0, 8.0), (72.0, 8.0), (136.0, 8.0)}
-    move(other, Intent(2.0, 3.0))
-    assert middles(sessions) == {(8.0, 8.0), (40.0, 8.0), (72.0, 8.0), (136.0, 8.0)}
-    version = sessions.places.version
-    move(other, Intent(3.0, 4.0))
-    sessions.follow_moves()
-    assert sessions.places.version == version
+    assert places(sessions) == set()
+    move(one, Intent(1.0, 2.0, route=((1.0, 2.0), (101.0, 2.0))))
+    version = sessions.places_version
+    found = places(sessions)
+    assert sessions.places_version != version
+    assert {(1.0, 2.0), (101.0, 2.0)} < found
+    assert {y for _, y in found} == {2.0}, "all along the route"
+    assert one.intent is not None
+    assert not one.intent.route, "the motion has it; it may be long"
+    move(other, Intent(-2.0, 3.0))
+    assert places(sessions) == found | {(-2.0, 3.0)}
     one.connection.session = None
     sessions.close(one)
-    assert middles(sessions) == {(8.0, 8.0)}
+    assert places(sessions) == {(-2.0, 3.0)}
     other.disconnect()
-    assert middles(sessions) == set()
+    assert places(sessions) == set()
+
+
+def test_a_route_lasts_until_the_client_says_something_else() -> None:
+    """A request that says nothing of it changes nothing; one with another pose and no route ends it."""
+    sessions = Sessions()
+    session = sessions.open(connections.of(), "", 0.0)
+    move(session, Intent(0.0, 0.0, route=((0.0, 0.0), (100.0, 0.0))))
+    sessions.follow_moves()
+    sessions.moved[session] = None  # it asks for another area
+    assert (100.0, 0.0) in places(sessions)
+    move(session, Intent(1.0, 0.0), 1.0)
+    assert places(sessions) == {(1.0, 0.0)}
+
+
+def test_how_a_client_moves_is_learnt_from_its_poses() -> None:
+    sessions = Sessions()
+    session = sessions.open(connections.of(), "", 0.0)
+    for second in range(4):
+        move(session, Intent(10.0 * second, 0.0), float(second))
+        sessions.follow_moves()
+    assert (session.motion.vx, session.motion.vy) == (10.0, 0.0)
+    assert session.motion.travelled_m == 30.0
 
 
 @pytest.mark.parametrize("far", [1e4, 1e9, 1e308])
-def test_however_long_a_route_is_it_counts_as_a_few_squares(far: float) -> None:
-    """The farther ahead, the farther apart; also where it leaves the grid."""
-    route = tuple((far * (1 + n % 3), far * n * (-1) ** n) for n in range(ROUTE_VERTICES))
+def test_however_long_a_route_is_it_counts_as_so_many_places(far: float) -> None:
+    """Also where it leaves the map by far."""
+    sessions = Sessions()
+    route = tuple((far * (1 + n % 3), far * n * (-1) ** n) for n in range(4096))
     for intent in (Intent(0.0, 0.0, route=route), Intent(far, far, vx=-far, vy=far)):
-        assert len(squares_of(predicted_path(intent))) <= 32
-    straight = squares_of([(0.0, 0.0), (1000.0, 0.0)])
-    assert sorted((square >> 32) - SQUARES_ORIGIN for square in straight) == [0, 2, 4, 8, 16, 32, 62]
+        move(sessions.open(connections.of(), "", 0.0), intent)
+        sessions.follow_moves()
+    assert all(len(session.places) <= MOST_OF_A_CLIENT for session in sessions)
+    assert np.isfinite(sessions.places()[:, :4]).all()
