@@ -74,6 +74,7 @@ class InnerDaemon:
         quota_bytes: int = 64 << 20,
         workers: int = 1,
         load_timeout_s: float = 30.0,
+        prefetch_share: float = 0.0,
         cache_dir: str,
         shm_dir: str = "",
         name: str = "inner",
@@ -94,7 +95,7 @@ class InnerDaemon:
         self.ledger.overhead_bytes = self.statistics.size_bytes
         pins = PinWatch(self.directory, events=True)
         self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, pins)
-        self.evictor = Evictor(self.reclaimer, POLICIES["distance"])
+        self.evictor = Evictor(self.reclaimer, POLICIES["time"])
         self.watched = WatchedDescriptors()
         self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
         self.pool = WorkerPool(workers, self.directory, self.parent, load_timeout_s, self.watched)
@@ -107,7 +108,10 @@ class InnerDaemon:
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
+        self.scheduler = Scheduler(
+            self.cache, self.map_switch, self.pool, clock=self.now_s,
+            prefetch_share=prefetch_share, ride_out_s=10.0,
+        )  # fmt: skip
         self.loads = self.scheduler.loads
         self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.hear_of_freed)
         self.watched.watch(pins.fd, lambda: self.scheduler.room.hear_of_closes(self.now_s()))
@@ -169,6 +173,8 @@ class InnerDaemon:
         self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
         self.map_switch.turn(now_s)
+        if self.scheduler.prefetcher.next_s <= now_s:
+            self.scheduler.prefetcher.turn(now_s)
         if self.evictor.next_s <= now_s:
             self.evictor.turn(now_s)
         while not self.hold_answers and self.due:

@@ -97,28 +97,27 @@ class Prefetcher:
         if now_s < self._full_until_s:
             self._next_s = self._full_until_s
         elif not self._may_begin():
-            self._next_s = math.inf  # until a load ends, or somebody asks for something
+            self._next_s = math.inf  # until a load ends
         else:
             self._wish(now_s)
+
+    def _may_begin(self) -> bool:
+        """Whether a loader has nothing to do but wait for demands."""
+        return not len(self._loads) and self._pool.idle > (1 if self._pool.limit > 1 else 0)
 
     def _wish(self, now_s: float) -> None:
         cache, prefetch = self._cache, self.prefetch
         wish = prefetch.next(cache.catalogue, now_s)
-        if wish is not None:
-            key, nbytes = (
-                Key(cache.catalogue.id(wish.cell), wish.layer),
-                cache.estimate(wish.cell, wish.layer),
-            )
+        if wish is None:
+            self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
+            return
+        key, nbytes = Key(cache.catalogue.id(wish.cell), wish.layer), cache.estimate(wish.cell, wish.layer)
+        taken = cache.ledger.prefetched_bytes + sum(self._running.values())
+        if taken + nbytes > self.share * cache.ledger.budget_bytes:
+            self._next_s = math.inf  # until somebody asks for what was fetched
+        else:
             self._loads.prefetch(key, nbytes, wish.needed_in_s)
-        self._next_s = now_s if wish is not None or prefetch.more else prefetch.next_s(now_s)
-
-    def _may_begin(self) -> bool:
-        """Whether a loader has nothing to do but wait for demands, and there is memory for a wish."""
-        if len(self._loads):
-            return False
-        ledger, spare = self._cache.ledger, 1 if self._pool.limit > 1 else 0
-        taken = ledger.prefetched_bytes + sum(self._running.values())
-        return self._pool.idle > spare and taken < self.share * ledger.budget_bytes
+            self._next_s = now_s
 
     def _is_absent(self, index: int, layer: str) -> bool:
         key = Key(self._cache.catalogue.id(index), layer)

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells are loaded before somebody asks for them: with real loaders, and what is free of memory and of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, MOST_WAYS
+from shmmap.daemon.transport.sessions import Session
+from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
+from tests.support.daemon_process import stop
+from tests.support.divided_map import DividedMap, make_map
+from tests.unit.daemon.inner_daemon import Inner, InnerDaemon, names
+
+RADIUS_M = 30.0
+SPEED_MPS = 10.0
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> DividedMap:
+    """Return a map of 40 x 3 cells of 20 m, from x = -400 m to 400 m."""
+    return make_map(tmp_path / "street", columns=40, rows=3, points=60)
+
+
+class Drive:
+    """A client that drives along the street, with 10 m/s."""
+
+    def __init__(self, one: InnerDaemon, x: float = -350.0, *, layers: tuple[str, ...] = ("points",)) -> None:
+        self.one, self.layers = one, layers
+        self.session: Session = one.session()
+        self.request = 0
+        self.ask(x)
+
+    def ask(self, x: float, wait: float = 30.0) -> list[str]:
+        """Say where it is, and ask for what is around; returns the cells."""
+        self.request += 1
+        session = self.session
+        session.intent = session.told = Intent(x, 10.0, vx=SPEED_MPS)
+        session.says_where, session.last_request_s = True, self.one.now_s()
+        area = CircleMessage(x, 10.0, RADIUS_M)
+        self.one.ask(session, Area(self.request, area, self.layers, wait=wait))
+        return names(self.one.cells_of(self.request))
+
+
+def count(one: InnerDaemon, name: str) -> int:
+    return int(one.statistics.values[name])
+
+
+def idle(one: InnerDaemon) -> bool:
+    """Whether nothing is being loaded, and nothing wished for until later."""
+    prefetcher = one.scheduler.prefetcher
+    return not one.loads.by_key and not prefetcher.ended and prefetcher.next_s > one.now_s()
+
+
+@pytest.fixture
+def prefetching(inner: Inner, street: DividedMap) -> Iterator[Callable[..., InnerDaemon]]:
+    def factory(**options: object) -> InnerDaemon:
+        return inner(street.root, **{"prefetch_share": 0.5, "workers": 2, **options})
+
+    yield factory
+
+
+def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[..., InnerDaemon]) -> None:
+    one = prefetching()
+    drive = Drive(one)
+    one.run_until(lambda: idle(one))
+    loaded, misses = count(one, "prefetch_started"), count(one, "misses")
+    assert loaded > 3 * 4, "the street has three rows; twelve seconds are six columns"
+    assert one.ledger.prefetched_bytes == sum(r.nbytes for r in one.ledger.residents() if r.prefetched) > 0
+    seen = set[str]()
+    for x in (-340.0, -330.0, -320.0, -310.0, -300.0):
+        one.offset_s += 1.0
+        seen.update(drive.ask(x, wait=0.0))
+    one.turn()
+    assert count(one, "misses") == misses
+    assert count(one, "cells_late") == 0
+    assert count(one, "prefetch_used") == len([r for r in one.ledger.residents() if r.hits]) - misses > 5
+    assert len(seen) > 5
+    assert one.ledger.prefetched_bytes == sum(r.nbytes for r in one.ledger.residents() if r.prefetched)
+    assert count(one, "bytes_used") < count(one, "bytes_loaded")
+
+
+def test_layers_are_fetched_as_the_client_asks_for_them(prefetching: Callable[..., InnerDaemon]) -> None:
+    one = prefetching()
+    Drive(one, layers=("points", "voxel(0.5)"))
+    one.run_until(lambda: idle(one))
+    kinds = {resident.key.layer for resident in one.ledger.residents() if resident.prefetched}
+    assert len(kinds) == 2
+
+
+def test_nobody_s_way_nothing_is_fetched(inner: Inner, street: DividedMap) -> None:
+    """Who stands still, who has gone, and where it is switched off."""
+    off = inner(street.root, prefetch_share=0.0, name="off")
+    Drive(off)
+    off.run_until(lambda: idle(off))
+    one = inner(street.root, prefetch_share=0.5)
+    session = one.session()
+    one.ask(session, Area(1, CircleMessage(0.0, 10.0, RADIUS_M), wait=30.0))
+    one.cells_of(1)
+    one.run_until(lambda: idle(one))
+    assert [count(each, "prefetch_started") for each in (off, one)] == [0, 0]
+    drive = Drive(one)
+    one.turn()
+    assert len(one.scheduler.prefetcher.prefetch.ways) == 2
+    drive.session.disconnect()
+    session.disconnect()
+    one.run_until(lambda: idle(one))
+    assert not one.scheduler.prefetcher.prefetch.ways
+
+
+def test_a_crowd_costs_no_more_than_so_many_ways(inner: Inner, street: DividedMap) -> None:
+    one = inner(street.root, prefetch_share=0.5)
+    for number in range(MOST_WAYS + 10):
+        session = one.session()
+        one.ask(session, Area(number, CircleMessage(0.0, 10.0, 1.0), wait=0.0))
+    one.run_until(lambda: not one.sessions.moved)
+    assert len(one.scheduler.prefetcher.prefetch.ways) == MOST_WAYS
+
+
+def test_a_loader_is_kept_for_what_somebody_asks_for(prefetching: Callable[..., InnerDaemon]) -> None:
+    """One of two loaders fetches ahead and hangs: the other one has the demand."""
+    one = prefetching()
+    Drive(one)
+    one.run_until(lambda: count(one, "prefetch_started") and len(one.scheduler._jobs) == 0)
+    hung: list[int] = []
+
+    def hang() -> bool:
+        for worker in one.pool:
+            if worker.queue and worker.ready and not hung:
+                hung.append(worker.pid)
+                stop(worker.pid)
+        return bool(hung)
+
+    if not one.loads.by_key:
+        Drive(one, 100.0)
+    one.run_until(hang)
+    other = one.session()
+    one.ask(other, Selected(50, ("-400_0.pcd", "380_0.pcd"), wait=30.0))
+    assert names(one.cells_of(50)) == ["-400_0.pcd", "380_0.pcd"]
+    os.kill(hung[0], signal.SIGCONT)
+    one.run_until(lambda: idle(one))
+
+
+def test_what_is_asked_for_while_it_is_fetched_is_loaded_once(
+    prefetching: Callable[..., InnerDaemon],
+) -> None:
+    one = prefetching(workers=1)
+    drive = Drive(one)
+    with one.loaders_standing_still():
+        one.run_until(lambda: any(load.prefetch and load.running for load in one.loads.by_key.values()))
+        (load,) = one.loads.by_key.values()
+        other, started = one.session(), count(one, "loads_started")
+        one.ask(other, Selected(50, (load.key.cell_id,), wait=30.0))
+        assert not load.prefetch
+        assert count(one, "prefetch_overtaken") == 1
+    assert len(names(one.cells_of(50))) == 1
+    resident = one.ledger.by_key[load.key]
+    assert (resident.prefetched, resident.hits) == (False, 1)
+    assert count(one, "loads_started") >= started
+    one.run_until(lambda: idle(one))
+    assert count(one, "loads_finished") == len(list(one.ledger.residents())), "none came twice"
+    assert drive.session.cold_cells == 0
+
+
+def test_a_client_that_moves_on_and_has_to_wait_is_late(prefetching: Callable[..., InnerDaemon]) -> None:
+    """Not one that has just come, nor one that jumps."""
+    one = prefetching(prefetch_share=1e-9)  # a way, but no memory for it
+    drive = Drive(one)
+    one.run_until(lambda: not one.sessions.moved)
+    assert count(one, "cells_late") == 0
+    one.offset_s += 2.0
+    drive.ask(-330.0)
+    one.run_until(lambda: not one.sessions.moved)
+    assert count(one, "cells_late") == 3
+    one.offset_s += 1.0
+    drive.ask(300.0)
+    one.run_until(lambda: not one.sessions.moved)
+    assert count(one, "cells_late") == 3
+    assert count(one, "prefetch_started") == 0
+
+
+def test_no_more_than_its_share_of_the_budget(prefetching: Callable[..., InnerDaemon]) -> None:
+    one = prefetching()
+    Drive(one)
+    one.run_until(lambda: idle(one))
+    each = max(resident.nbytes for resident in one.ledger.residents())
+    share = (4 * each) / one.ledger.budget_bytes
+    other = prefetching(prefetch_share=share, name="other")
+    Drive(other)
+    other.run_until(lambda: idle(other))
+    assert 0 < other.ledger.prefetched_bytes <= 4 * each
+    assert other.ledger.prefetched_bytes < one.ledger.prefetched_bytes
+
+
+def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., InnerDaemon]) -> None:
+    """A full cache: what lies behind gives way, what is nearer ahead does not; nothing is refused or failed."""
+    one = prefetching(prefetch_share=1.0)
+    drive = Drive(one)
+    one.run_until(lambda: idle(one))
+    each = max(resident.nbytes for resident in one.ledger.residents())
+    few = prefetching(prefetch_share=1.0, name="few")
+    estimate = few.cache.estimate(0, "points")
+    few.ledger.budget_bytes = few.ledger.overhead_bytes + 16 * each + 2 * estimate
+    drive = Drive(few)
+
+    def settled() -> bool:
+        return idle(few) or few.scheduler.prefetcher.next_s - few.now_s() > FULL_S / 2
+
+    few.run_until(lambda: settled() and not few.loads.by_key)
+    columns = sorted({int(r.key.cell_id.rsplit("/", 1)[1].split("_")[0]) for r in few.ledger.residents()})
+    assert columns == list(range(columns[0], columns[-1] + 1, 20)), "the next ones, without a gap"
+    assert few.loads.failures == {}
+    assert count(few, "refused_over_budget") == 0
+    before = columns[-1]
+    for x in (-320.0, -290.0, -260.0):  # it lets go of what it has left behind
+        few.offset_s += 3.0 + HAND_OUT_GRACE_S
+        drive.session.drop(list(drive.session.held))
+        assert drive.ask(x)
+        few.run_until(lambda: settled() and not few.loads.by_key)
+    columns = sorted({int(r.key.cell_id.rsplit("/", 1)[1].split("_")[0]) for r in few.ledger.residents()})
+    assert columns[-1] > before, "what is behind made room for what is ahead"
+    assert few.evictor.evicted_count > 0
+    assert count(few, "prefetch_in_vain") == 0
+
+
+def test_an_origin_that_comes_back_is_used_at_once(
+    prefetching: Callable[..., InnerDaemon], street: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it is away one load in a while tells whether it is; then what had failed is tried at once."""
+    monkeypatch.setenv("SHMMAP_TEST_WORKER", "offline:")
+    marks = [Path(street.id(f"{x}_{y}.pcd") + ".offline") for x in range(-300, 400, 20) for y in (-20, 0, 20)]
+    for mark in marks:
+        mark.touch()
+    one = prefetching()
+    drive = Drive(one)
+    health = one.scheduler.prefetcher.prefetch.health
+    one.run_until(lambda: health.is_out)
+    tried = count(one, "prefetch_started")
+    for _ in range(3):
+        one.turn()
+    assert count(one, "prefetch_started") == tried, "not again at once"
+    for mark in marks:
+        mark.unlink()
+    one.stop_clock()
+    one.offset_s += 0.5
+    one.run_until(lambda: not health.is_out)
+    assert not [key for key, failure in one.loads.failures.items() if failure.code == "offline"]
+    one.stopped_at_s = None
+    one.run_until(lambda: idle(one))
+    assert drive.ask(-340.0, wait=0.0)
+    assert len({r.key.cell_id for r in one.ledger.residents()}) > 3 * 8
