@@ -32,6 +32,7 @@ INSTALL = read_page("shmmap/INSTALL.md")
 CLONE = README.commands("clone")
 (FULL,) = (line for line in README.text.splitlines() if line.endswith(" && shmmap demo"))
 (SLIM,) = INSTALL.commands("slim")
+pytestmark = pytest.mark.minutes
 WHERE = ["python3.10", "python3.13"] if os.environ.get("SHMMAP_TEST_FROM_NOTHING") else ["installed"]
 WITHOUT_OPEN3D = "python3.10"
 SLIM_BYTES = 360 << 20

@@ -141,6 +141,10 @@ def follow(
                 assert tuple(content) == expected.content(cell_id.rsplit("/", 1)[1])
                 assert versions.setdefault(cell_id, version) == version  # the same for everybody
         held = wanted
+    for client in clients:
+        if isinstance(client, CppFollower):
+            contents = {cell_id: tuple(content) for cell_id, *content in client.contents()}
+            assert contents == {made.id(name): expected.content(name) for name in held}
 
 
 def drive(count: int, half_side: float) -> list[Pose]:

@@ -30,6 +30,7 @@ import shmmap
 from shmmap.errors import BadRequest
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
+from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
 LONG_S = 60.0
@@ -88,11 +89,23 @@ class AtPlace:
         return self
 
 
+def threads() -> set[str]:
+    """Numbers of the threads of this process."""
+    return set(os.listdir("/proc/self/task"))
+
+
+def await_end_of_threads(known: set[str]) -> None:
+    """Wait until there is no thread but these: one that has said that it is over still has to end."""
+    waiting = Patience()
+    while waiting(not threads() <= known):
+        time.sleep(0.001)
+
+
 def holdings(one: DaemonProcess) -> tuple[int, int, int]:
     """Descriptors, mappings of segments, and threads of this process."""
     gc.collect()
     maps = Path("/proc/self/maps").read_text()
-    return len(os.listdir("/proc/self/fd")), maps.count(one.shm_dir), len(os.listdir("/proc/self/task"))
+    return len(os.listdir("/proc/self/fd")), maps.count(one.shm_dir), len(threads())
 
 
 def interrupted_everywhere(work: Callable[[], object], check: Callable[[int], None]) -> int:
@@ -154,7 +167,9 @@ def test_what_a_window_does_in_the_calling_thread(daemon: Factory, divided_map: 
 def test_closing(daemon: Factory, divided_map: DividedMap) -> None:
     """A close that was interrupted can be repeated, and the next connection ends what was left."""
     one = daemon(divided_map.root)
+    known = threads()
     shmmap.connect(one.endpoint).close()
+    await_end_of_threads(known)
     before = holdings(one)
     number, done = 0, False
     while not done:
@@ -173,18 +188,23 @@ def test_closing(daemon: Factory, divided_map: DividedMap) -> None:
         del client
         if number % 8 == 0 or done:
             shmmap.connect(one.endpoint).close()
+            await_end_of_threads(known)
             assert holdings(one) == before, number
     assert number > 20
 
 
-def leaves_nothing(one: DaemonProcess) -> Callable[[int], None]:
-    """Return what fails, every sixteenth time, if this process holds anything that it does not hold now."""
+def leaves_nothing(one: DaemonProcess, work: Callable[[], object]) -> Callable[[int], None]:
+    """Return what fails, every sixteenth time, if this process holds more than after doing the work once."""
+    known = threads()
+    work()
+    await_end_of_threads(known)
     before = holdings(one)
 
     def check(number: int) -> None:
         if number % 16 == 0:
             gc.collect()
             shmmap.connect(one.endpoint).close()
+            await_end_of_threads(known)
             assert holdings(one) == before, number
 
     return check
@@ -192,15 +212,13 @@ def leaves_nothing(one: DaemonProcess) -> Callable[[int], None]:
 
 def test_connecting(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
-    shmmap.connect(one.endpoint).close()
-    check = leaves_nothing(one)
+    check = leaves_nothing(one, lambda: shmmap.connect(one.endpoint).close())
     assert interrupted_everywhere(lambda: shmmap.connect(one.endpoint, name="x").close(), check) > 100
 
 
 def test_following_events(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
-    shmmap.EventStream(one.endpoint).close()
-    check = leaves_nothing(one)
+    check = leaves_nothing(one, lambda: shmmap.EventStream(one.endpoint).close())
 
     def follow() -> None:
         shmmap.EventStream(one.endpoint, name="x", timeout=LONG_S).close()
@@ -226,7 +244,9 @@ def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, wh
         assert connection is not None
         return client.close, connection._socket
 
+    known = threads()
     made()[0]()
+    await_end_of_threads(known)
     before = holdings(one)
     close, socket = made()
     hold_up = socket.context.socket(zmq.PAIR)  # the context ends when the last socket of it is closed
@@ -238,7 +258,7 @@ def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, wh
             time.sleep(0.001)
         main = os.getpid()
         for _ in range(50):
-            for thread in set(map(int, os.listdir("/proc/self/task"))) - {main}:
+            for thread in set(map(int, threads())) - {main}:
                 _libc.tgkill(main, thread, signal.SIGUSR1)
             time.sleep(0.001)
     finally:
@@ -246,6 +266,7 @@ def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, wh
         closing.join()
         signal.signal(signal.SIGUSR1, handled)
     del close, socket, hold_up, closing
+    await_end_of_threads(known)
     assert holdings(one) == before
 
 

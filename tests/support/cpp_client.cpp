@@ -106,9 +106,13 @@ void print(const shmmap::WindowUpdate& update) {
   std::cout << "update\t" << update.current << "\t" << update.covered << "\t" << update.complete() << "\n";
 }
 
-void print_columns() {
+/// Of the cells with these numbers, or of all.
+void print_columns(const std::vector<std::string>& numbers) {
   std::map<std::pair<std::string, std::string>, shmmap::CellPtr> sorted;
-  for (const auto& [number, cell] : kept) sorted[{cell->id, cell->layer}] = cell;
+  const auto add = [&sorted](const auto& cell) { sorted[{cell->id, cell->layer}] = cell; };
+  for (const auto& number : numbers) add(kept.at(std::stoull(number)));
+  if (numbers.empty())
+    for (const auto& [number, cell] : kept) add(cell);
   for (const auto& [key, cell] : sorted) {
     for (const auto& column : cell->columns) {
       std::cout << cell->id << "\t" << cell->layer << "\t" << column.name << "\t" << column.dtype << "\t";
@@ -284,7 +288,7 @@ void obey(const std::vector<std::string>& words) {
     for (const auto& one : near.cells) print(one.whole ? "whole" : "part", one.cell);
     std::cout << "around\t" << near.covered << "\t" << (words.size() > 5 ? near.count() : 0) << "\n";
   } else if (what == "columns") {
-    print_columns();
+    print_columns({words.begin() + 1, words.end()});
   } else if (what == "bytes") {
     print_bytes(kept.at(std::stoull(words.at(1)))->named(words.at(2)));
   } else if (what == "drop") {

@@ -165,11 +165,11 @@ class CppCell:
     def __init__(self, program: CppProgram, words: Sequence[str]) -> None:
         _, number, self.id, self.layer, version, points, stale, self.frame_id, box = words
         self.box = tuple(map(float, box.split()))
-        self._program, self._number = program, int(number)
+        self._program, self.number = program, int(number)
         self.version, self.points, self.stale = int(version), int(points), stale == "1"
 
     def _column(self, name: str) -> tuple[np.ndarray, int]:
-        ((dtype, shape, data, checksum),) = self._program.told("bytes", self._number, name)
+        ((dtype, shape, data, checksum),) = self._program.told("bytes", self.number, name)
         sides = tuple(map(int, shape.split()))
         return np.frombuffer(bytes.fromhex(data), dtype).reshape(sides), int(checksum)
 
@@ -548,9 +548,20 @@ class CppFollower:
             for cell_id in removed:
                 del self._held[cell_id]
             self._held |= {cell.id: cell for cell in new}
-        crc = {(line[0], line[2]): int(line[6]) for line in self._program.told("columns") if len(line) == 7}
-        rows = [[c.id, c.version, c.points, crc[c.id, "xyz"], crc[c.id, "intensity"]] for c in new]
+        versions = {cell.id: cell.version for cell in new}
+        rows = [[cell_id, versions[cell_id], *content] for cell_id, *content in self._contents(new)]
         return {"new": rows, "removed": removed, "held": [[c.id, c.version] for c in self._held.values()]}
+
+    def contents(self) -> list[list[Any]]:
+        """Return the id, points and CRC-32 of xyz and of the intensity of every cell it holds."""
+        return self._contents(self._held.values())
+
+    def _contents(self, cells: Collection[CppCell]) -> list[list[Any]]:
+        if not cells:
+            return []
+        lines = self._program.told("columns", *(cell.number for cell in cells))
+        crc = {(line[0], line[2]): int(line[6]) for line in lines}
+        return [[cell.id, cell.points, crc[cell.id, "xyz"], crc[cell.id, "intensity"]] for cell in cells]
 
     def kill(self) -> None:
         """End it now, whatever it does."""
