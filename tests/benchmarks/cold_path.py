@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells that are not in memory yet: how long clients wait for them.
 
-    python -m tests.benchmarks.cold_path [cell step window] [--against ../other] [--pairs 20] [--shm-dir DIR]
+    python -m tests.benchmarks.cold_path [cell step window moving] [--against ../other] [--pairs 20]
+                                         [--shm-dir DIR]
 
 - ``cell``: one cold cell of 1 MB, from the request to its attached view; the loaders run already.
 - ``step``: two such cells at once.
@@ -9,6 +10,9 @@
   all points; against four that read the files into memory of their own.  Shown three times: as it is, with
   the processor time that the loaders' processes had used before READY added, and for four more that find
   everything in memory, which is what of it has nothing to do with loading.
+
+- ``moving``: a vehicle drives off at 20 m/s as soon as a daemon is READY, its window of 100 m cold: until the
+  window is complete for the first time; and for which part of the 15 s after that it is not.
 
 ``--shm-dir`` is where segments lie: for huge pages a tmpfs mounted with ``huge=within_size``.
 
@@ -126,6 +130,29 @@ for line in sys.stdin:
     print(json.dumps([took, took + before_s, again]), flush=True)
 """
 
+_MOVING = """
+import json, sys, time
+import shmmap
+from tests.support.daemon_process import DaemonProcess
+print("up", flush=True)
+for line in sys.stdin:
+    one = DaemonProcess(sys.argv[1], "--budget", "1G", shm_dir=sys.argv[2] or None).start()
+    with shmmap.MapWindow(one.endpoint, radius=100.0) as window:
+        begin, first, turns, incomplete = time.perf_counter(), 0.0, 0, 0
+        while True:
+            now = time.perf_counter() - begin
+            if first and now > first + 15.0:
+                break
+            window.move_to(-300.0 + 20.0 * now, 0.0, vx=20.0)
+            if not first and window.complete:
+                first = now
+            turns, incomplete = turns + bool(first), incomplete + (bool(first) and not window.complete)
+            time.sleep(0.002)
+    one.stop()
+    one.dispose()
+    print(json.dumps([first, incomplete / turns]), flush=True)
+"""
+
 
 class Measuring:
     """A program of one checkout that measures whenever it is told to."""
@@ -204,10 +231,35 @@ def first_window(folder: Path, checkouts: list[Path], pairs: int, shm_dir: str) 
         )
 
 
+def moving(folder: Path, checkouts: list[Path], pairs: int, shm_dir: str) -> None:
+    """Measure and print how soon a vehicle that drives off at once has its window, and how often not."""
+    made = make_map(folder / "street", columns=40, rows=14, points=POINTS // 4)
+    programs = [Measuring(checkout, _MOVING, str(made.root), shm_dir) for checkout in checkouts]
+    found: list[list[list[float]]] = [[] for _ in checkouts]
+    for number in range(pairs + 1):
+        for at in range(len(programs))[:: -1 if number % 2 else 1]:
+            times = json.loads(programs[at].measure())
+            if number:
+                found[at].append(times)
+    for program in programs:
+        program.close()
+    print(f"a vehicle that drives off at once, medians of {pairs}")
+    here = [times[0] for times in found[0]]
+    for checkout, rows in zip(checkouts, found, strict=True):
+        first, incomplete = [list(values) for values in zip(*rows, strict=True)]
+        print(
+            f"  {statistics.median(first):6.3f} s until its window is complete;"
+            f" here {ratio(here, first):5.2f} of that;"
+            f" then incomplete {100 * statistics.median(incomplete):5.2f} % of the time  {checkout}"
+        )
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("what", nargs="*", default=["cell", "step", "window"], metavar="cell step window")
+    parser.add_argument(
+        "what", nargs="*", default=["cell", "step", "window"], metavar="cell step window moving"
+    )
     parser.add_argument("--against", type=Path, help="another checkout")
     parser.add_argument("--shm-dir", default="", help="where segments lie (default: a directory in /dev/shm)")
     parser.add_argument("--pairs", type=int, default=20)
@@ -221,6 +273,8 @@ def main() -> None:
                 cold_cells(folder / what, checkouts, args.pairs, args.shm_dir, count)
         if "window" in args.what:
             first_window(folder, checkouts, max(3, args.pairs // 3), args.shm_dir)
+        if "moving" in args.what:
+            moving(folder, checkouts, max(3, args.pairs // 3), args.shm_dir)
 
 
 if __name__ == "__main__":

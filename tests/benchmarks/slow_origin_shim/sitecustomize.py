@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes a daemon's loaders as slow as an origin far away; a daemon started with this directory in PYTHONPATH.
 
-``SLOW_ORIGIN`` is JSON: ``mean_s`` (of a log-normal time for each file, sigma 0.8), ``outages`` ([[from, to],
-...] in seconds of `time.monotonic`; what begins or lasts in one fails), ``throttle_bytes_s`` (0 for none).
+``SLOW_ORIGIN`` is JSON: ``mean_s`` (of a log-normal time for each file, sigma 0.8, the same each time),
+``outages`` ([[from, to], ...] in seconds of `time.monotonic`; what begins or lasts in one fails) and
+``throttle_bytes_s`` (0 for none).
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import json
 import math
 import os
 import random
-import sys
 import time
 from typing import Any
 
@@ -22,17 +22,14 @@ SIGMA = 0.8
 def _slow_down(plan: dict[str, Any]) -> None:
     from shmmap.daemon.loading import worker_main
 
-    outages = plan.get("outages", [])
-
     def is_out() -> bool:
-        return any(begin <= time.monotonic() < end for begin, end in outages)
+        return any(begin <= time.monotonic() < end for begin, end in plan["outages"])
 
     def wait_for_origin(path: str) -> None:
-        random.seed(os.urandom(8))
-        mean_s = plan["mean_s"]
-        took_s = random.lognormvariate(math.log(mean_s) - SIGMA**2 / 2, SIGMA) if mean_s else 0.0
-        if plan.get("throttle_bytes_s"):
-            took_s += os.stat(path).st_size / plan["throttle_bytes_s"]
+        mean_s, bytes_s = plan["mean_s"], plan["throttle_bytes_s"]
+        took_s = os.stat(path).st_size / bytes_s if bytes_s else 0.0
+        if mean_s:
+            took_s += random.Random(path).lognormvariate(math.log(mean_s) - SIGMA**2 / 2, SIGMA)
         end_s = time.monotonic() + took_s
         while not is_out() and (left_s := end_s - time.monotonic()) > 0:
             time.sleep(min(left_s, 0.05))
@@ -42,5 +39,5 @@ def _slow_down(plan: dict[str, Any]) -> None:
     worker_main._test_hook = wait_for_origin
 
 
-if "SLOW_ORIGIN" in os.environ and "shmmap.daemon.loading.parent_main" in sys.orig_argv:
+if "SLOW_ORIGIN" in os.environ:
     _slow_down(json.loads(os.environ["SLOW_ORIGIN"]))

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A vehicle drives, and the map's files are far away: are its cells in memory before it asks for them?
+
+    python -m tests.benchmarks.slow_origin [--seconds 600] [--mean 0.4] [--outage 10] [--every 120]
+
+A daemon with eight loaders serves a map of cells of 20 m.  Each file takes a log-normal time to read (sigma
+0.8; the same each time), and at regular times none can be read for some seconds.  A vehicle drives at 12 m/s
+round a square of 2.4 km and asks for a circle of 200 m every 20 m; it starts when its first circle is in
+memory.  Beside it a client asks for single cells far away from it, which are cold, and for warm ones.
+Three daemons, one after the other: one that fetches nothing ahead, one that is told the vehicle's poses, one
+that is told its route, too.
+
+Late is a cell that is not in the first answer to the request that needs it; the first 30 s do not count.
+Limits: with the route none is late, without it 97 % of requests find all in memory; what is asked for beside
+takes at most 1.2 times as long (p99) as where nothing is fetched ahead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import random
+import tempfile
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+import shmmap
+from shmmap.statistics.reader import read_statistics
+from tests.benchmarks.make_many_cells import make_many_cells
+from tests.support.daemon_process import DaemonProcess
+
+SIDE: Final = 150
+RADIUS_M: Final = 200.0
+STEP_M: Final = 20.0
+LEAVE_OUT_S: Final = 30.0
+LOADERS: Final = 8
+SHIM: Final = Path(__file__).with_name("slow_origin_shim")
+CORNERS: Final = ((300.0, 300.0), (2700.0, 300.0), (2700.0, 2700.0), (300.0, 2700.0), (300.0, 300.0))
+KINDS: Final = ("nothing ahead", "poses", "route")
+
+
+@dataclass
+class Run:
+    """What one daemon's clients met."""
+
+    queries: int = 0
+    warm: int = 0
+    late: int = 0
+    cold_ms: list[float] = field(default_factory=list)
+    warm_ms: list[float] = field(default_factory=list)
+    counters: dict[str, int] = field(default_factory=dict)
+
+
+def at(along_m: float) -> tuple[float, float, float, float]:
+    """Position and heading (a unit vector) so far along the square."""
+    for (x, y), (to_x, to_y) in pairwise(CORNERS):
+        length = math.hypot(to_x - x, to_y - y)
+        hx, hy = (to_x - x) / length, (to_y - y) / length
+        if along_m <= length:
+            break
+        along_m -= length
+    return x + along_m * hx, y + along_m * hy, hx, hy
+
+
+def vehicle(client: shmmap.Client, kind: str, speed: float, seconds: float, run: Run) -> None:
+    """Drive, and ask for what is around every 20 m."""
+    client.area(shmmap.Circle(*CORNERS[0], RADIUS_M), wait=300.0)
+    client.release()
+    begin_s = time.monotonic()
+    for step in range(int(seconds * speed / STEP_M)):
+        time.sleep(max(0.0, begin_s + step * STEP_M / speed - time.monotonic()))
+        x, y, _, _ = at(step * STEP_M)
+        intent = shmmap.Intent(x, y, route=CORNERS if kind == "route" else ())
+        answer = client.area(shmmap.Circle(x, y, RADIUS_M), wait=0, intent=intent)
+        client.release()
+        if time.monotonic() - begin_s > LEAVE_OUT_S:
+            missing = len(answer.pending) + len(answer.failed)
+            run.queries, run.warm, run.late = run.queries + 1, run.warm + (not missing), run.late + missing
+
+
+def beside(client: shmmap.Client, over: threading.Event, run: Run) -> None:
+    """Ask for one cold cell a second, in the middle of the square, and for one that is warm in between."""
+    rng, numbers = random.Random(1), [(x, y) for x in range(60, 90) for y in range(30, 120)]
+    rng.shuffle(numbers)
+    warm = client.area(shmmap.Circle(1500.0, 1500.0, 30.0), wait=60.0)
+    while not over.wait(0.5) and numbers:
+        begin_s = time.perf_counter()
+        client.area(shmmap.Circle(1500.0, 1500.0, 30.0), wait=0)
+        middle_s = time.perf_counter()
+        x, y = numbers.pop()
+        found = client.selected([f"city_{20 * x}_{20 * y}.pcd"], wait=60.0)
+        run.warm_ms.append((middle_s - begin_s) * 1e3)
+        if found.cells:  # else the origin was away
+            run.cold_ms.append((time.perf_counter() - middle_s) * 1e3)
+    del warm
+
+
+def drive(root: Path, kind: str, args: argparse.Namespace) -> Run:
+    """One daemon, its vehicle, and a client beside it."""
+    first_s = time.monotonic() + args.every
+    outages = [[first_s + n * args.every, first_s + n * args.every + args.outage] for n in range(1000)]
+    plan = {"mean_s": args.mean, "outages": outages if args.outage else [], "throttle_bytes_s": args.throttle}
+    share = "0" if kind == "nothing ahead" else "0.5"
+    options = ["--workers", str(LOADERS), "--budget", "256M", "--ride-out", str(args.ride_out)]
+    one = DaemonProcess(
+        root, *options, "--prefetch-share", share, environment={"SLOW_ORIGIN": json.dumps(plan)}
+    )
+    one.environment["PYTHONPATH"] = f"{SHIM}:{one.environment['PYTHONPATH']}"
+    run, over = Run(), threading.Event()
+    with ExitStack() as stack:
+        stack.enter_context(one)
+        driver = stack.enter_context(shmmap.connect(one.endpoint))
+        other = stack.enter_context(shmmap.connect(one.endpoint))
+        thread = threading.Thread(target=beside, args=(other, over, run))
+        thread.start()
+        vehicle(driver, kind, args.speed, args.seconds, run)
+        over.set()
+        thread.join()
+        run.counters = dict(read_statistics(one.instance, one.shm_dir).counters)
+    return run
+
+
+def p99(times: list[float]) -> float:
+    """Return the 99th percentile."""
+    return float(np.percentile(times, 99)) if times else math.nan
+
+
+def main() -> None:
+    """Drive with each, and print what each met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=600.0, help="of each drive")
+    parser.add_argument("--mean", type=float, default=0.4, help="seconds that a file takes")
+    parser.add_argument(
+        "--outage", type=float, default=10.0, help="seconds for which no file can be read; 0: none"
+    )
+    parser.add_argument("--every", type=float, default=120.0, help="seconds from one outage to the next")
+    parser.add_argument("--throttle", type=float, default=0.0, help="bytes a second of each loader; 0: any")
+    parser.add_argument("--speed", type=float, default=12.0, help="of the vehicle, m/s")
+    parser.add_argument("--ride-out", type=float, default=10.0, help="the daemon's setting")
+    parser.add_argument("--only", choices=KINDS, help="one of the three")
+    args = parser.parse_args()
+    if args.seconds * args.speed > 4 * 2400.0:
+        parser.error("the way is 9.6 km long: drive for a shorter time, or slower")
+    runs: dict[str, Run] = {}
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as scratch:
+        make_many_cells(Path(scratch) / "map", SIDE)
+        for kind in [args.only] if args.only else KINDS:
+            run = runs[kind] = drive(Path(scratch) / "map", kind, args)
+            counters = run.counters
+            over = counters["bytes_loaded"] / counters["bytes_used"]
+            longest_ms = max(value for name, value in counters.items() if name.startswith("longest")) / 1e6
+            print(
+                f"{kind:13} requests {run.queries:4}, all in memory {100 * run.warm / run.queries:5.1f} %,"
+                f" late cells {run.late:5}; loaded/used {over:.2f};"
+                f" p99 of single cold cells {p99(run.cold_ms):7.0f} ms ({len(run.cold_ms)}),"
+                f" of warm requests {p99(run.warm_ms):6.2f} ms; longest turn {longest_ms:.1f} ms",
+                flush=True,
+            )
+    if not args.only:
+        nothing, poses, route = (runs[kind] for kind in KINDS)
+        print(f"with the route {route.late} cells are late (limit 0)")
+        share = 100 * poses.warm / poses.queries
+        print(f"without it {share:.1f} % of requests find all in memory (at least 97 %)")
+        for kind in KINDS[1:]:
+            ratio = p99(runs[kind].cold_ms) / p99(nothing.cold_ms)
+            print(f"cold cells beside it, {kind}: p99 {ratio:.2f} times as long (limit 1.2)")
+
+
+if __name__ == "__main__":
+    main()
