@@ -29,6 +29,7 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
 )
 from shmmap_clients.ndt_scan_matcher.backends.opencl.free_list import FreeList, rounded
 from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool
+from shmmap_clients.ndt_scan_matcher.backends.opencl.pool_memory import in_large_pages
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
 from shmmap_clients.ndt_scan_matcher.cli import main
 
@@ -381,3 +382,15 @@ def test_blocks_never_overlap_and_all_come_back() -> None:
     for offset, nbytes in taken.items():
         free.give(offset, nbytes)
     assert free.take(total) == 0
+
+
+def test_memory_in_large_pages_is_memory() -> None:
+    for nbytes in (1, 4096, (4 << 20) + 100):
+        memory = in_large_pages(nbytes)
+        assert (len(memory), memory.nbytes) == (nbytes, nbytes)
+        assert memory.ctypes.data % (2 << 20) == 0
+        assert not memory.any()
+        memory[:] = 7
+        assert (memory == 7).all()
+    with pytest.raises(MemoryError, match="bytes"):
+        in_large_pages(1 << 60)
