@@ -29,8 +29,6 @@ from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covaria
 __all__ = ["MapPool"]
 
 _STRETCH_BYTES: Final = 1 << 22  # staged in one piece at most
-_WORD: Final = np.dtype(np.int32)  # what all is written as: every array and every block is a multiple of it
-_NOTHING: Final = np.zeros(ALIGNMENT // _WORD.itemsize, _WORD)  # what lies between blocks
 
 _Key = tuple[int, str]
 _Part = tuple[int, int, tuple[NDArray[Any], ...]]  # offset, bytes, and the arrays that lie there
@@ -82,14 +80,14 @@ class MapPool:
         self._lock = threading.Lock()
         self._waiting = Waiting(device.info.name)
         with device_errors(device.info.name, f"allocate {capacity / 1e6:.0f} MB for maps"):
-            self._staging: NDArray[np.int32] | None = None
+            self._staging: NDArray[np.uint8] | None = None
             if device.is_processor:
                 # it reads this process's memory: how that is paged is ours to choose, and nothing is staged
                 flags, memory = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR, in_large_pages(capacity)
                 self.buffer = cl.Buffer(context, flags, hostbuf=memory)
             else:
                 self.buffer = cl.Buffer(context, cl.mem_flags.READ_ONLY, capacity)
-                self._staging = in_large_pages(min(capacity, _STRETCH_BYTES)).view(_WORD)
+                self._staging = in_large_pages(min(capacity, _STRETCH_BYTES))
             # a queue of its own: no evaluation waits for a map that is being written
             self._queue = cl.CommandQueue(context, device.handle)
 
@@ -197,11 +195,12 @@ class MapPool:
                 continue
             nbytes = 6 * size * len(inverse)
             if key[0] in means_at:
-                contents.append((self._words(inverse),))
+                contents.append((self._written(inverse),))
             else:
                 fresh.append((len(keys), nbytes))
                 nbytes += 3 * size * len(inverse) + 4 * cell.lattice.size
-                contents.append((self._words(inverse), self._words(self._means(cell)), cell.lattice.T))
+                means, lattice = self._written(self._means(cell)), np.ascontiguousarray(cell.lattice.T)
+                contents.append((self._written(inverse), means, lattice))
             keys.append(key)
             sizes.append(nbytes)
             owners.append(cell)
@@ -220,9 +219,7 @@ class MapPool:
         try:
             self._address(tables[0], voxel_map, covariance)
             parts: list[_Part] = list(zip(offsets, sizes, contents, strict=False))  # all but the tables
-            parts += [
-                (at, table.nbytes, (table.view(_WORD),)) for at, table in zip(places, tables, strict=True)
-            ]
+            parts += [(at, table.nbytes, (table,)) for at, table in zip(places, tables, strict=True)]
             self._write(parts)
         except BaseException:
             # what may not have been written is no copy of anything
@@ -253,47 +250,54 @@ class MapPool:
         # relative to the lattice's corner, which is exact where the kernel computes it
         return cell.mean + (cell.origin - cell.lattice_origin * cell.leaf)
 
-    def _words(self, array: NDArray[np.float64]) -> NDArray[np.int32]:
-        return (array if array.dtype is self._real else array.astype(self._real)).view(_WORD)
+    def _written(self, array: NDArray[np.float64]) -> NDArray[np.floating]:
+        return np.ascontiguousarray(array, self._real)
 
     def _write(self, parts: list[_Part]) -> None:
         """Write arrays to their places: what lies side by side, together."""
-        word = _WORD.itemsize
+        import pyopencl as cl
+
+        queue = self._queue
         with device_errors(self._device.info.name, "write a map"):
-            for stretch in _stretches(parts, _STRETCH_BYTES if self._staging is not None else self.capacity):
+            for stretch in _stretches(parts, self.capacity if self._staging is None else _STRETCH_BYTES):
                 first, last = stretch[0][0], stretch[-1][0] + stretch[-1][1]
-                pieces: list[NDArray[Any]] = []
-                at = first
-                for offset, nbytes, arrays in stretch:
-                    if offset > at:
-                        pieces.append(_NOTHING[: (offset - at) // word])
-                    pieces += arrays
-                    at = offset + nbytes
-                self._join(pieces, first, (last - first) // word)
+                if self._staging is None:
+                    flags = cl.map_flags.WRITE_INVALIDATE_REGION
+                    memory: Any  # an array whose base is to be released
+                    memory, mapped = cl.enqueue_map_buffer(
+                        queue,
+                        self.buffer,
+                        flags,
+                        first,
+                        (last - first,),
+                        np.dtype(np.uint8),
+                        is_blocking=False,
+                    )
+                    queue.flush()
+                    self._waiting.until(mapped)
+                    _fill(memory, first, stretch)
+                    written = memory.base.release(queue)
+                else:
+                    # one piece of memory for all; a cell that is larger than that has one of its own
+                    large = last - first > len(self._staging)
+                    there = np.empty(last - first, np.uint8) if large else self._staging[: last - first]
+                    _fill(there, first, stretch)
+                    written = cl.enqueue_copy(queue, self.buffer, there, dst_offset=first, is_blocking=False)
+                queue.flush()
+                self._waiting.until(written)
                 self.statistics.writes += 1
                 self.statistics.written_bytes += last - first
 
-    def _join(self, pieces: list[NDArray[Any]], first: int, words: int) -> None:
-        """Write arrays one after the other, beginning at an offset; they come to so many words."""
-        import pyopencl as cl
 
-        if self._staging is None:
-            flags = cl.map_flags.WRITE_INVALIDATE_REGION
-            there, mapped = cl.enqueue_map_buffer(
-                self._queue, self.buffer, flags, first, (words,), _WORD, is_blocking=False
-            )
-            self._queue.flush()
-            self._waiting.until(mapped)
-            np.concatenate(pieces, axis=None, out=there)
-            written = there.base.release(self._queue)
-        else:
-            # one piece of memory for all stretches; a cell that is larger than that has one of its own
-            large = words > len(self._staging)
-            staged = np.empty(words, _WORD) if large else self._staging[:words]
-            np.concatenate(pieces, axis=None, out=staged)
-            written = cl.enqueue_copy(self._queue, self.buffer, staged, dst_offset=first, is_blocking=False)
-        self._queue.flush()
-        self._waiting.until(written)
+def _fill(there: NDArray[np.uint8], first: int, stretch: list[_Part]) -> None:
+    """Put arrays where they belong, in memory that stands for the pool from its byte ``first`` on."""
+    memory = there.data  # numpy would take three times as long for so many small pieces
+    for offset, _, arrays in stretch:
+        at = offset - first
+        for array in arrays:
+            if array.size:
+                memory[at : at + array.nbytes] = array.data.cast("B")
+                at += array.nbytes
 
 
 def _stretches(parts: list[_Part], most: int) -> list[list[_Part]]:
