@@ -67,7 +67,7 @@ def cells() -> dict[str, VoxelCell]:
 
 
 def ready(memory: str, some: VoxelMap) -> OpenclBackend:
-    """Return a backend that has evaluated, so that its program is built and the driver's threads have started."""
+    """Return a backend that has evaluated: its program is built, the driver's threads have started."""
     backend = OpenclBackend(Limits(), options=DeviceOptions(memory=memory))  # type: ignore[arg-type]
     backend.set_source(np.random.default_rng(2).uniform(-40, 40, (1500, 3)))
     backend.prepare(some, **HOW)
@@ -136,8 +136,9 @@ def measure(memory: str, made: dict[str, VoxelCell], repeats: int) -> None:
         backend.evaluate(_POSE, **HOW)
     print(
         f"{memory}: {here.voxels} voxels in {len(here.cells)} cells; {written / 1e6:.2f} MB written, private"
-        f" memory grows by {private / 1e3:.0f} kB\n  whole map, memory never used: {fresh}\n  whole map, later:"
-        f" {whole}\n  step: {step}, {max(sizes) / 1e3:.0f} kB\n  taking a map: {taking}"
+        f" memory grows by {private / 1e3:.0f} kB\n"
+        f"  whole map, memory never used: {fresh}\n  whole map, later: {whole}\n"
+        f"  step: {step}, {max(sizes) / 1e3:.0f} kB\n  taking a map: {taking}"
     )
     backend.close()
 
