@@ -335,6 +335,26 @@ def test_another_kind_of_covariance_is_written_beside_the_first(
     assert there.pool.used_bytes <= 2 * nothing
 
 
+@pytest.mark.parametrize("options", [COPY, SVM])
+def test_a_map_may_have_a_cell_twice(
+    points: NDArray[np.float64], scan: NDArray[np.float64], options: DeviceOptions
+) -> None:
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    cells = cells_of(points, 2.0)
+    twice = VoxelMap({**cells, "again": next(iter(cells.values()))})
+    there = ready("opencl", twice, scan, options=options)
+    there.evaluate(NEAR, **how)
+    used = there.pool.used_bytes  # type: ignore[attr-defined]
+    for voxel_map in (VoxelMap(cells), VoxelMap({}), twice, VoxelMap({}), twice):
+        there.prepare(voxel_map, **how)
+        there.set_map(voxel_map)
+        found, wanted = there.evaluate(NEAR, **how), ready("numba", voxel_map, scan).evaluate(NEAR, **how)
+        assert counts(found) == counts(wanted)
+        if voxel_map.cells:
+            assert off(found, wanted) <= 1e-12
+    assert there.pool.used_bytes <= used + 4096, "nothing is lost"  # type: ignore[attr-defined]
+
+
 def test_a_cell_without_voxels_does_no_harm(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
     cells = cells_of(points, 2.0)
     empty = voxel_cell(points[:3], 2.0)

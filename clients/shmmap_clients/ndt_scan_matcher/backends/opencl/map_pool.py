@@ -183,24 +183,28 @@ class MapPool:
 
     def _place(self, voxel_map: VoxelMap, covariance: Covariance, plan: _Plan) -> PlacedMap | None:
         """Find room and write; None, and nothing has changed, where there is no room."""
-        blocks, means_at, size = self._blocks, self._means_at, self._real.itemsize
+        blocks, means_at, real = self._blocks, self._means_at, self._real
         keys: list[_Key] = []
         sizes: list[int] = []
         owners: list[object] = []
         contents: list[tuple[NDArray[Any], ...]] = []
         fresh: list[tuple[int, int]] = []  # which of these have means, too, and after how many bytes
-        for cell, inverse in zip(voxel_map.cells.values(), plan.inverses, strict=True):
+        # a map may have a cell twice, under two keys
+        cells = dict(zip(voxel_map.cells.values(), plan.inverses, strict=True))
+        for cell, inverse in cells.items():
             key = (id(cell), covariance)
             if key in blocks:
                 continue
-            nbytes = 6 * size * len(inverse)
+            inverses = np.ascontiguousarray(inverse, real)
+            nbytes = inverses.nbytes
             if key[0] in means_at:
-                contents.append((self._written(inverse),))
+                contents.append((inverses,))
             else:
                 fresh.append((len(keys), nbytes))
-                nbytes += 3 * size * len(inverse) + 4 * cell.lattice.size
-                means, lattice = self._written(self._means(cell)), np.ascontiguousarray(cell.lattice.T)
-                contents.append((self._written(inverse), means, lattice))
+                means = np.ascontiguousarray(self._means(cell), real)
+                lattice = np.ascontiguousarray(cell.lattice.T, np.int32)
+                nbytes += means.nbytes + lattice.nbytes
+                contents.append((inverses, means, lattice))
             keys.append(key)
             sizes.append(nbytes)
             owners.append(cell)
@@ -249,9 +253,6 @@ class MapPool:
             return cell.mean
         # relative to the lattice's corner, which is exact where the kernel computes it
         return cell.mean + (cell.origin - cell.lattice_origin * cell.leaf)
-
-    def _written(self, array: NDArray[np.float64]) -> NDArray[np.floating]:
-        return np.ascontiguousarray(array, self._real)
 
     def _write(self, parts: list[_Part]) -> None:
         """Write arrays to their places: what lies side by side, together."""
