@@ -29,7 +29,7 @@ from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, VoxelCell, Vo
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import choose_device
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
 
-from shmmap.demo.process_memory import process_memory
+from tests.support.process_costs import anonymous_bytes
 
 HOW: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
 _ACROSS = 20  # cells
@@ -38,20 +38,18 @@ _EDGE_M = 20.0
 _POSE = np.array([200.0, 200.0, 1.5, 0.0, 0.0, 0.3])
 
 FIRST = """
-import time
+import os, time
 import numpy as np
 import shmmap_clients.ndt_scan_matcher.matching.matcher
-def own_kb():
-    lines = open("/proc/self/smaps_rollup", encoding="ascii").read().splitlines()
-    return int(next(line for line in lines if line.startswith("Private_Dirty:")).split()[1])
-before = own_kb()
+from tests.support.process_costs import anonymous_bytes
+before = anonymous_bytes(os.getpid())
 begin = time.perf_counter()
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher import Limits, VoxelMap
 backend = backend_named("opencl", Limits())
 backend.set_source(np.zeros((1500, 3)))
 backend.evaluate(np.zeros(6), neighbors="radius", covariance="autoware")
-print(time.perf_counter() - begin, own_kb() - before)
+print(time.perf_counter() - begin, anonymous_bytes(os.getpid()) - before)
 """
 
 
@@ -103,11 +101,11 @@ def measure(memory: str, made: dict[str, VoxelCell], repeats: int) -> None:
     some = VoxelMap({key: made[key] for key in inside[:5]})
     backend = ready(memory, some)
     gc.collect()
-    private, written = process_memory(os.getpid()).private_bytes, backend.uploads.written_bytes
+    private, written = anonymous_bytes(os.getpid()), backend.uploads.written_bytes
     backend.prepare(here, **HOW)
     backend.set_map(here)
     backend.evaluate(_POSE, **HOW)
-    private = process_memory(os.getpid()).private_bytes - private
+    private = anonymous_bytes(os.getpid()) - private
     written = backend.uploads.written_bytes - written
     backend.close()
     fresh, whole, step, taking = Costs(), Costs(), Costs(), Costs()
@@ -166,9 +164,11 @@ def main() -> None:
     for _ in range(6):
         done = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=True)
         seconds, private = done.stdout.split()
-        runs.append((float(seconds), int(private) / 1024))
+        runs.append((float(seconds), int(private)))
     least_s, _ = min(runs[1:])  # the first may have built the program
-    print(f"fresh process: first evaluation after {least_s:.2f} s, {max(runs[1:])[1]:.1f} MiB of its own")
+    print(
+        f"fresh process: first evaluation after {least_s:.2f} s, {max(bytes_ for _, bytes_ in runs[1:]) / 1e6:.1f} MB of its own"
+    )
 
 
 if __name__ == "__main__":

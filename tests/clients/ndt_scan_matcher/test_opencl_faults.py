@@ -34,10 +34,9 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBacken
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 import shmmap
-from shmmap.demo.process_memory import process_memory
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
 from tests.support.opencl_device import need_device
-from tests.support.process_costs import descriptors
+from tests.support.process_costs import anonymous_bytes, descriptors
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 HOW: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
@@ -252,13 +251,13 @@ def test_ten_thousand_evaluations_grow_nothing(points: NDArray[np.float64]) -> N
     work(20)
     gc.collect()
     before, files, used = (
-        process_memory(os.getpid()).private_bytes,
+        anonymous_bytes(os.getpid()),
         descriptors(os.getpid()),
         backend.pool.used_bytes,
     )
     work(200)
     gc.collect()
-    assert process_memory(os.getpid()).private_bytes - before < 2_000_000
+    assert anonymous_bytes(os.getpid()) - before < 2_000_000
     assert descriptors(os.getpid()) == files
     assert backend.pool.used_bytes == used
 
