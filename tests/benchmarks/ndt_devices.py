@@ -165,9 +165,9 @@ def main() -> None:
         done = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=True)
         seconds, private = done.stdout.split()
         runs.append((float(seconds), int(private)))
-    least_s, _ = min(runs[1:])  # the first may have built the program
+    seconds_, bytes_ = zip(*runs[1:], strict=True)  # the first may have built the program
     print(
-        f"fresh process: first evaluation after {least_s:.2f} s, {max(bytes_ for _, bytes_ in runs[1:]) / 1e6:.1f} MB of its own"
+        f"fresh process: first evaluation after {min(seconds_):.2f} s, {max(bytes_) / 1e6:.1f} MB of its own"
     )
 
 
