@@ -16,7 +16,9 @@ confidence (bootstrap).  Less than 1: this version is faster.
 - ``import``: CPU time of importing the client
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
 - ``ndt``: CPU time of alignments by numba on one thread: two scans by DIRECT7 and DIRECT1, and Autoware's
-  working point (1500 points, 2 m voxels), its data in the caches, and after 64 MiB of other data
+  working point (1500 points, 2 m voxels), its data in the caches, and cold: 64 MiB of other data have been
+  written since the last alignment, twice the largest cache.  And what being cold costs: a cold alignment
+  less the second one after it, each pair in one go, so that the machine's load is in both
 - ``device``: CPU time, of all threads, of the reference alignments in ``SHMMAP_TEST_DATA``, on the first
   OpenCL device; of a version that knows none, by numba
 - ``pose``: wall and CPU time of a first pose among 200 candidates: one thread without batches, two with
@@ -129,16 +131,22 @@ for name, at, leaf, settings in (
     made[name] = matcher, clouds[at + "_source"], clouds[at + "_guess"]
 print("up", flush=True)
 for line in sys.stdin:
-    name, _, cold = line.strip().partition(" ")
+    name, _, how = line.strip().partition(" ")
     matcher, source, guess = made[name]
+    def align():
+        begin = time.thread_time()
+        matcher.align(source, guess)
+        return time.thread_time() - begin
     times = []
     for _ in range(10):
-        if cold:
+        if how:
             other += 1.0
-        begin = time.process_time()
-        matcher.align(source, guess)
-        times.append(time.process_time() - begin)
-    print(min(times) * 1e6, flush=True)
+        took = align()
+        if how == "penalty":
+            align()
+            took -= align()
+        times.append(took)
+    print((float(np.median(times)) if how == "penalty" else min(times)) * 1e6, flush=True)
 """
 _DEVICE = """
 import json, sys, time
@@ -244,8 +252,8 @@ def cpu_us(checkout: Path, *arguments: str) -> float:
     return (usage.ru_utime + usage.ru_stime) * 1e6
 
 
-def compare(name: str, this: Callable[[], float], other: Callable[[], float], pairs: int) -> None:
-    """Take turns, and print what comes of it."""
+def turns(this: Callable[[], float], other: Callable[[], float], pairs: int) -> list[tuple[float, float]]:
+    """Return what both measured, each first in half of the pairs."""
     this()  # warms up
     other()
     found = []
@@ -255,13 +263,33 @@ def compare(name: str, this: Callable[[], float], other: Callable[[], float], pa
         else:
             theirs = other()
             found.append((this(), theirs))
-    ratios = [mine / theirs for mine, theirs in found]
+    return found
+
+
+def most(values: list[float]) -> float:
+    """Return what the median is below with 95 % confidence."""
     draw = random.Random(1)
-    medians = sorted(statistics.median(draw.choices(ratios, k=pairs)) for _ in range(4000))
+    return sorted(statistics.median(draw.choices(values, k=len(values))) for _ in range(4000))[3800]
+
+
+def compare(name: str, this: Callable[[], float], other: Callable[[], float], pairs: int) -> None:
+    """Take turns, and print what comes of it."""
+    found = turns(this, other, pairs)
+    ratios = [mine / theirs for mine, theirs in found]
     mine, theirs = (statistics.median(values) for values in zip(*found, strict=True))
     print(
         f"{name:14} this {mine / 1e3:9.3f} ms, other {theirs / 1e3:9.3f} ms,"
-        f" ratio {statistics.median(ratios):.3f}, below {medians[3800]:.3f} with 95 % confidence",
+        f" ratio {statistics.median(ratios):.3f}, below {most(ratios):.3f} with 95 % confidence",
+        flush=True,
+    )
+
+
+def compare_differences(name: str, this: Callable[[], float], other: Callable[[], float], pairs: int) -> None:
+    """Take turns with what may be nothing at all, so that a ratio says little."""
+    here, there = ([value / 1e3 for value in one] for one in zip(*turns(this, other, pairs), strict=True))
+    print(
+        f"{name:14} this {statistics.median(here):9.3f} ms, below {most(here):.3f} with 95 % confidence;"
+        f" other {statistics.median(there):9.3f} ms, below {most(there):.3f}",
         flush=True,
     )
 
@@ -315,7 +343,8 @@ def main() -> None:
     def both(program: str, asks: dict[str, str], *arguments: str) -> None:
         this, other = (Measuring(checkout, program, *arguments) for checkout in checkouts)
         for name, ask in asks.items():
-            compare(name, partial(this.measure, ask), partial(other.measure, ask), options.pairs)
+            how = compare_differences if ask.endswith("penalty") else compare
+            how(name, partial(this.measure, ask), partial(other.measure, ask), options.pairs)
         this.close()
         other.close()
 
@@ -337,7 +366,8 @@ def main() -> None:
             asks = {name: name for name in ("direct7", "direct1", "working")}
             with tempfile.NamedTemporaryFile(suffix=".npz") as file:
                 write_clouds(file.name)
-                both(_NDT, {**asks, "working, cold": "working cold"}, file.name)
+                cold = {"working, cold": "working cold", "cold, penalty": "working penalty"}
+                both(_NDT, {**asks, **cold}, file.name)
         elif what == "device":
             with tempfile.TemporaryDirectory() as folder:
                 both(_DEVICE, {"references on a device": ""}, *write_references(Path(folder)))

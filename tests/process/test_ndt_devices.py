@@ -59,6 +59,15 @@ def test_a_drive_is_followed_on_a_device_as_without(
         assert summary["trustworthy"] == 12
         assert summary["backend"] == ("numba" if way == "numba" else "opencl")
         assert summary["fault"] is None
+        assert summary["map_updates"] >= 1
+        assert 0.0 < summary["map_prepare_ms"]["max"] <= summary["map_build_ms"]["max"]
+        if way == "copy":
+            # with --fine a map is prepared twice: with its cells, and with another kind of covariance
+            assert summary["map_writes"] >= 2
+            assert summary["map_written_bytes"] > 100_000
+        else:
+            assert summary["map_writes"] == summary["map_written_bytes"] == 0
+        assert summary["map_laid_out_anew"] == 0
         found[way] = poses(lines)
     for way in ("copy", "svm"):
         np.testing.assert_allclose(found[way], found["numba"], atol=1e-9)

@@ -7,6 +7,7 @@ then has to end although the device is busy for ever.  ``program WORDS...`` is s
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 import time
@@ -19,6 +20,7 @@ from shmmap_clients.ndt_scan_matcher import (
     Settings,
     matrix_from_pose,
 )
+from shmmap_clients.ndt_scan_matcher.backends import opencl_backend
 from shmmap_clients.ndt_scan_matcher.backends.opencl import program
 from shmmap_clients.ndt_scan_matcher.cli import main
 
@@ -54,6 +56,11 @@ def align(deadline_s: float, fallback: str | None) -> None:
             said = {"converged": result.converged, "late": result.cut.deadline}
         fault = None if matcher.fault is None else matcher.fault.code
         print(json.dumps({**said, "fault": fault, "took_s": time.monotonic() - begin}), flush=True)
+    matcher.close()
+    del matcher
+    gc.collect()
+    # the device is still reading what the backend has
+    assert [type(one) for one in opencl_backend._BUSY] == [opencl_backend.OpenclBackend]
     print("end", flush=True)
 
 

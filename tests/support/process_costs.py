@@ -32,6 +32,11 @@ def resident_bytes(pid: int) -> int:
     return _status_bytes(pid, "VmRSS")
 
 
+def anonymous_bytes(pid: int) -> int:
+    """Memory of its own that it has now; libraries, which other processes may share or not, are left out."""
+    return _status_bytes(pid, "RssAnon")
+
+
 def peak_bytes(pid: int) -> int:
     """Most memory that a process ever had."""
     return _status_bytes(pid, "VmHWM")

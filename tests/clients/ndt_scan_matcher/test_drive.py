@@ -20,6 +20,7 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.decimation import KEPT
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
@@ -32,7 +33,7 @@ from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
     TrajectoryErrors,
     pose_errors,
 )
-from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.scans.thinning import thinned
 from shmmap_clients.scans.trajectory import Trajectory
 
@@ -158,8 +159,10 @@ def test_a_vehicle_that_stands_begins_no_stretches() -> None:
 def test_summary_and_picture_of_a_drive(tmp_path: Path) -> None:
     drive = arc(30)
     frames = [frame(i, T, T) for i, T in enumerate(drive.T_map_sensor)]
-    updates = UpdateStatistics()
-    updates.add(added=5, removed=2, request_s=0.1, build_s=0.01, private_bytes=1000)
+    uploads = UploadStatistics()
+    updates = UpdateStatistics(uploads)
+    updates.add(added=5, removed=2, request_s=0.1, build_s=0.01, prepare_s=0.004, private_bytes=1000)
+    uploads.written_bytes, uploads.writes, uploads.laid_out_anew = 123_456, 7, 1
     statistics = DriveStatistics()
     for one in frames:
         statistics.add(one)
@@ -168,6 +171,9 @@ def test_summary_and_picture_of_a_drive(tmp_path: Path) -> None:
     assert summary.errors.ate_rmse_m < 1e-9
     assert (summary.frames, summary.waited, summary.too_slow) == (30, 1, 1)
     assert (summary.cells_added, summary.cells_removed, summary.map_private_bytes) == (5, 2, 1000)
+    assert (summary.map_written_bytes, summary.map_writes, summary.map_laid_out_anew) == (123_456, 7, 1)
+    assert summary.map_build_ms.max == pytest.approx(10.0)
+    assert summary.map_prepare_ms.max == pytest.approx(4.0)
     assert summary.latency_ms.max == pytest.approx(11.0 + 29.0)
     json.dumps(summary.as_document(), allow_nan=False)
     assert (summary.no_map, summary.lost, summary.trustworthy) == (30, 30, 0)
@@ -187,9 +193,16 @@ def test_the_summary_in_words_leaves_out_what_has_no_data(capsys: pytest.Capture
     for number in range(3):
         statistics.add(frame(number, np.eye(4), None))  # without a map: no score
     updates = UpdateStatistics()
-    updates.add(added=64, removed=0, request_s=0.1, build_s=0.01, private_bytes=60_000)
+    updates.add(added=64, removed=0, request_s=0.1, build_s=0.01, prepare_s=0.002, private_bytes=60_000)
     print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
     out = capsys.readouterr().out
+    assert "on the device" not in out
+    updates.uploads.written_bytes, updates.uploads.writes = 5_360_000, 2
+    print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
+    assert "5.36 MB written in 2 writes\n" in capsys.readouterr().out
+    updates.uploads.laid_out_anew = 3
+    print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
+    assert "5.36 MB written in 2 writes, laid out anew 3 times\n" in capsys.readouterr().out
     assert "updates: 1, cells added: 64, cells removed: 0" in out
     assert "0.06 MB at most, beside the shared memory" in out
     rows = [line.split("  ")[0] for line in out.splitlines() if " variance " in line]

@@ -17,6 +17,7 @@ from shmmap_clients.ndt_scan_matcher import (
     voxel_cell,
 )
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 
 from tests.clients.ndt_scan_matcher.brute_force import rotation, score
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
@@ -199,6 +200,38 @@ def test_read_only_arrays_are_taken_as_they_are(points: NDArray[np.float64]) -> 
             array.flags.writeable = False
     scan.flags.writeable = False
     assert evaluated("numba", VoxelMap(cells), scan, NEAR, **settings).score == before.score
+
+
+def test_a_next_maps_table_is_as_if_it_were_the_first(points: NDArray[np.float64]) -> None:
+    cells = cells_of(points, 2.0, edge=5.0)
+    names = list(cells)
+    moved = cells_of(points + 0.05, 2.0, edge=5.0)[names[8]]
+    whole = VoxelMap(cells)
+    covariances: tuple[Covariance, ...] = ("autoware", "pcl")
+    for covariance in covariances:
+        whole.table(covariance)
+    rng = np.random.default_rng(8)
+    last = whole
+    for _ in range(30):
+        # some go, some come, one changes, in another order; not every map is asked for its tables
+        some = {name: cells[name] for name in rng.permutation(names)[: rng.integers(0, len(names) + 1)]}
+        if names[8] in some and rng.random() < 0.5:
+            some[names[8]] = moved
+        voxel_map = VoxelMap(some, previous=last)
+        if rng.random() < 0.7:
+            for covariance in covariances:
+                table = voxel_map.table(covariance)
+                alone = VoxelMap(some, derived=voxel_map._derived)
+                assert (table == alone.table(covariance)).all()
+                for row, (name, cell) in zip(table, some.items(), strict=True):
+                    inverse = voxel_map.inverses(name, covariance)
+                    arrays = (cell.lattice, cell.mean, inverse)
+                    assert row[:3].tolist() == [array.ctypes.data for array in arrays]
+                    i0, j0, k0 = cell.lattice_origin.tolist()
+                    ni, nj, nk = cell.lattice.shape
+                    steps = [stride // 4 for stride in cell.lattice.strides]
+                    assert row[3:].tolist() == [i0, j0, k0, nk, *steps, len(cell.count), ni, nj]
+        last = voxel_map
 
 
 def test_a_pose_is_its_matrix() -> None:

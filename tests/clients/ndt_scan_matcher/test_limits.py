@@ -26,7 +26,7 @@ from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.matching import matcher as matcher_module
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import derivatives_of_poses, matrices_from_poses

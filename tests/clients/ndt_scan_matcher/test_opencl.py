@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -274,7 +275,7 @@ def test_many_guesses_are_aligned_as_one_by_one(
 
 
 def test_cells_are_written_once_and_the_old_map_stays(
-    points: NDArray[np.float64], scan: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str
 ) -> None:
     cells = cells_of(points, 2.0, edge=10.0)
     names = list(cells)
@@ -290,7 +291,7 @@ def test_cells_are_written_once_and_the_old_map_stays(
     assert written >= sum(cell.map_bytes for cell in first.cells.values())
     there.prepare(second, **how)
     new = [cells[name] for name in names[-4:]]
-    tables = second.private_bytes + 88 * len(second.cells) + 64 * (2 * len(new) + 4)
+    tables = second.private_bytes + 104 * len(second.cells) + 64 * (len(new) + 4)
     assert 0 < statistics.written_bytes - written <= sum(cell.map_bytes for cell in new) + tables
     assert same_bits(there.evaluate(NEAR, **how), before), "the map in use is untouched"
     writes = statistics.writes
@@ -302,6 +303,56 @@ def test_cells_are_written_once_and_the_old_map_stays(
     there.prepare(first, **how)
     there.set_map(first)
     assert same_bits(there.evaluate(NEAR, **how), before)
+
+
+@pytest.mark.parametrize("options", [COPY, FLOAT])
+def test_another_kind_of_covariance_is_written_beside_the_first(
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, options: DeviceOptions
+) -> None:
+    voxel_map = map_of(points, 2.0)
+    there = ready("opencl", VoxelMap({}), scan, options=options)
+    assert isinstance(there, OpenclBackend)
+    there.evaluate(NEAR, neighbors="radius", covariance="autoware")
+    nothing = there.pool.used_bytes
+    there.prepare(voxel_map, neighbors="radius", covariance="autoware")
+    written, used = there.uploads.written_bytes, there.pool.used_bytes
+    there.prepare(voxel_map, neighbors="radius", covariance="pcl")
+    inverses = sum(cell.inverse.nbytes for cell in voxel_map.cells.values())
+    tables = voxel_map.private_bytes + 104 * len(voxel_map.cells) + 64 * (len(voxel_map.cells) + 4)
+    assert there.uploads.written_bytes - written <= inverses + tables
+    there.set_map(voxel_map)
+    for covariance in ("autoware", "pcl"):
+        how: dict[str, Any] = {"neighbors": "radius", "covariance": covariance}
+        wanted = ready("numba", voxel_map, scan).evaluate(NEAR, **how)
+        assert off(there.evaluate(NEAR, **how), wanted) <= (1e-12 if options is COPY else 1e-4)
+    assert there.uploads.written_bytes - written <= inverses + tables, "nothing more"
+    assert used < there.pool.used_bytes
+    # all comes back, of both kinds
+    empty = VoxelMap({})
+    there.set_map(empty)
+    there.evaluate(NEAR, neighbors="radius", covariance="autoware")
+    there.prepare(VoxelMap({}), neighbors="radius", covariance="autoware")
+    assert there.pool.used_bytes <= 2 * nothing
+
+
+@pytest.mark.parametrize("options", [COPY, SVM])
+def test_a_map_may_have_a_cell_twice(
+    points: NDArray[np.float64], scan: NDArray[np.float64], options: DeviceOptions
+) -> None:
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    cells = cells_of(points, 2.0)
+    twice = VoxelMap({**cells, "again": next(iter(cells.values()))})
+    there = ready("opencl", twice, scan, options=options)
+    there.evaluate(NEAR, **how)
+    used = there.pool.used_bytes  # type: ignore[attr-defined]
+    for voxel_map in (VoxelMap(cells), VoxelMap({}), twice, VoxelMap({}), twice):
+        there.prepare(voxel_map, **how)
+        there.set_map(voxel_map)
+        found, wanted = there.evaluate(NEAR, **how), ready("numba", voxel_map, scan).evaluate(NEAR, **how)
+        assert counts(found) == counts(wanted)
+        if voxel_map.cells:
+            assert off(found, wanted) <= 1e-12
+    assert there.pool.used_bytes <= used + 4096, "nothing is lost"  # type: ignore[attr-defined]
 
 
 def test_a_cell_without_voxels_does_no_harm(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
@@ -318,6 +369,21 @@ def test_a_cell_without_voxels_does_no_harm(points: NDArray[np.float64], scan: N
             there.set_map(voxel_map)
             found = there.evaluate(NEAR, **how)
             assert same_bits(found, without) if len(some) > 1 else found.found == 0
+
+
+def test_a_map_in_place_stays_while_it_is_in_use_beside_the_next_ones(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
+    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    there = ready("opencl", map_of(points, 2.0), scan, options=SVM)
+    before = there.evaluate(NEAR, **how)
+    for number in range(20):
+        last = map_of(points, 2.0, edge=5.0 + number % 4)
+        there.prepare(last, **how)
+        gc.collect()  # tables that nobody kept would be overwritten by the next map's
+        assert same_bits(there.evaluate(NEAR, **how), before)
+    there.set_map(last)
+    assert off(there.evaluate(NEAR, **how), ready("numba", last, scan).evaluate(NEAR, **how)) <= 1e-12
 
 
 def test_a_write_that_fails_leaves_nothing_behind(
@@ -338,6 +404,7 @@ def test_a_write_that_fails_leaves_nothing_behind(
         with pytest.raises(DeviceError):
             there.prepare(voxel_map, **how)
     assert there.pool.used_bytes == used
+    assert there.uploads.laid_out_anew == 0
     there.prepare(voxel_map, **how)
     there.set_map(voxel_map)
     assert off(there.evaluate(NEAR, **how), ready("numba", voxel_map, scan).evaluate(NEAR, **how)) <= 1e-12
@@ -350,6 +417,7 @@ def test_a_map_in_place_is_not_copied(points: NDArray[np.float64], scan: NDArray
             array.flags.writeable = False
     there = ready("opencl", voxel_map, scan, options=SVM)
     assert isinstance(there, OpenclBackend)
-    there.evaluate(NEAR, neighbors="radius", covariance="autoware")
-    tables = voxel_map.private_bytes + 4 * 64
-    assert there.pool.statistics.written_bytes <= tables < 16_384
+    at = there.evaluate(NEAR, neighbors="radius", covariance="autoware")
+    assert at.found > 0
+    assert (there.uploads.writes, there.uploads.written_bytes, there.pool.used_bytes) == (0, 0, 0)
+    assert voxel_map.private_bytes < 16_384, "tables, of which the device reads the only copy"

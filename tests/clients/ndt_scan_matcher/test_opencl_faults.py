@@ -29,14 +29,14 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
 )
 from shmmap_clients.ndt_scan_matcher.backends.opencl.free_list import FreeList, rounded
 from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool
+from shmmap_clients.ndt_scan_matcher.backends.opencl.pool_memory import in_large_pages
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 import shmmap
-from shmmap.demo.process_memory import process_memory
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
 from tests.support.opencl_device import need_device
-from tests.support.process_costs import descriptors
+from tests.support.process_costs import anonymous_bytes, descriptors
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 HOW: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
@@ -251,13 +251,13 @@ def test_ten_thousand_evaluations_grow_nothing(points: NDArray[np.float64]) -> N
     work(20)
     gc.collect()
     before, files, used = (
-        process_memory(os.getpid()).private_bytes,
+        anonymous_bytes(os.getpid()),
         descriptors(os.getpid()),
         backend.pool.used_bytes,
     )
     work(200)
     gc.collect()
-    assert process_memory(os.getpid()).private_bytes - before < 2_000_000
+    assert anonymous_bytes(os.getpid()) - before < 2_000_000
     assert descriptors(os.getpid()) == files
     assert backend.pool.used_bytes == used
 
@@ -381,3 +381,15 @@ def test_blocks_never_overlap_and_all_come_back() -> None:
     for offset, nbytes in taken.items():
         free.give(offset, nbytes)
     assert free.take(total) == 0
+
+
+def test_memory_in_large_pages_is_memory() -> None:
+    for nbytes in (1, 4096, (4 << 20) + 100):
+        memory = in_large_pages(nbytes)
+        assert (len(memory), memory.nbytes) == (nbytes, nbytes)
+        assert memory.ctypes.data % (2 << 20) == 0
+        assert not memory.any()
+        memory[:] = 7
+        assert (memory == 7).all()
+    with pytest.raises(MemoryError, match="bytes"):
+        in_large_pages(1 << 60)

@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
 
@@ -33,6 +34,10 @@ class Backend(Protocol):
 
     most_map_bytes: int
     """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
+
+    @property
+    def uploads(self) -> UploadStatistics:
+        """What `prepare` and evaluations wrote to a device for maps; one object, which goes on counting."""
 
     def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
         """Do in advance what evaluations with this map would have to wait for.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, Neighbors
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
 
@@ -54,6 +55,11 @@ class FallbackBackend:
     def on_device(self) -> bool:
         """Of the one that computes."""
         return self._active.on_device
+
+    @property
+    def uploads(self) -> UploadStatistics:
+        """Of the one on a device."""
+        return self._first.uploads
 
     def close(self) -> None:
         """Give back threads and memory."""

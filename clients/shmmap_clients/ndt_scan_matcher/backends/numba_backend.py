@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.backends.kernels import accumulate
 from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import CONTRACTED, contract, derive, step_into
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     CHUNK_POINTS,
@@ -43,6 +44,7 @@ class NumbaBackend:
         self._source = ScanBuffer(limits.source_points)
         self._most_poses = limits.poses
         self.most_map_bytes = limits.most_map_bytes
+        self.uploads = UploadStatistics()  # nothing is
         self._map = VoxelMap({})
         self._most_rows = max(-(-limits.source_points // CHUNK_POINTS), _BATCH_ROWS)
         self._rows = np.zeros((self._most_rows, SUMS))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
@@ -83,6 +84,7 @@ class NumpyBackend:
         self._most = limits.neighbors
         self._most_poses = limits.poses
         self.most_map_bytes = limits.most_map_bytes
+        self.uploads = UploadStatistics()  # nothing is
         self._gaussians = self._prepared = _Gaussians(VoxelMap({}))
 
     def close(self) -> None:

@@ -17,9 +17,12 @@ from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, choose_device
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceHung, DeviceMemory, device_errors
-from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool, PlacedMap
+from shmmap_clients.ndt_scan_matcher.backends.opencl.map_in_place import MapInPlace
+from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool
+from shmmap_clients.ndt_scan_matcher.backends.opencl.placed_map import PlacedMap
 from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
 from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import CHUNK_POINTS, SUMS, Evaluation, gauss_for
 from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
@@ -36,6 +39,10 @@ __all__ = ["OpenclBackend"]
 _POSE: Final = 40  # numbers of a pose in the kernel
 _LAUNCH_ROWS: Final = 4096  # chunks in a launch of many poses: 256 poses of 2048 points
 _TABLES_BYTES: Final = 18 << 20  # of one map, at most: VoxelMap's directory and the table of its cells
+
+
+_BUSY: Final[set[OpenclBackend]] = set()
+"""Whose devices did not answer in time: what these may still read has to stay, whoever forgets it."""
 
 
 class OpenclBackend:
@@ -95,8 +102,16 @@ class OpenclBackend:
                 self._context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=self._places
             )
             self._rows_buffer = cl.Buffer(self._context, flags.WRITE_ONLY, self._rows.nbytes)
-        capacity = 2 * _TABLES_BYTES + (0 if device.in_place else 2 * self.most_map_bytes)
-        self.pool = MapPool(self._context, device, capacity)
+        self.pool: MapPool | MapInPlace
+        if device.in_place:
+            self.pool = MapInPlace(self._context)
+        else:
+            self.pool = MapPool(self._context, device, 2 * (_TABLES_BYTES + self.most_map_bytes))
+
+    @property
+    def uploads(self) -> UploadStatistics:
+        """What was written to the device for maps."""
+        return self.pool.statistics
 
     def _room_for_maps(self) -> int:
         """Return the most bytes that a map may have: as limited, or half of the largest buffer."""
@@ -116,6 +131,7 @@ class OpenclBackend:
         if self._closed or (self._running is not None and self._running.command_execution_status > 0):
             return
         self._closed = True
+        _BUSY.discard(self)
         self._kernels.clear()
         self._arguments.clear()
         self.pool.close()
@@ -225,7 +241,11 @@ class OpenclBackend:
             )
             self._running = cl.enqueue_copy(queue, rows, self._rows_buffer, is_blocking=False)
             queue.flush()
-            self._waiting.until(self._running, deadline_s)
+            try:
+                self._waiting.until(self._running, deadline_s)
+            except DeviceHung:
+                _BUSY.add(self)
+                raise
         self._running = None
         inputs.clear()
         return evaluations_of(rows.reshape(number, chunks, SUMS), derivatives)
@@ -239,6 +259,7 @@ class OpenclBackend:
                 f"device {self.device.info.name!r} is still busy with what it did not finish in time"
             )
         self._running = None
+        _BUSY.discard(self)
 
     def _built(self, neighbors: Neighbors) -> Any:
         return build_kernel(self._context, self.device, neighbors, self._limits.neighbors)
@@ -262,7 +283,7 @@ class OpenclBackend:
             self._places_buffer,
             self._rows_buffer,
             self.pool.buffer,
-            *(offset(at) for at in placed.offsets),
+            *(offset(at) for at in placed.places),
             *(integer(side) for side in (*box, *placed.lead, placed.squares)),
             real(leaf),
             real(1.0 / leaf),

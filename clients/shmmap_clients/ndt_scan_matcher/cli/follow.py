@@ -81,7 +81,9 @@ def run(args: argparse.Namespace) -> int:
             max_bytes=matcher.limits.most_map_bytes,
         )
         client = stack.enter_context(connect(args, "shmmap-ndt"))
-        maps = stack.enter_context(MapUpdater(client, rules, prepare=matcher.prepare))
+        maps = stack.enter_context(
+            MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads)
+        )
         relocalizer = None
         if args.relocalize or args.rough is not None:
             relocalizer = _relocalizer(args, stack)

@@ -50,8 +50,11 @@ JSON (fields may be added, none is removed).
    "errors": null without a truth, else {"ate_rmse_m", "ate_m": spread,
      "ate_deg": spread, "rte": {metres: metres per 100 m}},
    "transform_probability", "nvtl", "iterations", "latency_ms", "align_ms",
-   "thin_ms", "map_ms", "map_request_ms", "map_build_ms": spread each,
-   "map_updates", "cells_added", "cells_removed", "map_private_bytes"}
+   "thin_ms", "map_ms", "map_request_ms", "map_build_ms",
+   "map_prepare_ms": its part of the backend: spread each,
+   "map_updates", "cells_added", "cells_removed", "map_private_bytes",
+   "map_written_bytes", "map_writes": to a device,
+   "map_laid_out_anew": maps that did not fit beside the one in use}
   A spread is {"mean", "variance", "p50", "p99", "max"}; ate is the distance
   of the poses to the true ones in metres, or degrees.
 --json-lines writes a line for each scan, as soon as it is localized:

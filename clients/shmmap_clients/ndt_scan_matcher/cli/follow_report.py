@@ -169,6 +169,9 @@ def print_summary(summary: DriveSummary) -> None:
         f" {s.cells_removed}, scans that waited for it: {s.waited}"
     )
     print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most, beside the shared memory")
+    if s.map_writes:
+        again = f", laid out anew {s.map_laid_out_anew} times" if s.map_laid_out_anew else ""
+        print(f"  on the device {s.map_written_bytes / 1e6:.2f} MB written in {s.map_writes} writes{again}")
     if s.errors is not None:
         e = s.errors
         print(
@@ -188,6 +191,7 @@ def print_summary(summary: DriveSummary) -> None:
         ("  alignment, ms", s.align_ms),
         ("map request, ms", s.map_request_ms),
         ("map building, ms", s.map_build_ms),
+        ("  preparing, ms", s.map_prepare_ms),
     ):
         if not spread.max > 0.0:  # none (NaN), or no scan had it
             continue

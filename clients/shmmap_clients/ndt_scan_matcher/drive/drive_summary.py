@@ -12,7 +12,7 @@ from typing import Any
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import RunningErrors, TrajectoryErrors
-from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 from shmmap_clients.spread import RunningSpread, Spread
 
@@ -57,10 +57,12 @@ class DriveSummary:
         the map and the compiler's cache, is left out.
     map_updates, cells_added, cells_removed
         Changes of the map in use.
-    map_request_ms, map_build_ms
-        What they cost, in another thread.
+    map_request_ms, map_build_ms, map_prepare_ms
+        What they cost, in another thread; the last is a part of the one before, see `UpdateStatistics`.
     map_private_bytes
         This process's own memory for a map, at most.
+    map_written_bytes, map_writes, map_laid_out_anew
+        What was written to a device, see `UploadStatistics`.
     """
 
     frames: int
@@ -90,7 +92,11 @@ class DriveSummary:
     cells_removed: int
     map_request_ms: Spread
     map_build_ms: Spread
+    map_prepare_ms: Spread
     map_private_bytes: int
+    map_written_bytes: int
+    map_writes: int
+    map_laid_out_anew: int
 
     def as_document(self) -> dict[str, Any]:
         """Return the summary for JSON: numbers that are not there are null."""
@@ -170,7 +176,11 @@ class DriveStatistics:
             cells_removed=updates.removed,
             map_request_ms=updates.request_ms.spread,
             map_build_ms=updates.build_ms.spread,
+            map_prepare_ms=updates.prepare_ms.spread,
             map_private_bytes=updates.private_bytes,
+            map_written_bytes=updates.uploads.written_bytes,
+            map_writes=updates.uploads.writes,
+            map_laid_out_anew=updates.uploads.laid_out_anew,
         )
 
 

@@ -19,11 +19,12 @@ from types import TracebackType
 from typing import Final
 
 from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
+from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
-from shmmap_clients.spread import RunningSpread
 
-__all__ = ["MapRules", "MapUpdater", "UpdateStatistics"]
+__all__ = ["MapRules", "MapUpdater"]
 
 _REFRESH_S: Final = 1.0  # Autoware's timer; also how soon a changed map is noticed
 _REQUEST_S: Final = 60.0
@@ -73,41 +74,6 @@ class MapRules:
         return canonical_layer(f"ndt(leaf={self.leaf!r})")
 
 
-class UpdateStatistics:
-    """What the changes of the map in use were like.
-
-    Attributes
-    ----------
-    updates
-        How many there were.
-    added, removed
-        Cells, over all of them.
-    request_ms
-        From asking until the daemon's cells were attached, milliseconds.
-    build_ms
-        For the tables beside the map in use, milliseconds.
-    private_bytes
-        This process's own memory for a map, at most.
-    """
-
-    def __init__(self) -> None:
-        self.updates = 0
-        self.added = 0
-        self.removed = 0
-        self.request_ms = RunningSpread()
-        self.build_ms = RunningSpread()
-        self.private_bytes = 0
-
-    def add(self, *, added: int, removed: int, request_s: float, build_s: float, private_bytes: int) -> None:
-        """Count one change."""
-        self.updates += 1
-        self.added += added
-        self.removed += removed
-        self.request_ms.add(request_s * 1e3)
-        self.build_ms.add(build_s * 1e3)
-        self.private_bytes = max(self.private_bytes, private_bytes)
-
-
 class MapUpdater:
     """Keeps a `VoxelMap` around a pose.
 
@@ -118,6 +84,8 @@ class MapUpdater:
     rules
     prepare
         Called in the updater's thread with each new map; computes what alignments need of it.
+    uploads
+        Where ``prepare`` counts what it writes to a device, `NdtMatcher.uploads`; for the statistics.
     name
         Of its own session, for ``shmmap clients``.
 
@@ -133,10 +101,11 @@ class MapUpdater:
         rules: MapRules | None = None,
         *,
         prepare: Callable[[VoxelMap], VoxelMap] = lambda voxel_map: voxel_map,
+        uploads: UploadStatistics | None = None,
         name: str = "shmmap-ndt",
     ) -> None:
         self.rules = rules if rules is not None else MapRules()
-        self.statistics = UpdateStatistics()
+        self.statistics = UpdateStatistics(uploads)
         self.too_slow = 0
         self._prepare = prepare
         self._window = MapWindow(
@@ -294,21 +263,22 @@ class MapUpdater:
             voxel_map = before[0]
         else:
             begin_s = time.perf_counter()
-            voxel_map = self._prepare(
-                VoxelMap(
-                    {key: voxels for key, (_, voxels) in known.items()},
-                    max_voxels=self.rules.max_voxels,
-                    max_bytes=self.rules.max_bytes,
-                    centre=(x, y),
-                    previous=before[0] if before is not None else None,
-                )
+            voxel_map = VoxelMap(
+                {key: voxels for key, (_, voxels) in known.items()},
+                max_voxels=self.rules.max_voxels,
+                max_bytes=self.rules.max_bytes,
+                centre=(x, y),
+                previous=before[0] if before is not None else None,
             )
-            build_s = time.perf_counter() - begin_s
+            made_s = time.perf_counter()
+            voxel_map = self._prepare(voxel_map)
+            done_s = time.perf_counter()
             self.statistics.add(
                 added=len(changed),
                 removed=len(gone),
                 request_s=request_s,
-                build_s=build_s,
+                build_s=done_s - begin_s,
+                prepare_s=done_s - made_s,
                 private_bytes=voxel_map.private_bytes,
             )
         with self._changed:

@@ -2,18 +2,19 @@
 """Many cells as one map, without copying them: a small private table of where their arrays lie.
 
 A kernel compiled once cannot take 256 mappings as arguments.  It takes the *table* instead: per cell
-the addresses of three arrays and the cell's lattice box, 11 integers.  All cells of one leaf size share
+the addresses of three arrays and the cell's lattice box, 13 integers.  All cells of one leaf size share
 one global lattice, so that a point's lattice index is right for every cell; the *directory* says, for
 each lattice column (i, j), which cells have it.  A column on a border belongs to both cells, and their
 voxels are never merged: both Gaussians count, as in Autoware.
 
-Private memory: 100 bytes a cell, 4 bytes a lattice column; and 48 bytes a voxel where the covariances
-are not those that the cells hold.
+Private memory: 210 bytes a cell, 4 bytes a lattice column; and 48 bytes a voxel where the covariances
+are not those that the cells hold.  A next map takes the addresses of the cells that it has in common with
+the last one from there, in arrays: Python's own integers would take several times as much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -26,7 +27,8 @@ __all__ = ["TABLE_COLUMNS", "Covariance", "VoxelMap"]
 
 Covariance = Literal["autoware", "pclomp", "pcl"]
 
-TABLE_COLUMNS: Final = 11  # addresses of lattice, mean, inverse; i0 j0 k0; nk; strides; voxels
+TABLE_COLUMNS: Final = 13  # addresses of lattice, mean, inverse; then those of `VoxelMap.boxes`
+_ADDRESSES: Final = 3
 _MAX_COLUMNS: Final = 1 << 22  # 16 MiB of directory: 2 km x 2 km at 1 m
 
 Inverses = dict[Covariance, NDArray[np.float64]]
@@ -48,6 +50,12 @@ class VoxelMap:
         A map whose derived tables are used again for the cells that both have.
     derived
         Inverse covariances, by a cell's key and their kind, that were computed elsewhere.
+
+    Attributes
+    ----------
+    boxes : (C, 10) int64
+        Of each cell in order: lattice index of its first place (i0, j0, k0), how many heights it has, steps
+        of its lattice array along i, j and k, voxels, columns along i and along j.
 
     Raises
     ------
@@ -83,13 +91,26 @@ class VoxelMap:
                 for key, cell in kept.items()
                 if previous.cells.get(key) is cell and key in previous._derived
             }
-        self.box, self.column_start, self.column_cell = _directory(list(kept.values()))
-        self._rows: dict[Covariance, dict[str, list[int]]] = {}
-        if previous is not None:
-            same = [key for key, cell in kept.items() if previous.cells.get(key) is cell]
-            for covariance, rows in previous._rows.items():
-                self._rows[covariance] = {key: rows[key] for key in same if key in rows}
+        self.boxes = _boxes(list(kept.values()))
+        self.box, self.column_start, self.column_cell = _directory(self.boxes)
         self._tables: dict[Covariance, NDArray[np.int64]] = {}
+        self._inherited: dict[Covariance, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+        if previous is not None:
+            self._inherit(previous)
+
+    def _inherit(self, previous: VoxelMap) -> None:
+        """Take over the addresses of the cells that a previous map has, too, and the rows they go to."""
+        places = {key: row for row, key in enumerate(previous.cells)}
+        same = np.array(
+            [
+                (row, places[key])
+                for row, (key, cell) in enumerate(self.cells.items())
+                if previous.cells.get(key) is cell
+            ],
+            np.int64,
+        ).reshape(-1, 2)
+        for covariance, table in list(previous._tables.items()):
+            self._inherited[covariance] = same[:, 0], table[same[:, 1], :_ADDRESSES]
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
         """Return (V, 6) inverse covariances of a cell; its own where it holds them already."""
@@ -107,11 +128,18 @@ class VoxelMap:
         """Return the kernel's table, (C, `TABLE_COLUMNS`); valid as long as this map lives."""
         table = self._tables.get(covariance)
         if table is None:
-            rows = self._rows.setdefault(covariance, {})
-            for key, cell in self.cells.items():
-                if key not in rows:
-                    rows[key] = _row(cell, self.inverses(key, covariance))
-            table = np.array([rows[key] for key in self.cells], np.int64).reshape(-1, TABLE_COLUMNS)
+            table = np.zeros((len(self.cells), TABLE_COLUMNS), np.int64)
+            table[:, _ADDRESSES:] = self.boxes
+            missing = np.ones(len(self.cells), bool)
+            inherited = self._inherited.pop(covariance, None)
+            if inherited is not None:
+                rows, addresses = inherited
+                table[rows, :_ADDRESSES] = addresses
+                missing[rows] = False
+            keys = list(self.cells)
+            for row in np.flatnonzero(missing).tolist():
+                key = keys[row]
+                table[row, :_ADDRESSES] = _addresses(self.cells[key], self.inverses(key, covariance))
             self._tables[covariance] = table
         return table
 
@@ -122,6 +150,7 @@ class VoxelMap:
             self.column_start.nbytes
             + self.column_cell.nbytes
             + self.origins.nbytes
+            + self.boxes.nbytes
             + sum(table.nbytes for table in self._tables.values())
             + sum(array.nbytes for derived in self._derived.values() for array in derived.values())
         )
@@ -148,14 +177,24 @@ def _within(
     return {key: cell for key, cell in cells.items() if key in chosen}
 
 
+def _boxes(cells: Sequence[VoxelCell]) -> NDArray[np.int64]:
+    if not cells:
+        return np.zeros((0, TABLE_COLUMNS - _ADDRESSES), np.int64)
+    shapes = np.array([cell.lattice.shape for cell in cells], np.int64)
+    steps = np.array([cell.lattice.strides for cell in cells], np.int64) // cells[0].lattice.itemsize
+    voxels = np.array([[len(cell.count)] for cell in cells], np.int64)
+    first = np.concatenate([cell.lattice_origin for cell in cells]).astype(np.int64, copy=False)
+    return np.concatenate([first.reshape(-1, 3), shapes[:, 2:], steps, voxels, shapes[:, :2]], axis=1)
+
+
 def _directory(
-    cells: Iterable[VoxelCell],
+    all_boxes: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
     """Return (i0, j0, ni, nj), where each column's cells start, and the cells."""
     boxes = [
-        (index, *cell.lattice_origin[:2].tolist(), *cell.lattice.shape[:2])
-        for index, cell in enumerate(cells)
-        if len(cell.count)
+        (index, i, j, di, dj)
+        for index, (i, j, _, _, _, _, _, voxels, di, dj) in enumerate(all_boxes.tolist())
+        if voxels
     ]
     if not boxes:
         return np.zeros(4, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
@@ -182,18 +221,10 @@ def _directory(
     return np.array([i0, j0, ni, nj], np.int64), start, column_cell
 
 
-def _row(cell: VoxelCell, inverse: NDArray[np.float64]) -> list[int]:
+def _addresses(cell: VoxelCell, inverse: NDArray[np.float64]) -> tuple[int, int, int]:
     for array, dtype in ((cell.lattice, np.int32), (cell.mean, np.float64), (inverse, np.float64)):
         if array.dtype != dtype:
             raise BadRequest(f"a cell's array has dtype {array.dtype}, not {np.dtype(dtype)}")
     if not (cell.mean.flags.c_contiguous and inverse.flags.c_contiguous):
         raise BadRequest("a cell's arrays must be contiguous")
-    return [
-        cell.lattice.ctypes.data,
-        cell.mean.ctypes.data,
-        inverse.ctypes.data,
-        *map(int, cell.lattice_origin),
-        cell.lattice.shape[2],
-        *(stride // cell.lattice.itemsize for stride in cell.lattice.strides),
-        len(cell.count),
-    ]
+    return cell.lattice.ctypes.data, cell.mean.ctypes.data, inverse.ctypes.data

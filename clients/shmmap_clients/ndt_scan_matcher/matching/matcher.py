@@ -17,6 +17,7 @@ from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, Neighbors
 from shmmap_clients.ndt_scan_matcher.backends.fallback_backend import FallbackBackend
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
+from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
@@ -112,6 +113,11 @@ class NdtMatcher:
     def fault(self) -> DeviceError | None:
         """Why the fallback computes; None as long as it does not."""
         return self._backend.fault if isinstance(self._backend, FallbackBackend) else None
+
+    @property
+    def uploads(self) -> UploadStatistics:
+        """What was written to a device for maps; it goes on counting."""
+        return self._backend.uploads
 
     @property
     def neighbors(self) -> Neighbors:

@@ -132,6 +132,9 @@ def choose_device(options: DeviceOptions) -> Device:
         )
     double = info.fp64 if options.precision == "auto" else options.precision == "double"
     if options.memory == "svm" and not double:
+        # A device without doubles has no instruction that reads them.  One that has them, and is told to use
+        # floats because its doubles are slow, would have to subtract and convert nine doubles for each
+        # neighbour at each evaluation, at the slow rate and with twice the bytes read; copying does it once.
         raise NoDevice(
             "segments have double precision: a program that computes with floats cannot read them in place",
             hint="--memory copy, or --precision double",

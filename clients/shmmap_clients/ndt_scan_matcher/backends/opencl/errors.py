@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Final
 
 from shmmap import ShmmapError
 
@@ -25,6 +26,7 @@ _OUT_OF_MEMORY = (
     "OUT_OF_HOST_MEMORY",
     "INVALID_BUFFER_SIZE",
 )
+_LESS: Final = "lower limits (--max-voxels, --max-map-bytes, --max-points) need less"
 
 
 class DeviceError(ShmmapError):
@@ -61,7 +63,7 @@ class DeviceHung(DeviceError):
 
 @contextmanager
 def device_errors(device: str, what: str) -> Iterator[None]:
-    """Turn pyopencl's errors into those of this module.
+    """Turn pyopencl's errors, and a lack of memory, into those of this module.
 
     Parameters
     ----------
@@ -79,6 +81,10 @@ def device_errors(device: str, what: str) -> Iterator[None]:
         if isinstance(error, cl.MemoryError) or any(name in told for name in _OUT_OF_MEMORY):
             raise DeviceMemory(
                 f"device {device!r} has not enough memory to {what}: {told}",
-                hint="lower limits (--max-voxels, --max-map-bytes, --max-points) need less",
+                hint=_LESS,
             ) from None
         raise DeviceError(f"device {device!r} cannot {what}: {told}") from None
+    except MemoryError as error:  # of this process, which a processor's memory is
+        raise DeviceMemory(
+            f"device {device!r} has not enough memory to {what}: {error}", hint=_LESS
+        ) from None

@@ -8,7 +8,7 @@
 //
 // Macros that the program is built with (program.py):
 //   DOUBLE          1: double throughout; 0: float throughout
-//   IN_PLACE        1: the table has addresses of shared memory; 0: it has offsets into the pool
+//   IN_PLACE        1: tables and what they lead to are at addresses; 0: at offsets into the pool
 //   SEARCH          1, 7 or 27: the places of the lattice that are looked at
 //   MOST            neighbours that a point may have; the nearest are taken
 //   ITEM_PER_CHUNK  1: one work-item sums a chunk, for processors; 0: one work-item a point, for GPUs
@@ -36,7 +36,7 @@ typedef float real;
 #define AT(type, base) ((__global const type *)(pool + (base)))
 #endif
 
-// columns of the table of cells: those of VoxelMap.table, and how many columns a cell has
+// columns of the table of cells, VoxelMap.table
 enum { LATTICE, MEAN, INVERSE, I0, J0, K0, NK, SI, SJ, SK, VOXELS, NI, NJ, COLUMNS };
 
 #if SEARCH == 1
@@ -275,12 +275,12 @@ __kernel void evaluate(__global const real *restrict source, const int points,
     __global const int *place = places + at * 3;
     Map map;
     map.pool = pool;
-    map.table = (__global const long *)(pool + table_at);
+    map.table = AT(long, table_at);
 #if DOUBLE
-    map.origins = (__global const double *)(pool + origins_at);
+    map.origins = AT(double, origins_at);
 #endif
-    map.square_start = (__global const int *)(pool + start_at);
-    map.square_cell = (__global const int *)(pool + cell_at);
+    map.square_start = AT(int, start_at);
+    map.square_cell = AT(int, cell_at);
     map.lead_i = lead_i;
     map.lead_j = lead_j;
     map.squares = squares;

@@ -49,7 +49,7 @@ class FreeList:
 
     def take_all(self, sizes: Sequence[int]) -> list[int] | None:
         """Return the offsets of new blocks, side by side where there is room; None, and no block, else."""
-        lengths = [rounded(nbytes) for nbytes in sizes]
+        lengths = list(map(rounded, sizes))
         first = self.take(sum(lengths)) if lengths else 0
         if first is not None:
             return [first + end - length for end, length in zip(accumulate(lengths), lengths, strict=True)]
