@@ -13,7 +13,7 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.cell_names import CellNames
-from shmmap.origin.spatial_index import SpatialIndex
+from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
 
@@ -45,6 +45,8 @@ class Catalogue:
         Oddities found while reading the map, one sentence each, for the log and `shmmap status`.
     before
         An earlier state; what was made for its very ``names`` or ``boxes`` is used for them here, too.
+    by_base, made
+        What was made of the same names and boxes before: `CellNames.by_base` and `SpatialIndex.made`.
 
     Raises
     ------
@@ -63,18 +65,21 @@ class Catalogue:
         stamps: NDArray[np.int64],
         problems: Sequence[str] = (),
         before: Catalogue | None = None,
+        by_base: NDArray[np.int32] | None = None,
+        made: MadeOfBoxes | None = None,
     ) -> None:
         self._names: CellNames
         self._index: SpatialIndex
         if before is not None and before.names is names and before.id_prefix == id_prefix:
             self._names = before._names
         else:
-            self._names = CellNames(id_prefix, names)
+            self._names = CellNames(id_prefix, names, by_base)
         if before is not None and before.boxes is boxes:
             self._index = before._index
         else:
-            self._refuse_bad(boxes)
-            self._index = SpatialIndex(boxes)
+            if made is None:
+                self._refuse_bad(boxes)
+            self._index = SpatialIndex(boxes, made)
         self._stamps = stamps
         self._versions = np.zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
@@ -132,12 +137,12 @@ class Catalogue:
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
         """Box around all cells, metres, map frame; None where there are none."""
-        return self._index.bounds
+        return self._index.made.bounds
 
     @property
     def mean_size(self) -> tuple[float, float]:
         """Mean extent of the cells along x and y, metres."""
-        return self._index.mean_size
+        return self._index.made.mean_size
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -145,9 +150,20 @@ class Catalogue:
         return self._stamps
 
     @property
+    def by_base(self) -> NDArray[np.int32]:
+        """In which order base names ascend, see `shmmap.origin.cell_names.order_by_base`; do not write."""
+        return self._names.by_base
+
+    @property
+    def made_of_boxes(self) -> MadeOfBoxes:
+        """What areas are looked up in."""
+        return self._index.made
+
+    @property
     def nbytes(self) -> int:
-        """Memory of the tables (names, boxes, stamps, index), without lazily built lookups."""
-        return int(self.names.nbytes + self._stamps.nbytes + self._versions.nbytes) + self._index.nbytes
+        """Memory of the tables (names, boxes, stamps, index), without what is remembered of lookups."""
+        tables = (self.names, self.by_base, self._stamps, self._versions)
+        return sum(int(table.nbytes) for table in tables) + self._index.nbytes
 
     def id(self, index: int) -> str:
         """Id of a cell: the absolute path of its file."""

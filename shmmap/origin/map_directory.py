@@ -17,6 +17,7 @@ from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import Source
 from shmmap.origin.catalogue_change import Tables
+from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
 from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
 from shmmap.origin.metadata_entries import MapMetadata, list_some
@@ -176,7 +177,7 @@ def _joined(
     """Match entries with files by base name, as Autoware does."""
     if not len(entries.names):
         raise MapDataError("it lists no cells", path=metadata, cause="no_cells")
-    bases = _base_names(files.names)
+    bases = base_names(files.names)
     order = np.argsort(entries.names, kind="stable")
     ascending = entries.names[order]
     at = np.minimum(ascending.searchsorted(bases), len(ascending) - 1)
@@ -210,9 +211,3 @@ def _joined(
         stamps=files.stamps[has_entry],
         problems=problems,
     )
-
-
-def _base_names(names: NDArray[np.bytes_]) -> NDArray[np.bytes_]:
-    if int(np.char.find(names, b"/").max()) < 0:
-        return names
-    return np.array([name.rpartition(b"/")[2] for name in names.tolist()], dtype=np.bytes_)
