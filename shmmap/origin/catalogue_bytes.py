@@ -188,7 +188,9 @@ def read_catalogue(
     sizes = [dtype.itemsize * math.prod(shape) for dtype, shape in shapes]
     if size_bytes is not None and size_bytes != after_header + sum(size + _padding(size) for size in sizes):
         raise ValueError("its size contradicts its header")
-    old: list[NDArray[Any] | None] = [None] * len(shapes)  # stamps are not shared: they are corrected in place
+    old: list[NDArray[Any] | None] = [None] * len(
+        shapes
+    )  # stamps are not shared: they are corrected in place
     if before is not None and before.id_prefix == header.prefix:
         old[0] = before.names
     if before is not None:

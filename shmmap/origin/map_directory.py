@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.catalogue import Catalogue

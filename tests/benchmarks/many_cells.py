@@ -8,20 +8,21 @@ are made in five minutes on a disk, and take half a gigabyte there; with --maps 
 time.  Each column of the table is one map, in rows:
 
 first start     from the start of the process to READY, with no catalogue in the cache
-start           the same with it, as every later start has it
+start           the same with it, as every later start has it; of CPU: the daemon's processor time until then
 daemon          resident memory of the daemon then, and the most it ever had
 with loaders    proportional set size of the daemon and all its processes
 circle          `Catalogue.query` of 200 m, some 355 cells of 20 m, median
 request         the same area in a request, all of it in memory, median
-ls, map         `shmmap ls --circle` of that area, `shmmap map` of that area and of everything, `shmmap status`:
-                whole commands
 page            a page of the list of cells, median; of an area that is too large to be tested at once
 whole list      all pages of it, by the client library (left out with --skip whole)
 unknown         a request for a cell that the map does not have
 refused         a request for more cells than one request may have
+ls, map, status `shmmap ls --circle` of that area, `shmmap map` of that area and of everything: whole commands
+longest turn    of the serving loop in all of that: processor time, as the daemon measures it
 reload          until a change of ten cells is served
-longest turn    of the serving loop in all of that, and in the reload: processor time, as the daemon measures it
-probe           the longest that another client waited for warm cells during the reload, and a bare echo's client
+turn in it      the longest turn then
+probe, echo     the longest that another client waited for warm cells then, and the client of a bare echo
+daemon then     resident memory after the reload, and the most until then
 
 Exit code 1 if a limit does not hold; printed beside the table.
 """
@@ -64,7 +65,7 @@ LONGEST_TURN_MS: Final = 10.0
 
 
 def own_files(root: Path, side: int) -> list[Path]:
-    """Files of ten cells along the diagonal, none at its ends, made files of their own: a change of one is of one cell."""
+    """Files of ten cells along the diagonal, but for its ends; made files of their own to change alone."""
     found = []
     for number in range(CHANGED):
         corner = CELL_METRES * (side * (number + 1) // (CHANGED + 1))
@@ -94,6 +95,12 @@ def seconds_to_start(one: DaemonProcess) -> float:
     return time.perf_counter() - begin_s
 
 
+def processor_s(pid: int) -> float:
+    """Processor time of a process and all its threads so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def measure_starts(one: DaemonProcess, row: dict[str, float]) -> None:
     """Start without and with the catalogue in the cache; the daemon runs afterwards."""
     row["first start"] = seconds_to_start(one)
@@ -103,6 +110,7 @@ def measure_starts(one: DaemonProcess, row: dict[str, float]) -> None:
         one.stop()
         starts.append(seconds_to_start(one))
     row["start"] = statistics.median(starts)
+    row["of CPU"] = processor_s(one.pid)
     row["daemon"] = resident_bytes(one.pid) / 1e6
     row["its peak"] = peak_bytes(one.pid) / 1e6
     row["with loaders"] = sum(map(proportional_bytes, [one.pid, *one.children()])) / 1e6
@@ -138,14 +146,12 @@ def measure_requests(one: DaemonProcess, side: int, row: dict[str, float], *, wh
 
 def measure_reload(one: DaemonProcess, changed: list[Path], told: Report, row: dict[str, float]) -> None:
     """Ten cells change, and the map is read again."""
-    peak, done = 0, False
     with Beside(told, one, newcomers_too=False) as beside:
         time.sleep(1.0)
         for path in changed:
             os.utime(path)
         with Actor(reloads, one.endpoint) as operator:
             took_s, failure = operator.said(FIRST_START_S)
-        del peak, done
         told.must("the reload was answered", not failure, failure)
         row["reload"] = took_s
         row["turn in it"] = beside.turns.quantile_and_longest_ms(1.0)[1]
@@ -184,7 +190,7 @@ def measure(side: int, stage: Stage, told: Report, *, whole: bool) -> dict[str, 
 
 
 UNITS: Final = {
-    "first start": "s", "start": "s", "daemon": "MB", "its peak": "MB", "with loaders": "MB", "circle": "ms",
+    "first start": "s", "start": "s", "of CPU": "s", "daemon": "MB", "its peak": "MB", "with loaders": "MB", "circle": "ms",
     "request": "ms", "page": "ms", "page of an area": "ms", "whole list": "s", "unknown": "ms",
     "refused": "ms", "ls": "s", "map": "s", "map, all": "s", "status": "s", "longest turn": "ms",
     "reload": "s", "turn in it": "ms", "probe": "ms", "echo": "ms", "daemon then": "MB", "peak then": "MB",
