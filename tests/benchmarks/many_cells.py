@@ -59,8 +59,10 @@ RADIUS_M: Final = 200.0
 CHANGED: Final = 10
 FIRST_START_S: Final = 1200.0
 LARGEST: Final = 10_000_000
-LIMITS: Final = {"start": 2.0, "circle": 0.1, "ls": 0.3, "daemon": 1600.0, "with loaders": 1600.0}
+LIMITS: Final = {"start": 2.0, "circle": 0.1, "ls": 0.3, "peak then": 1600.0, "with loaders": 1600.0}
 """Seconds, milliseconds and megabytes for `LARGEST` cells; smaller maps have to keep them, too."""
+STATE_MIB: Final = 400.0
+"""A second state of the map may be there while the reload goes on; the peak has its own limit."""
 LONGEST_TURN_MS: Final = 10.0
 
 
@@ -146,7 +148,7 @@ def measure_requests(one: DaemonProcess, side: int, row: dict[str, float], *, wh
 
 def measure_reload(one: DaemonProcess, changed: list[Path], told: Report, row: dict[str, float]) -> None:
     """Ten cells change, and the map is read again."""
-    with Beside(told, one, newcomers_too=False) as beside:
+    with Beside(told, one, newcomers_too=False, over_idle_mib=STATE_MIB) as beside:
         time.sleep(1.0)
         for path in changed:
             os.utime(path)
@@ -190,11 +192,17 @@ def measure(side: int, stage: Stage, told: Report, *, whole: bool) -> dict[str, 
 
 
 UNITS: Final = {
-    "first start": "s", "start": "s", "of CPU": "s", "daemon": "MB", "its peak": "MB", "with loaders": "MB", "circle": "ms",
-    "request": "ms", "page": "ms", "page of an area": "ms", "whole list": "s", "unknown": "ms",
-    "refused": "ms", "ls": "s", "map": "s", "map, all": "s", "status": "s", "longest turn": "ms",
-    "reload": "s", "turn in it": "ms", "probe": "ms", "echo": "ms", "daemon then": "MB", "peak then": "MB",
-}  # fmt: skip
+    **dict.fromkeys(("first start", "start", "of CPU"), "s"),
+    **dict.fromkeys(("daemon", "its peak", "with loaders"), "MB"),
+    **dict.fromkeys(("circle", "request", "page", "page of an area"), "ms"),
+    "whole list": "s",
+    **dict.fromkeys(("unknown", "refused"), "ms"),
+    **dict.fromkeys(("ls", "map", "map, all", "status"), "s"),
+    "longest turn": "ms",
+    "reload": "s",
+    **dict.fromkeys(("turn in it", "probe", "echo"), "ms"),
+    **dict.fromkeys(("daemon then", "peak then"), "MB"),
+}
 
 
 def main() -> int:
