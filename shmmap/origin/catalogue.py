@@ -16,6 +16,7 @@ from shmmap.origin.cell_names import CellNames
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
+from shmmap.sparse_table import sparse_zeros
 
 __all__ = ["Catalogue", "common_directory"]
 
@@ -81,7 +82,7 @@ class Catalogue:
                 self._refuse_bad(boxes)
             self._index = SpatialIndex(boxes, made)
         self._stamps = stamps
-        self._versions = np.zeros(len(stamps), np.uint64)  # 0: not computed yet
+        self._versions = sparse_zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
         self._fixed_digest = 0
         self._map_version: int | None = None
@@ -161,8 +162,8 @@ class Catalogue:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the tables (names, boxes, stamps, index), without what is remembered of lookups."""
-        tables = (self.names, self.by_base, self._stamps, self._versions)
+        """Memory of the tables (names, boxes, stamps, index), without what is remembered of some cells."""
+        tables = (self.names, self.by_base, self._stamps)
         return sum(int(table.nbytes) for table in tables) + self._index.nbytes
 
     def id(self, index: int) -> str:
