@@ -24,6 +24,7 @@ Indices = NDArray[np.intp]
 
 # Stamps are hashed in blocks of this many cells, so that one changed stamp costs one block.
 _BLOCK_CELLS = 4096
+_HASHED_BYTES = 1 << 20
 
 
 class Catalogue:
@@ -84,7 +85,9 @@ class Catalogue:
         self._stamps = stamps
         self._versions = sparse_zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
-        self._fixed_digest = 0
+        self._fixed_digest: int | None = None
+        if before is not None and before.names is names and before.boxes is self.boxes:
+            self._fixed_digest = before._fixed_digest if before.id_prefix == id_prefix else None
         self._map_version: int | None = None
         self.problems = tuple(problems)
 
@@ -231,17 +234,23 @@ class Catalogue:
         version is the hash of *fixed* and every *block* as uint64.
         """
         if self._map_version is None:
+            if self._fixed_digest is None:
+                self._fixed_digest = self._digest_fixed()
             if self._block_digests is None:
-                fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
-                fixed.update(np.ascontiguousarray(self.names).view(np.uint8).data)
-                fixed.update(np.ascontiguousarray(self.boxes.T).data)
-                self._fixed_digest = fixed.intdigest()
                 blocks = range(-(-len(self) // _BLOCK_CELLS))
                 self._block_digests = np.array([self._digest_block(i) for i in blocks], dtype=np.uint64)
             self._map_version = xxh3_64_intdigest(
                 self._fixed_digest.to_bytes(8, "little") + self._block_digests.tobytes()
             )
         return self._map_version
+
+    def _digest_fixed(self) -> int:
+        fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
+        for table in (self.names, self.boxes.T):
+            parts = np.ascontiguousarray(table).reshape(-1).view(np.uint8)
+            for begin in range(0, len(parts), _HASHED_BYTES):  # others get the interpreter in between
+                fixed.update(parts[begin : begin + _HASHED_BYTES].data)
+        return fixed.intdigest()
 
     def _digest_block(self, block: int) -> int:
         cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]

@@ -44,6 +44,8 @@ _MAGIC: Final = b"SHMMAPCT"
 _VERSION: Final = 2
 _START: Final = struct.Struct("<8sIIQ")
 _BLOCK_BYTES: Final = 1 << 18
+_MOST_NAME_BYTES: Final = 1 << 16
+"""Many more than any path has."""
 _FLOAT64, _INT64, _INT32 = np.dtype("<f8"), np.dtype("<i8"), np.dtype("<i4")
 
 
@@ -115,7 +117,8 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
         """
         in_grids = [cells for _, cells in self.grids]
         if (
-            min(self.cells, self.name_bytes, self.by_base, *in_grids) < 0
+            min(self.cells, self.by_base, *in_grids) < 0
+            or not 0 < self.name_bytes <= _MOST_NAME_BYTES
             or self.by_base not in (0, self.cells)
             or sum(in_grids) not in (0, self.cells)
         ):
@@ -188,12 +191,10 @@ def read_catalogue(
     sizes = [dtype.itemsize * math.prod(shape) for dtype, shape in shapes]
     if size_bytes is not None and size_bytes != after_header + sum(size + _padding(size) for size in sizes):
         raise ValueError("its size contradicts its header")
-    old: list[NDArray[Any] | None] = [None] * len(
-        shapes
-    )  # stamps are not shared: they are corrected in place
-    if before is not None and before.id_prefix == header.prefix:
-        old[0] = before.names
+    # stamps are not shared: they are corrected in place
+    old: list[NDArray[Any] | None] = [None for _ in shapes]
     if before is not None:
+        old[0] = before.names if before.id_prefix == header.prefix else None
         old[1] = before.boxes.T
     names, boxes, stamps = (columns.take(*shapes[n], old[n]) for n in range(3))
     if before is not None:  # of the same names and boxes the same was made
