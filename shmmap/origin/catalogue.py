@@ -47,8 +47,9 @@ class Catalogue:
         Oddities found while reading the map, one sentence each, for the log and `shmmap status`.
     before
         An earlier state; what was made for its very ``names`` or ``boxes`` is used for them here, too.
-    by_base, made
-        What was made of the same names and boxes before: `CellNames.by_base` and `SpatialIndex.made`.
+    by_base, made, fixed_digest
+        What was made of the same names and boxes before: `CellNames.by_base`, `SpatialIndex.made` and
+        `fixed_digest`.
 
     Raises
     ------
@@ -69,6 +70,7 @@ class Catalogue:
         before: Catalogue | None = None,
         by_base: NDArray[np.int32] | None = None,
         made: MadeOfBoxes | None = None,
+        fixed_digest: int | None = None,
     ) -> None:
         self._names: CellNames
         self._index: SpatialIndex
@@ -85,9 +87,7 @@ class Catalogue:
         self._stamps = stamps
         self._versions = sparse_zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
-        self._fixed_digest: int | None = None
-        if before is not None and before.names is names and before.boxes is self.boxes:
-            self._fixed_digest = before._fixed_digest if before.id_prefix == id_prefix else None
+        self._fixed_digest = fixed_digest
         self._map_version: int | None = None
         self.problems = tuple(problems)
 
@@ -234,23 +234,25 @@ class Catalogue:
         version is the hash of *fixed* and every *block* as uint64.
         """
         if self._map_version is None:
-            if self._fixed_digest is None:
-                self._fixed_digest = self._digest_fixed()
             if self._block_digests is None:
                 blocks = range(-(-len(self) // _BLOCK_CELLS))
                 self._block_digests = np.array([self._digest_block(i) for i in blocks], dtype=np.uint64)
             self._map_version = xxh3_64_intdigest(
-                self._fixed_digest.to_bytes(8, "little") + self._block_digests.tobytes()
+                self.fixed_digest.to_bytes(8, "little") + self._block_digests.tobytes()
             )
         return self._map_version
 
-    def _digest_fixed(self) -> int:
-        fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
-        for table in (self.names, self.boxes.T):
-            parts = np.ascontiguousarray(table).reshape(-1).view(np.uint8)
-            for begin in range(0, len(parts), _HASHED_BYTES):  # others get the interpreter in between
-                fixed.update(parts[begin : begin + _HASHED_BYTES].data)
-        return fixed.intdigest()
+    @property
+    def fixed_digest(self) -> int:
+        """Hash of what never changes, *fixed* of `map_version`: equal where all names and boxes are equal."""
+        if self._fixed_digest is None:
+            fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
+            for table in (self.names, self.boxes.T):
+                parts = np.ascontiguousarray(table).reshape(-1).view(np.uint8)
+                for begin in range(0, len(parts), _HASHED_BYTES):  # others get the interpreter in between
+                    fixed.update(parts[begin : begin + _HASHED_BYTES].data)
+            self._fixed_digest = fixed.intdigest()
+        return self._fixed_digest
 
     def _digest_block(self, block: int) -> int:
         cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]

@@ -18,7 +18,8 @@ Zero bytes follow the header and each column to a multiple of 8.  The last two a
 of names and boxes: to sort them takes longer than to read everything.
 
 A reader takes one column after the other.  Names and boxes that are those of the map's state before are not
-kept a second time: of a million cells whose files have changed, a new state takes 24 bytes a cell.
+kept a second time: of a million cells whose files have changed, a new state takes 24 bytes a cell.  A reader
+that tells the digest of its names and boxes gets the stamps alone, if they are those that it has.
 """
 
 from __future__ import annotations
@@ -84,6 +85,10 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
         As in `Catalogue`.
     grids
         Where each grid lies, and how many cells it has; none of few cells.
+    fixed_digest
+        As in `Catalogue`.
+    stamps_only
+        The reader has names and boxes already: all columns but the stamps are left out.
     """
 
     key: str
@@ -96,9 +101,13 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
     bounds: tuple[float, float, float, float] | None
     mean_size: tuple[float, float]
     grids: list[tuple[GridFrame, int]]
+    fixed_digest: int
+    stamps_only: bool
 
     def columns(self) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
         """Type and shape of each column that follows."""
+        if self.stamps_only:
+            return [(_INT64, (self.cells, 3))]
         names = np.dtype(f"S{self.name_bytes}"), (self.cells,)
         found: list[tuple[np.dtype[Any], tuple[int, ...]]] = [
             names, (_FLOAT64, (4, self.cells)), (_INT64, (self.cells, 3)), (_INT32, (self.by_base,))
@@ -125,25 +134,38 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
             raise ValueError("its header makes no sense")
 
 
-def write_catalogue(file: IO[bytes], key: str, sources: Sequence[Source], catalogue: Catalogue) -> None:
-    """Write a catalogue, and what it was made from."""
-    names, made = np.ascontiguousarray(catalogue.names), catalogue.made_of_boxes
+def write_catalogue(
+    file: IO[bytes],
+    key: str,
+    sources: Sequence[Source],
+    catalogue: Catalogue,
+    known_digest: int | None = None,
+) -> None:
+    """Write a catalogue, and what it was made from.
+
+    ``known_digest`` is `Catalogue.fixed_digest` of what the reader has.
+    """
+    made, stamps_only = catalogue.made_of_boxes, catalogue.fixed_digest == known_digest
     header = msgspec.json.encode(
         Header(
             key=key,
             sources=list(sources),
             prefix=catalogue.id_prefix,
             cells=len(catalogue),
-            name_bytes=names.dtype.itemsize,
+            name_bytes=catalogue.names.dtype.itemsize,
             problems=list(catalogue.problems),
             by_base=len(catalogue.by_base),
             bounds=made.bounds,
             mean_size=made.mean_size,
             grids=[(grid.frame, len(grid.cells)) for grid in made.grids],
+            fixed_digest=catalogue.fixed_digest,
+            stamps_only=stamps_only,
         )
     )
-    columns: list[NDArray[Any]] = [names, catalogue.boxes.T, catalogue.stamps, catalogue.by_base]
-    columns += [column for grid in made.grids for column in (grid.keys, grid.cells)]
+    columns: list[NDArray[Any]] = [catalogue.stamps]
+    if not stamps_only:
+        columns = [catalogue.names, catalogue.boxes.T, catalogue.stamps, catalogue.by_base]
+        columns += [column for grid in made.grids for column in (grid.keys, grid.cells)]
     parts: list[bytes | memoryview] = [header, bytes(_padding(len(header)))]
     for column in columns:
         parts.append(np.ascontiguousarray(column).reshape(-1).view(np.uint8).data)
@@ -191,30 +213,32 @@ def read_catalogue(
     sizes = [dtype.itemsize * math.prod(shape) for dtype, shape in shapes]
     if size_bytes is not None and size_bytes != after_header + sum(size + _padding(size) for size in sizes):
         raise ValueError("its size contradicts its header")
-    # stamps are not shared: they are corrected in place
-    old: list[NDArray[Any] | None] = [None for _ in shapes]
-    if before is not None:
-        old[0] = before.names if before.id_prefix == header.prefix else None
-        old[1] = before.boxes.T
-    names, boxes, stamps = (columns.take(*shapes[n], old[n]) for n in range(3))
-    if before is not None:  # of the same names and boxes the same was made
-        old[3] = before.by_base if names is before.names else None
-        if boxes is old[1]:
-            old[4:] = [column for grid in before.made_of_boxes.grids for column in (grid.keys, grid.cells)]
-    rest = [columns.take(*shape, there) for shape, there in zip(shapes[3:], old[3:], strict=True)]
+    if header.stamps_only:
+        if before is None or before.fixed_digest != header.fixed_digest:
+            raise ValueError("it has stamps alone, of other cells")
+        made, by_base, names, boxes = before.made_of_boxes, before.by_base, before.names, before.boxes
+        stamps = columns.take(*shapes[0], None)
+    else:
+        # stamps are not shared: they are corrected in place
+        names = columns.take(*shapes[0], before.names if before is not None else None)
+        sides = columns.take(*shapes[1], there := before.boxes.T if before is not None else None)
+        stamps = columns.take(*shapes[2], None)
+        by_base, *grids = (columns.take(*shape, None) for shape in shapes[3:])
+        boxes = before.boxes if before is not None and sides is there else sides.T
+        frames = [frame for frame, _ in header.grids]
+        made = MadeOfBoxes(tuple(map(Grid, frames, grids[::2], grids[1::2])), header.bounds, header.mean_size)
     if columns.digest.intdigest() != digest:
         raise ValueError("its checksum is wrong")
-    frames = [frame for frame, _ in header.grids]
-    grids = tuple(map(Grid, frames, rest[1::2], rest[2::2]))
     return header, Catalogue(
         id_prefix=header.prefix,
         names=names,
-        boxes=before.boxes if before is not None and boxes is old[1] else boxes.T,
+        boxes=boxes,
         stamps=stamps,
         problems=header.problems,
         before=before,
-        by_base=rest[0],
-        made=MadeOfBoxes(grids, header.bounds, header.mean_size),
+        by_base=by_base,
+        made=made,
+        fixed_digest=header.fixed_digest,
     )
 
 

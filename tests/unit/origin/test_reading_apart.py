@@ -209,12 +209,16 @@ def test_bytes_of_a_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.BytesIO()
     write_catalogue(out, "key", (Source("/m", 0, 1, 2, 3),), Catalogue.from_cells(cells, ["odd"]))
     written = out.getvalue()
+    fixed = xxh3_64_intdigest(
+        b"shmmap map 1\0/m/\0" + b"".join(map(str.encode, names)) + np.array(boxes).T.tobytes()
+    )
     magic, version, header_bytes, digest = struct.unpack_from("<8sIIQ", written)
     assert (magic, version, digest) == (b"SHMMAPCT", 2, xxh3_64_intdigest(written[24:]))
     assert json.loads(written[24 : 24 + header_bytes]) == {
         "key": "key", "sources": [["/m", 0, 1, 2, 3]], "prefix": "/m/", "cells": 3, "name_bytes": 9,
         "problems": ["odd"], "by_base": 3, "bounds": [0, -20, 40, 45], "mean_size": [15, 15],
         "grids": [[[0, 40, 5, 5, 5, 5, 1, 1], 1], [[0, -20, 20, 20, 20, 20, 2, 2], 2]],
+        "fixed_digest": fixed, "stamps_only": False,
     }  # fmt: skip
     rest = written[24 + -(-header_bytes // 8) * 8 :]
     assert rest[:32] == b"a/two.pcdb/one.pcdb/two.pcd\0\0\0\0\0"
@@ -225,6 +229,26 @@ def test_bytes_of_a_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.frombuffer(rest, "<i8", 2, 232).tolist() == [1, 1 << 32]
     assert np.frombuffer(rest, "<i4", 2, 248).tolist() == [1, 0]
     assert len(rest) == 256
+
+
+def test_who_has_names_and_boxes_gets_the_stamps_alone() -> None:
+    before, other = many(1_000_000), many(1_000_000, 5.0)
+    after = many(1_000_000)
+    after.set_stamp(CELLS - 1, before.stamp(0))
+    whole, short = io.BytesIO(), io.BytesIO()
+    write_catalogue(whole, "", (), after, other.fixed_digest)
+    write_catalogue(short, "", (), after, before.fixed_digest)
+    assert len(short.getvalue()) < CELLS * 24 + 1024 < len(whole.getvalue())
+    found = [read_catalogue(io.BytesIO(out.getvalue()), before=before)[1] for out in (whole, short)]
+    for one in found:
+        assert one.names is before.names
+        assert one.boxes is before.boxes
+        assert one.map_version == after.map_version != before.map_version
+        assert compare(before, one).changed.tolist() == [CELLS - 1]
+        assert one.query(Circle(505.0, 505.0, 1.0))[0].tolist() == [25 * 500 + 25]
+    for without in (None, other):
+        with pytest.raises(ValueError, match="stamps alone, of other cells"):
+            read_catalogue(io.BytesIO(short.getvalue()), len(short.getvalue()), without)
 
 
 CELLS = 200_000
