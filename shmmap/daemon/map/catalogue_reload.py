@@ -107,8 +107,8 @@ class Reloader:
         if result is not None:
             for answer in asked:
                 answer(result)
-        if isinstance(result, Reread):
-            give_back_apart(result.change.old, result.change.new)
+        if isinstance(result, Reread) and self._served() is result.catalogue:
+            give_back_apart(result.change.old, result.catalogue)
         if self._next and not self._asked:
             self._begin()
 

@@ -15,6 +15,7 @@ import mmap
 import threading
 from typing import Any, Final
 
+import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.origin.catalogue_change import Tables
@@ -39,10 +40,9 @@ def give_back(old: Tables, new: Tables) -> None:
 
     They read as zeros from then on.
     """
-    if old.stamps is not new.stamps:
-        _give_back(old.stamps)
-    if old.boxes is not new.boxes:
-        _give_back(old.boxes)
+    for table, now in ((old.stamps, new.stamps), (old.boxes, new.boxes)):
+        if not np.may_share_memory(table, now):
+            _give_back(table)
 
 
 def _give_back(table: NDArray[Any]) -> None:

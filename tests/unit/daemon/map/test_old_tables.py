@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 import mmap
+import select
+import threading
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.map.old_tables import give_back
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_change import Tables
 
 CELLS = 1 << 18
 
@@ -56,6 +62,48 @@ def test_boxes_go_with_them_where_the_map_has_others() -> None:
 
 
 def test_the_state_that_is_served_is_left_alone() -> None:
+    """Also where it has the same memory as another array."""
     one = state()
     give_back(one, one)
+    same = Catalogue(id_prefix="/m/", names=one.names, boxes=one.boxes[:], stamps=one.stamps[:])
+    give_back(one, same)
     assert np.all(one.stamps == 1)
+    assert np.all(one.boxes[:, 3] == 20.0)
+
+
+def collected(reloader: Reloader, served: list[CatalogueView], *, takes_over: bool) -> None:
+    """Have the map read again, and do what the loop does; wait until the threads of it have ended."""
+    reloader.ask(lambda _: None)
+    assert select.select([reloader.fd], [], [], 60.0)[0]
+
+    def apply(found: Reread) -> None:
+        if takes_over:
+            served[0] = found.catalogue
+
+    reloader.collect(apply, lambda _: None)
+    for thread in threading.enumerate():
+        if thread.name == "giving back":
+            thread.join(60.0)
+
+
+@pytest.mark.parametrize("takes_over", [True, False])
+def test_a_reload_gives_back_what_is_served_no_more(takes_over: bool) -> None:
+    old = state()
+    served: list[CatalogueView] = [old]
+
+    class Origin:
+        path = "/m"
+
+        def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
+            assert fresh
+            assert before is old
+            return state(old)
+
+    reloader = Reloader(Origin(), lambda: served[0])
+    try:
+        collected(reloader, served, takes_over=takes_over)
+    finally:
+        reloader.close()
+    left = np.count_nonzero(old.stamps)  # parts of pages at the ends may stay
+    assert left < 1024 if takes_over else left == old.stamps.size
+    assert np.all(served[0].stamps == 1)
