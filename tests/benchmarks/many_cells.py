@@ -22,6 +22,8 @@ longest turn    of the serving loop in all of that: processor time, as the daemo
 reload          until a change of ten cells is served
 turn in it      the longest turn then
 probe, echo     the longest that another client waited for warm cells then, and the client of a bare echo
+same work       most processor time that 0.4 ms of work, always the same, took in a process beside it then:
+                how much the machine itself slowed everybody
 daemon then     resident memory after the reload, with 2000 cells from everywhere in memory, and the most ever
 
 Exit code 1 if a limit does not hold; printed beside the table.
@@ -45,7 +47,7 @@ import numpy as np
 import shmmap
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.catalogue import run_measure
-from tests.benchmarks.hostile.actors import Actor
+from tests.benchmarks.hostile.actors import Actor, Orders
 from tests.benchmarks.hostile.beside import OVER_ECHO_MS, Beside
 from tests.benchmarks.hostile.files import reloads
 from tests.benchmarks.hostile.report import Report
@@ -153,6 +155,16 @@ def measure_requests(one: DaemonProcess, side: int, row: dict[str, float], *, wh
             row["whole list"] = median_s(lambda: len(listing.metadata()), 1)
 
 
+def works(orders: Orders) -> float:
+    """Do the same work every 5 ms; returns the most processor time that it took, seconds."""
+    longest_s = 0.0
+    while orders.go_on(0.005):
+        begin_s = time.thread_time()
+        sum(range(20_000))
+        longest_s = max(longest_s, time.thread_time() - begin_s)
+    return longest_s
+
+
 def measure_reload(
     one: DaemonProcess, side: int, changed: list[Path], told: Report, row: dict[str, float]
 ) -> None:
@@ -162,7 +174,10 @@ def measure_reload(
     with RawClient(one.endpoint, timeout=120.0) as client:
         for begin in range(0, LOADED, 500):
             client.selected(names[begin : begin + 500], wait=60.0)
-    with Beside(told, one, newcomers_too=False, over_idle_mib=STATE_MIB) as beside:
+    with (
+        Beside(told, one, newcomers_too=False, over_idle_mib=STATE_MIB) as beside,
+        Actor(works, is_bystander=True) as worker,
+    ):
         time.sleep(1.0)
         for path in changed:
             os.utime(path)
@@ -170,6 +185,7 @@ def measure_reload(
             took_s, failure = operator.said(FIRST_START_S)
         told.must("the reload was answered", not failure, failure)
         row["reload"] = took_s
+        row["same work"] = worker.end() * 1e3
         row["turn in it"] = beside.turns.quantile_and_longest_ms(1.0)[1]
     events = read_statistics(one.instance, one.shm_dir)
     told.must("there was one", events.counters["reloads"] == 1)
@@ -214,7 +230,7 @@ UNITS: Final = {
     **dict.fromkeys(("ls", "map", "map, all", "status"), "s"),
     "longest turn": "ms",
     "reload": "s",
-    **dict.fromkeys(("turn in it", "probe", "echo"), "ms"),
+    **dict.fromkeys(("turn in it", "same work", "probe", "echo"), "ms"),
     **dict.fromkeys(("daemon then", "peak then"), "MB"),
 }
 
