@@ -7,6 +7,7 @@ ready.  ``EXTEND_TIMEOUT_USEC`` (sd_notify(3)) asks for more.
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -42,7 +43,11 @@ class MoreTime:
         self._thread = threading.Thread(target=self._ask, name="more time", daemon=True)
 
     def __enter__(self) -> MoreTime:
-        self._thread.start()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        try:
+            self._thread.start()  # signals are for who reads the map: a stop must interrupt that
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return self
 
     def __exit__(
