@@ -267,8 +267,10 @@ class Client(OperatorRequests):
 
     # --- the map ------------------------------------------------------------------------------------
 
-    def metadata(self, area: geometry.Area | None = None, *, since: int | None = None) -> MapListing:
-        """List the map's cells, loaded or not.
+    def metadata(
+        self, area: geometry.Area | None = None, *, since: int | None = None, most: int | None = None
+    ) -> MapListing:
+        """List the map's cells, loaded or not.  A hundred thousand take half a second.
 
         Parameters
         ----------
@@ -277,10 +279,12 @@ class Client(OperatorRequests):
         since
             Only what changed after this map version, if the daemon still knows it
             (`MapListing.since_known`).
+        most
+            If there are more, some of them are enough: more than so many, the first ones.
         """
         from shmmap.client.map_listing import list_cells  # most clients never ask
 
-        return list_cells(self._session, area, since)
+        return list_cells(self._session, area, since, most=most)
 
 
 def connect(

@@ -114,7 +114,11 @@ class MapListing(Sequence[CellInfo]):
 
 
 def list_cells(
-    session: Session, area: geometry.Area | None, since: int | None, timeout_s: float | None = None
+    session: Session,
+    area: geometry.Area | None,
+    since: int | None,
+    timeout_s: float | None = None,
+    most: int | None = None,
 ) -> MapListing:
     """Ask for all pages of the daemon's list; see `shmmap.Client.metadata`.
 
@@ -143,7 +147,7 @@ def list_cells(
             elif page.map_version != listing.map_version:
                 break  # a reload came in between: pages of two states do not fit together
             listing.add(page.rows)
-            start = page.next
+            start = page.next if most is None or len(listing) <= most else None
         else:
             assert listing is not None  # noqa: S101  the loop ran at least once
             return listing

@@ -12,7 +12,8 @@ from shmmap.protocol import messages
 __all__ = ["OperatorRequests", "several"]
 
 RELOAD_S: Final = 60.0
-"""How long reading a map's catalogue may take, beside what any request may."""
+RELOAD_CELL_S: Final = 60e-6
+"""How long reading a map's catalogue may take, in all and for each cell, beside what any request may."""
 
 
 class OperatorRequests:
@@ -36,14 +37,18 @@ class OperatorRequests:
         return self._session.ask(lambda n: messages.Show(n, cell), messages.ShownCell)
 
     def reload(self) -> messages.Reloaded:
-        """Have the daemon read the map's directory again, which may take a minute more than other requests.
+        """Have the daemon read the map's directory again.
+
+        That may take a minute more than other requests, and another one for every million cells: all files
+        are looked at.
 
         Raises
         ------
         NotPermitted
             The daemon lets only administrators do this.
         """
-        return self._session.ask(messages.Reload, messages.Reloaded, quiet_s=RELOAD_S)
+        most_s = RELOAD_S + RELOAD_CELL_S * self._session.welcome.cells
+        return self._session.ask(messages.Reload, messages.Reloaded, quiet_s=most_s)
 
     def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
         """Have the daemon drop cells, all by default; those in use are freed when they are let go.

@@ -52,6 +52,7 @@ from shmmap.daemon.prerequisites import (
     raise_descriptor_limit,
 )
 from shmmap.daemon.requests.operators.authorization import Authorization
+from shmmap.daemon.service_manager.more_time import MoreTime
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
@@ -126,7 +127,8 @@ def run(config: DaemonConfig) -> int:
             step("daemon.lock")
             stack.push(partial(stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()
-        catalogue = origin.load()
+        with MoreTime(notify, "reading the map"):
+            catalogue = origin.load()
         for problem in catalogue.problems:
             log.warning("problem in the map", what=problem)
         with signals.held():

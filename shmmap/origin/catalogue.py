@@ -13,9 +13,10 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.cell_names import CellNames
-from shmmap.origin.spatial_index import SpatialIndex
+from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
+from shmmap.sparse_table import sparse_zeros
 
 __all__ = ["Catalogue", "common_directory"]
 
@@ -23,6 +24,7 @@ Indices = NDArray[np.intp]
 
 # Stamps are hashed in blocks of this many cells, so that one changed stamp costs one block.
 _BLOCK_CELLS = 4096
+_HASHED_BYTES = 1 << 20
 
 
 class Catalogue:
@@ -45,6 +47,9 @@ class Catalogue:
         Oddities found while reading the map, one sentence each, for the log and `shmmap status`.
     before
         An earlier state; what was made for its very ``names`` or ``boxes`` is used for them here, too.
+    by_base, made, fixed_digest
+        What was made of the same names and boxes before: `CellNames.by_base`, `SpatialIndex.made` and
+        `fixed_digest`.
 
     Raises
     ------
@@ -63,22 +68,26 @@ class Catalogue:
         stamps: NDArray[np.int64],
         problems: Sequence[str] = (),
         before: Catalogue | None = None,
+        by_base: NDArray[np.int32] | None = None,
+        made: MadeOfBoxes | None = None,
+        fixed_digest: int | None = None,
     ) -> None:
         self._names: CellNames
         self._index: SpatialIndex
         if before is not None and before.names is names and before.id_prefix == id_prefix:
             self._names = before._names
         else:
-            self._names = CellNames(id_prefix, names)
+            self._names = CellNames(id_prefix, names, by_base)
         if before is not None and before.boxes is boxes:
             self._index = before._index
         else:
-            self._refuse_bad(boxes)
-            self._index = SpatialIndex(boxes)
+            if made is None:
+                self._refuse_bad(boxes)
+            self._index = SpatialIndex(boxes, made)
         self._stamps = stamps
-        self._versions = np.zeros(len(stamps), np.uint64)  # 0: not computed yet
+        self._versions = sparse_zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
-        self._fixed_digest = 0
+        self._fixed_digest = fixed_digest
         self._map_version: int | None = None
         self.problems = tuple(problems)
 
@@ -132,12 +141,12 @@ class Catalogue:
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
         """Box around all cells, metres, map frame; None where there are none."""
-        return self._index.bounds
+        return self._index.made.bounds
 
     @property
     def mean_size(self) -> tuple[float, float]:
         """Mean extent of the cells along x and y, metres."""
-        return self._index.mean_size
+        return self._index.made.mean_size
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -145,9 +154,20 @@ class Catalogue:
         return self._stamps
 
     @property
+    def by_base(self) -> NDArray[np.int32]:
+        """In which order base names ascend, see `shmmap.origin.cell_names.order_by_base`; do not write."""
+        return self._names.by_base
+
+    @property
+    def made_of_boxes(self) -> MadeOfBoxes:
+        """What areas are looked up in."""
+        return self._index.made
+
+    @property
     def nbytes(self) -> int:
-        """Memory of the tables (names, boxes, stamps, index), without lazily built lookups."""
-        return int(self.names.nbytes + self._stamps.nbytes + self._versions.nbytes) + self._index.nbytes
+        """Memory of the tables (names, boxes, stamps, index), without what is remembered of some cells."""
+        tables = (self.names, self.by_base, self._stamps)
+        return sum(int(table.nbytes) for table in tables) + self._index.nbytes
 
     def id(self, index: int) -> str:
         """Id of a cell: the absolute path of its file."""
@@ -215,16 +235,24 @@ class Catalogue:
         """
         if self._map_version is None:
             if self._block_digests is None:
-                fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
-                fixed.update(np.ascontiguousarray(self.names).view(np.uint8).data)
-                fixed.update(np.ascontiguousarray(self.boxes.T).data)
-                self._fixed_digest = fixed.intdigest()
                 blocks = range(-(-len(self) // _BLOCK_CELLS))
                 self._block_digests = np.array([self._digest_block(i) for i in blocks], dtype=np.uint64)
             self._map_version = xxh3_64_intdigest(
-                self._fixed_digest.to_bytes(8, "little") + self._block_digests.tobytes()
+                self.fixed_digest.to_bytes(8, "little") + self._block_digests.tobytes()
             )
         return self._map_version
+
+    @property
+    def fixed_digest(self) -> int:
+        """Hash of what never changes, *fixed* of `map_version`: equal where all names and boxes are equal."""
+        if self._fixed_digest is None:
+            fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
+            for table in (self.names, self.boxes.T):
+                parts = np.ascontiguousarray(table).reshape(-1).view(np.uint8)
+                for begin in range(0, len(parts), _HASHED_BYTES):  # others get the interpreter in between
+                    fixed.update(parts[begin : begin + _HASHED_BYTES].data)
+            self._fixed_digest = fixed.intdigest()
+        return self._fixed_digest
 
     def _digest_block(self, block: int) -> int:
         cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]

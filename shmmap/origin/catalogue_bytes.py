@@ -4,16 +4,22 @@
 Layout, little-endian::
 
     0   8 bytes   magic "SHMMAPCT"
-    8   uint32    version of this layout, 1
+    8   uint32    version of this layout, 2
     12  uint32    bytes of the header
     16  uint64    XXH3 (64 bit) of everything after this field
-    24  header    JSON: key, sources, prefix, cells, name_bytes, problems; then zero bytes to a multiple of 8
-    ..  names     cells x name_bytes, zero padded; then zero bytes to a multiple of 8
+    24  header    JSON, see `Header`
+    ..  names     cells x name_bytes, zero padded
     ..  boxes     float64: all min_x, all min_y, all max_x, all max_y
     ..  stamps    int64: size, mtime_ns, ctime_ns of each cell
+    ..  by_base   int32, as many as the header says: `shmmap.origin.cell_names.order_by_base`
+    ..  grids     of each grid of the header: keys, int64; cells, int32 (`shmmap.origin.spatial_index.Grid`)
+
+Zero bytes follow the header and each column to a multiple of 8.  The last two are what a catalogue would make
+of names and boxes: to sort them takes longer than to read everything.
 
 A reader takes one column after the other.  Names and boxes that are those of the map's state before are not
-kept a second time: of a million cells whose files have changed, a new state takes 24 bytes a cell.
+kept a second time: of a million cells whose files have changed, a new state takes 24 bytes a cell.  A reader
+that tells the digest of its names and boxes gets the stamps alone, if they are those that it has.
 """
 
 from __future__ import annotations
@@ -31,13 +37,17 @@ from numpy.typing import NDArray
 from xxhash import xxh3_64
 
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.spatial_index import Grid, GridFrame, MadeOfBoxes
 
 __all__ = ["Header", "Source", "read_catalogue", "write_catalogue"]
 
 _MAGIC: Final = b"SHMMAPCT"
-_VERSION: Final = 1
+_VERSION: Final = 2
 _START: Final = struct.Struct("<8sIIQ")
 _BLOCK_BYTES: Final = 1 << 18
+_MOST_NAME_BYTES: Final = 1 << 16
+"""Many more than any path has."""
+_FLOAT64, _INT64, _INT32 = np.dtype("<f8"), np.dtype("<i8"), np.dtype("<i4")
 
 
 class Source(msgspec.Struct, frozen=True, array_like=True):
@@ -69,6 +79,16 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
         As in `Catalogue`.
     cells, name_bytes
         How many cells; how many bytes the longest name has.
+    by_base
+        How many entries that column has: none, or one a cell.
+    bounds, mean_size
+        As in `Catalogue`.
+    grids
+        Where each grid lies, and how many cells it has; none of few cells.
+    fixed_digest
+        As in `Catalogue`.
+    stamps_only
+        The reader has names and boxes already: all columns but the stamps are left out.
     """
 
     key: str
@@ -77,28 +97,79 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
     cells: int
     name_bytes: int
     problems: list[str]
+    by_base: int
+    bounds: tuple[float, float, float, float] | None
+    mean_size: tuple[float, float]
+    grids: list[tuple[GridFrame, int]]
+    fixed_digest: int
+    stamps_only: bool
+
+    def columns(self) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
+        """Type and shape of each column that follows."""
+        if self.stamps_only:
+            return [(_INT64, (self.cells, 3))]
+        names = np.dtype(f"S{self.name_bytes}"), (self.cells,)
+        found: list[tuple[np.dtype[Any], tuple[int, ...]]] = [
+            names, (_FLOAT64, (4, self.cells)), (_INT64, (self.cells, 3)), (_INT32, (self.by_base,))
+        ]  # fmt: skip
+        for _, cells in self.grids:
+            found += [(_INT64, (cells,)), (_INT32, (cells,))]
+        return found
+
+    def check(self) -> None:
+        """Refuse what no catalogue has.
+
+        Raises
+        ------
+        ValueError
+            It makes no sense.
+        """
+        in_grids = [cells for _, cells in self.grids]
+        if (
+            min(self.cells, self.by_base, *in_grids) < 0
+            or not 0 < self.name_bytes <= _MOST_NAME_BYTES
+            or self.by_base not in (0, self.cells)
+            or sum(in_grids) not in (0, self.cells)
+        ):
+            raise ValueError("its header makes no sense")
 
 
-def write_catalogue(file: IO[bytes], key: str, sources: Sequence[Source], catalogue: Catalogue) -> None:
-    """Write a catalogue, and what it was made from."""
-    names = np.ascontiguousarray(catalogue.names)
+def write_catalogue(
+    file: IO[bytes],
+    key: str,
+    sources: Sequence[Source],
+    catalogue: Catalogue,
+    known_digest: int | None = None,
+) -> None:
+    """Write a catalogue, and what it was made from.
+
+    ``known_digest`` is `Catalogue.fixed_digest` of what the reader has.
+    """
+    made, stamps_only = catalogue.made_of_boxes, catalogue.fixed_digest == known_digest
     header = msgspec.json.encode(
         Header(
             key=key,
             sources=list(sources),
             prefix=catalogue.id_prefix,
             cells=len(catalogue),
-            name_bytes=names.dtype.itemsize,
+            name_bytes=catalogue.names.dtype.itemsize,
             problems=list(catalogue.problems),
+            by_base=len(catalogue.by_base),
+            bounds=made.bounds,
+            mean_size=made.mean_size,
+            grids=[(grid.frame, len(grid.cells)) for grid in made.grids],
+            fixed_digest=catalogue.fixed_digest,
+            stamps_only=stamps_only,
         )
     )
-    parts: list[bytes | memoryview] = [
-        header.ljust(_padded(len(header)), b"\0"),
-        names.view(np.uint8).data,
-        bytes(_padded(names.nbytes) - names.nbytes),
-        np.ascontiguousarray(catalogue.boxes.T).data,
-        np.ascontiguousarray(catalogue.stamps).data,
-    ]
+    columns: list[NDArray[Any]] = [catalogue.stamps]
+    if not stamps_only:
+        columns = [catalogue.names, catalogue.boxes.T, catalogue.stamps, catalogue.by_base]
+        columns += [column for grid in made.grids for column in (grid.keys, grid.cells)]
+    parts: list[bytes | memoryview] = [header, bytes(_padding(len(header)))]
+    for column in columns:
+        parts.append(np.ascontiguousarray(column).reshape(-1).view(np.uint8).data)
+        parts.append(bytes(_padding(column.nbytes)))
     digest = xxh3_64()
     for part in parts:
         digest.update(part)
@@ -131,34 +202,43 @@ def read_catalogue(
     if magic != _MAGIC or version != _VERSION:
         raise ValueError("its magic or version is another")
     columns.digest.reset()
-    after_header = _START.size + _padded(header_bytes)
+    after_header = _START.size + header_bytes + _padding(header_bytes)
     if size_bytes is not None and size_bytes < after_header:
         raise ValueError("it is truncated")
-    written = memoryview(bytearray(_padded(header_bytes)))
+    written = memoryview(bytearray(after_header - _START.size))
     columns.fill(written)
     header = msgspec.json.decode(written[:header_bytes], type=Header)
-    cells, name_bytes = header.cells, header.name_bytes
-    if min(cells, name_bytes) < 0:
-        raise ValueError("its header makes no sense")
-    if size_bytes is not None and size_bytes != after_header + _padded(cells * name_bytes) + cells * (
-        32 + 24
-    ):
+    header.check()
+    shapes = header.columns()
+    sizes = [dtype.itemsize * math.prod(shape) for dtype, shape in shapes]
+    if size_bytes is not None and size_bytes != after_header + sum(size + _padding(size) for size in sizes):
         raise ValueError("its size contradicts its header")
-    old_names = before.names if before is not None and before.id_prefix == header.prefix else None
-    old_boxes = before.boxes.T if before is not None else None
-    names = columns.take(np.dtype(f"S{name_bytes}"), (cells,), old_names)
-    columns.fill(memoryview(bytearray(_padded(cells * name_bytes) - cells * name_bytes)))
-    boxes = columns.take(np.dtype(np.float64), (4, cells), old_boxes)
-    stamps = columns.take(np.dtype(np.int64), (cells, 3), None)  # not shared: they are corrected in place
+    if header.stamps_only:
+        if before is None or before.fixed_digest != header.fixed_digest:
+            raise ValueError("it has stamps alone, of other cells")
+        made, by_base, names, boxes = before.made_of_boxes, before.by_base, before.names, before.boxes
+        stamps = columns.take(*shapes[0], None)
+    else:
+        # stamps are not shared: they are corrected in place
+        names = columns.take(*shapes[0], before.names if before is not None else None)
+        sides = columns.take(*shapes[1], there := before.boxes.T if before is not None else None)
+        stamps = columns.take(*shapes[2], None)
+        by_base, *grids = (columns.take(*shape, None) for shape in shapes[3:])
+        boxes = before.boxes if before is not None and sides is there else sides.T
+        frames = [frame for frame, _ in header.grids]
+        made = MadeOfBoxes(tuple(map(Grid, frames, grids[::2], grids[1::2])), header.bounds, header.mean_size)
     if columns.digest.intdigest() != digest:
         raise ValueError("its checksum is wrong")
     return header, Catalogue(
         id_prefix=header.prefix,
         names=names,
-        boxes=before.boxes if before is not None and boxes is old_boxes else boxes.T,
+        boxes=boxes,
         stamps=stamps,
         problems=header.problems,
         before=before,
+        by_base=by_base,
+        made=made,
+        fixed_digest=header.fixed_digest,
     )
 
 
@@ -193,12 +273,18 @@ class _Columns:
                     column[:done], column[done : done + len(part)] = old[:done], part
                 done += len(part)
             if column is None:
+                self._pass_padding(size)
                 return before
         else:
             column = np.empty(size, np.uint8)
         self.fill(column[done:].data)
+        self._pass_padding(size)
         return column.view(dtype).reshape(shape)
 
+    def _pass_padding(self, size: int) -> None:
+        self.fill(memoryview(bytearray(_padding(size))))
 
-def _padded(size: int) -> int:
-    return -(-size // 8) * 8
+
+def _padding(size: int) -> int:
+    """Zero bytes from an end to the next multiple of 8."""
+    return -size % 8

@@ -8,19 +8,23 @@ byte order, which is the order of a C++ ``std::map<std::string, ...>`` and hence
 from __future__ import annotations
 
 import os
+from bisect import bisect_left, bisect_right
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["CellNames"]
+__all__ = ["CellNames", "base_names", "order_by_base"]
 
 Names = NDArray[np.bytes_]
 
 # Lookups remembered; a differential request asks for the same few hundred ids every time.
 _REMEMBERED = 1 << 16
 _NAMED_IN_ERRORS = 3
+
+# Names that are Python objects at the same time; ten million would take a gigabyte.
+_BLOCK_NAMES = 1 << 15
 
 
 class CellNames:
@@ -32,15 +36,17 @@ class CellNames:
         What every id starts with, ending in "/" (or empty when there are no cells).
     names
         (N,) bytes, ascending and unique.
+    by_base
+        (M,) int32, what `order_by_base` returned for them; None: it is found now.
     """
 
-    def __init__(self, prefix: str, names: Names) -> None:
+    def __init__(self, prefix: str, names: Names, by_base: NDArray[np.int32] | None = None) -> None:
         if len(names) > 1 and not bool((names[:-1] < names[1:]).all()):
             raise ValueError("cell names must be ascending and unique")
         self.prefix = prefix
         self.names = names
+        self.by_base = order_by_base(names) if by_base is None else by_base
         self._known: dict[str, int] = {}
-        self._by_base: tuple[Names, NDArray[np.intp]] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -82,36 +88,62 @@ class CellNames:
         return found.start if found else None
 
     def _find_base(self, wanted: str) -> int | None:
-        bases, order = self._bases()
-        found = _positions(bases, wanted)
-        if len(found) > 1:
-            some = ", ".join(self.ids(np.sort(order[found.start : found.stop])[:_NAMED_IN_ERRORS]))
-            more = ", ..." if len(found) > _NAMED_IN_ERRORS else ""
+        key, order = _encoded(wanted), self.by_base
+        if key is None or not len(order):
+            return None
+        # not a table of its own: of ten million names it would take 200 MB
+        places = range(len(order))
+        first = bisect_left(places, key, key=self._base)
+        last = bisect_right(places, key, lo=first, key=self._base)
+        if last - first > 1:
+            some = ", ".join(self.ids(order[first:last][:_NAMED_IN_ERRORS].astype(np.intp)))
+            more = ", ..." if last - first > _NAMED_IN_ERRORS else ""
             raise BadRequest(
-                f"{len(found)} cells are called {wanted}: {some}{more}", hint="give the full path of one"
+                f"{last - first} cells are called {wanted}: {some}{more}", hint="give the full path of one"
             )
-        return int(order[found.start]) if found else None
+        return int(order[first]) if last > first else None
 
-    def _bases(self) -> tuple[Names, NDArray[np.intp]]:
-        """Base names in ascending order, and whose they are; made at the first use."""
-        if self._by_base is None:
-            if len(self.names) and int(np.char.find(self.names, b"/").max()) < 0:
-                self._by_base = self.names, np.arange(len(self.names))
-            else:
-                bases = np.array([name.rpartition(b"/")[2] for name in self.names.tolist()], dtype=np.bytes_)
-                order = np.argsort(bases, kind="stable")
-                self._by_base = bases[order], order
-        return self._by_base
+    def _base(self, place: int) -> bytes:
+        """Base name at a place in the order of base names."""
+        return bytes(self.names[self.by_base[place]]).rpartition(b"/")[2]
+
+
+def base_names(names: Names) -> Names:
+    """Return what follows the last "/" in each name; ``names`` itself if there is none in any."""
+    if not len(names) or int(np.char.find(names, b"/").max()) < 0:
+        return names
+    blocks = []
+    for begin in range(0, len(names), _BLOCK_NAMES):
+        some = names[begin : begin + _BLOCK_NAMES].tolist()
+        blocks.append(np.array([name.rpartition(b"/")[2] for name in some], dtype=np.bytes_))
+    return np.concatenate(blocks)
+
+
+def order_by_base(names: Names) -> NDArray[np.int32]:
+    """Return in which order the base names ascend, those that are equal in that of ``names``.
+
+    Empty if no name has a "/": each is its own base name.
+    """
+    bases = base_names(names)
+    if bases is names:
+        return np.empty(0, np.int32)
+    return np.argsort(bases, kind="stable").astype(np.int32)
+
+
+def _encoded(wanted: str) -> bytes | None:
+    """A name as the tables have it; None if no file is called that."""
+    try:
+        key = os.fsencode(wanted)
+    except UnicodeEncodeError:
+        return None
+    return None if b"\0" in key else key
 
 
 def _positions(names: Names, wanted: str) -> range:
     """Where ``wanted`` stands in ascending ``names``."""
-    try:
-        key = os.fsencode(wanted)
-    except UnicodeEncodeError:
-        return range(0)
+    key = _encoded(wanted)
     # numpy pads with zero bytes, and would widen the whole table to compare it with a longer key
-    if len(key) > names.dtype.itemsize or b"\0" in key:
+    if key is None or len(key) > names.dtype.itemsize:
         return range(0)
     exact = np.array(key, dtype=names.dtype)
     return range(int(names.searchsorted(exact)), int(names.searchsorted(exact, side="right")))

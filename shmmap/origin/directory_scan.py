@@ -117,7 +117,9 @@ def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
         if recursive:
             pending.extend(inner)
     found.pack()
-    names, first = np.unique(np.concatenate(found.blocks), return_index=True)
+    names = np.concatenate(found.blocks)
+    found.blocks.clear()
+    names, first = np.unique(names, return_index=True)
     stamps = np.frombuffer(found.stamps, dtype=np.int64).reshape(-1, 3)[first]
     reports = tuple(f"{what}: {list_some(sorted(paths))}" for what, paths in problems.items())
     return ScannedFiles(prefix, names, stamps, directories, reports)

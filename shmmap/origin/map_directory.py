@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import Source
 from shmmap.origin.catalogue_change import Tables
+from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
 from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
 from shmmap.origin.metadata_entries import MapMetadata, list_some
@@ -145,6 +145,7 @@ class MapDirectory:
         if layout.metadata is None:
             return _without_metadata(files)
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
+        del data  # of ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
         if len(catalogue) >= self.cached_from_cells and all(os.path.isdir(root) for root in layout.roots):
             sources += [Source.of(path, status) for path, status in files.directories.items()]
@@ -176,7 +177,7 @@ def _joined(
     """Match entries with files by base name, as Autoware does."""
     if not len(entries.names):
         raise MapDataError("it lists no cells", path=metadata, cause="no_cells")
-    bases = _base_names(files.names)
+    bases = base_names(files.names)
     order = np.argsort(entries.names, kind="stable")
     ascending = entries.names[order]
     at = np.minimum(ascending.searchsorted(bases), len(ascending) - 1)
@@ -194,25 +195,21 @@ def _joined(
                 cause="missing_files",
             )
         problems.append(f"{metadata}: entries whose file is missing, not served: {listed}")
-    names = files.names[has_entry]
+    names, stamps = files.names, files.stamps
     if not has_entry.all():
+        names, stamps = names[has_entry], stamps[has_entry]
         listed = list_some([os.fsdecode(name) for name in files.names[~has_entry].tolist()])
         problems.append(f"{metadata}: files without an entry, not served: {listed}")
     if len(names) > len(entries.names) - int(lacks_file.sum()):
         problems.append("some base names stand for several files, all served with the same box")
-    lower = entries.corners[entry]
-    upper = lower + np.array((entries.x_resolution, entries.y_resolution))
+    sides = np.empty((4, len(entry)))
+    sides[:2] = entries.corners[entry].T
+    sides[2:] = sides[:2] + np.array([[entries.x_resolution], [entries.y_resolution]])
     return Catalogue(
         id_prefix=files.prefix,
         # as narrow as the longest: the catalogue's version covers the padded table
         names=names.astype(f"S{int(np.char.str_len(names).max())}", copy=False),
-        boxes=np.hstack((lower, upper)),
-        stamps=files.stamps[has_entry],
+        boxes=sides.T,
+        stamps=stamps,
         problems=problems,
     )
-
-
-def _base_names(names: NDArray[np.bytes_]) -> NDArray[np.bytes_]:
-    if int(np.char.find(names, b"/").max()) < 0:
-        return names
-    return np.array([name.rpartition(b"/")[2] for name in names.tolist()], dtype=np.bytes_)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from typing import IO, cast
+from typing import IO, Final, cast
 
 import msgspec
 
@@ -22,6 +22,9 @@ from shmmap.origin.catalogue_bytes import read_catalogue
 from shmmap.processes.start_child import how_ended
 
 __all__ = ["Outcome", "read_apart"]
+
+_PIPE_BYTES: Final = 1 << 20
+"""As much as every user may have: who reads gets a turn for each time that the pipe is full."""
 
 
 class Outcome(msgspec.Struct):
@@ -69,11 +72,12 @@ def read_apart(map_path: str, words: str, before: Catalogue | None) -> Catalogue
     """
     paths = os.pathsep.join(filter(None, sys.path))
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths}
-    command = [sys.executable, "-m", "shmmap.origin.reread", str(os.getpid()), words]
+    known = f"{before.fixed_digest:016x}" if before is not None else ""
+    command = [sys.executable, "-m", "shmmap.origin.reread", str(os.getpid()), words, known]
     try:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=environment, cwd="/",
+            env=environment, cwd="/", pipesize=_PIPE_BYTES,
         )  # fmt: skip
     except OSError as error:
         raise ShmmapError(

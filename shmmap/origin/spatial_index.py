@@ -5,96 +5,203 @@ Every cell is filed under the bucket ``floor(min corner / bucket size)`` of a gr
 as large as the largest cell; the buckets are sorted integer keys ``iy << 32 | ix``.  A cell that
 touches a query has its min corner at most one cell size before the query's, so each bucket row holds
 its candidates in one contiguous run that two binary searches find.  The area's exact test then runs
-on the candidates.  Cells need not form a lattice.  Cells of very different sizes go into several such
-grids, one per power of two, so that one huge cell does not widen the search for all others.
+on the candidates, of very many on some at a time.  Cells need not form a lattice.  Cells of very
+different sizes go into several such grids, one per power of two, so that one huge cell does not widen
+the search for all others.
+
+To sort ten million keys takes as long as to read all else of such a map: what is made of the boxes can be
+kept (`SpatialIndex.made`) and given back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.geometry import Area
+from shmmap.geometry import Area, Circle
 
-__all__ = ["SpatialIndex", "touches"]
+__all__ = ["Grid", "GridFrame", "MadeOfBoxes", "SpatialIndex", "touches"]
 
 Indices = NDArray[np.intp]
 Floats = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
 
 # Below this many cells the exact test on all of them is faster than any search.
 _LINEAR_CELLS = 5000
 
-# Candidates that are tested at a time where it is enough to know that very many touch an area.
+# Candidates that are tested at a time where there are very many.
 _AT_ONCE = 1 << 15
+
+# Rows of buckets whose ends are sooner found than how much of each lies in a circle.
+_FEW_ROWS = 128
 
 # float32 keeps 24 bits: an area test on float32-rounded values (Autoware's) may move a border by half
 # a unit in the last place, 2**-24 of its magnitude; twice that on the box and on the query side.
 _ROUNDING = 2.0**-22
 
+# What the rounding of float64 may move the border of a row by, of the magnitude of the grid; generous.
+_ROW_ROUNDING = 2.0**-45
+
+# Wider than this no cell counts for the mean.
+_LARGEST = float(np.finfo(np.float64).max)
+
 # Keys hold 31 bits per axis; wider extents get larger buckets.
 _MAX_BUCKETS = 2**31 - 2
 
 
-class _Grid:
+class GridFrame(NamedTuple):
+    """Where a grid lies: its corner, its largest cell and its buckets in metres, and how many buckets."""
+
+    min_x: float
+    min_y: float
+    width: float
+    height: float
+    bucket_x: float
+    bucket_y: float
+    columns: int
+    rows: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
     """Cells of similar size, sorted by the bucket of their min corner.
 
-    Parameters
+    Attributes
     ----------
+    keys
+        (N,) int64, ascending: ``iy << 32 | ix``.
     cells
-        Rows of ``boxes``, (N, 4), all of the map's.
+        (N,) int32, whose keys these are: rows of all boxes of the map.
     """
 
-    def __init__(self, cells: Indices, boxes: Floats) -> None:
+    frame: GridFrame
+    keys: NDArray[np.int64]
+    cells: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, cells: Indices, boxes: Floats) -> Grid:
+        """Sort ``cells``, rows of ``boxes``, (N, 4), into a grid."""
         lows, highs, sizes = [], [], []
         for _, (min_x, min_y, max_x, max_y) in _blocks(cells, boxes):
             lows.append((min_x.min(), min_y.min()))
             highs.append((min_x.max(), min_y.max()))
             sizes.append(((max_x - min_x).max(), (max_y - min_y).max()))
-        self._width, self._height = (float(size) for size in np.max(sizes, axis=0))
-        self._min_x, self._min_y = (float(low) for low in np.min(lows, axis=0))
+        width, height = (float(size) for size in np.max(sizes, axis=0))
+        low_x, low_y = (float(low) for low in np.min(lows, axis=0))
         high_x, high_y = (float(high) for high in np.max(highs, axis=0))
-        larger = max(self._width, self._height) or 1.0
-        self._bucket_x = max(self._width or larger, (high_x - self._min_x) / _MAX_BUCKETS)
-        self._bucket_y = max(self._height or larger, (high_y - self._min_y) / _MAX_BUCKETS)
+        larger = max(width, height) or 1.0
+        bucket_x = max(width or larger, (high_x - low_x) / _MAX_BUCKETS)
+        bucket_y = max(height or larger, (high_y - low_y) / _MAX_BUCKETS)
         keys = np.empty(len(cells), np.int64)
         columns, rows = [], []
         for block, (min_x, min_y, _, _) in _blocks(cells, boxes):
-            ix = np.floor((min_x - self._min_x) / self._bucket_x).astype(np.int64)
-            iy = np.floor((min_y - self._min_y) / self._bucket_y).astype(np.int64)
+            ix = np.floor((min_x - low_x) / bucket_x).astype(np.int64)
+            iy = np.floor((min_y - low_y) / bucket_y).astype(np.int64)
             columns.append(int(ix.max()) + 1)
             rows.append(int(iy.max()) + 1)
             keys[block] = iy << 32 | ix
-        self._columns, self._rows = max(columns), max(rows)
+        frame = GridFrame(low_x, low_y, width, height, bucket_x, bucket_y, max(columns), max(rows))
         order = np.argsort(keys, kind="stable")
-        self._keys = keys[order]
-        self._cells = cells[order]
+        return cls(frame, keys[order], cells.astype(np.int32)[order])
 
     @property
     def nbytes(self) -> int:
-        return int(self._keys.nbytes + self._cells.nbytes)
+        return int(self.keys.nbytes + self.cells.nbytes)
 
-    def candidates(self, bounds: tuple[float, float, float, float]) -> Indices:
-        """Cells whose box may touch ``bounds``, unordered; all of the grid's if that is about as quick."""
-        x0 = (bounds[0] - self._width - self._min_x) / self._bucket_x
-        y0 = (bounds[1] - self._height - self._min_y) / self._bucket_y
-        x1 = (bounds[2] - self._min_x) / self._bucket_x
-        y1 = (bounds[3] - self._min_y) / self._bucket_y
-        if x1 < 0 or y1 < 0 or x0 >= self._columns or y0 >= self._rows:
-            return self._cells[:0]
+    def runs(self, bounds: Bounds, slack: float, circle: Circle | None = None) -> tuple[Indices, Indices]:
+        """Begins and ends of the runs of `cells` whose box may touch an area.
+
+        Parameters
+        ----------
+        bounds, slack
+            Around the area, and what rounding may move a border by.
+        circle
+            The area, if it is one.  Of very many cells around it only those near the circle are found: the
+            corners may have all of a map, and the circle none.
+        """
+        at, nothing = self.frame, np.empty(0, np.intp)
+        x0 = (bounds[0] - slack - at.width - at.min_x) / at.bucket_x
+        y0 = (bounds[1] - slack - at.height - at.min_y) / at.bucket_y
+        x1 = (bounds[2] + slack - at.min_x) / at.bucket_x
+        y1 = (bounds[3] + slack - at.min_y) / at.bucket_y
+        if x1 < 0 or y1 < 0 or x0 >= at.columns or y0 >= at.rows:
+            return nothing, nothing
         # clipped before the conversion: a finite area may reach 1e308, no integer does
-        ix0, ix1 = math.floor(max(x0, 0.0)), math.floor(min(x1, self._columns - 1.0))
-        iy0, iy1 = math.floor(max(y0, 0.0)), math.floor(min(y1, self._rows - 1.0))
-        if (iy1 - iy0 + 1) * 8 > len(self._cells):
-            return self._cells
-        rows = np.arange(iy0 << 32, (iy1 + 1) << 32, 1 << 32, dtype=np.int64)
-        starts = self._keys.searchsorted(rows + ix0).tolist()
-        stops = self._keys.searchsorted(rows + (ix1 + 1)).tolist()
-        cells = self._cells
-        return np.concatenate([cells[i:j] for i, j in zip(starts, stops, strict=True)])
+        ix0, ix1 = math.floor(max(x0, 0.0)), math.floor(min(x1, at.columns - 1.0))
+        iy0, iy1 = math.floor(max(y0, 0.0)), math.floor(min(y1, at.rows - 1.0))
+        if (iy1 - iy0 + 1) * 8 > len(self.cells):
+            return np.array([0]), np.array([len(self.cells)])
+        first = np.arange(iy0 << 32, (iy1 + 1) << 32, 1 << 32, dtype=np.int64)
+        if circle is None or len(first) <= _FEW_ROWS:
+            begins, ends = self.keys.searchsorted(first + ix0), self.keys.searchsorted(first + (ix1 + 1))
+            if circle is None or int((ends - begins).sum()) <= _AT_ONCE:
+                return begins, ends
+        low, high = self._within(circle, slack, iy0, iy1)
+        return self.keys.searchsorted(first + low), self.keys.searchsorted(first + high + 1)
+
+    def _within(
+        self, circle: Circle, slack: float, iy0: int, iy1: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First and last column of each row whose cells may touch a circle."""
+        at = self.frame
+        low_y = at.min_y + np.arange(iy0, iy1 + 1) * at.bucket_y
+        rounding = _ROW_ROUNDING * max(abs(at.min_y), abs(at.min_y + at.rows * at.bucket_y), at.height)
+        with np.errstate(over="ignore", invalid="ignore"):
+            above = low_y - rounding - circle.y
+            below = circle.y - (low_y + at.bucket_y + at.height + rounding)
+            away = np.maximum(np.maximum(above, below), 0.0)
+            radius = circle.radius + slack
+            half = np.sqrt(np.maximum((radius - away) * (radius + away), 0.0))
+            half[np.isnan(half)] = np.inf
+            low = (circle.x - half - slack - at.width - at.min_x) / at.bucket_x
+            high = (circle.x + half + slack - at.min_x) / at.bucket_x
+        low, high = np.clip(low, 0.0, at.columns), np.clip(high, -1.0, at.columns - 1.0)
+        return np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
+
+
+class MadeOfBoxes(NamedTuple):
+    """What is made of the boxes once.
+
+    Attributes
+    ----------
+    grids
+        None of few cells.
+    bounds
+        Box around all boxes, metres, map frame; None where there are none.
+    mean_size
+        Mean extent of the boxes along x and y, metres.
+    """
+
+    grids: Sequence[Grid]
+    bounds: Bounds | None
+    mean_size: tuple[float, float]
+
+    @classmethod
+    def of(cls, boxes: Floats) -> MadeOfBoxes:
+        """Make it of boxes, (N, 4)."""
+        if not len(boxes):
+            return cls((), None, (0.0, 0.0))
+        low_x, low_y = boxes[:, :2].min(axis=0).tolist()
+        high_x, high_y = boxes[:, 2:].max(axis=0).tolist()
+        mean_x = mean_y = 0.0
+        level = np.empty(len(boxes), np.int16)
+        for block, (min_x, min_y, max_x, max_y) in _blocks(np.arange(len(boxes)), boxes):
+            with np.errstate(over="ignore"):
+                width, height = max_x - min_x, max_y - min_y
+            mean_x += float((np.minimum(width, _LARGEST) / len(boxes)).sum())
+            mean_y += float((np.minimum(height, _LARGEST) / len(boxes)).sum())
+            level[block] = np.frexp(np.maximum(width, height))[1]
+        grids: list[Grid] = []
+        # no grid spans more than a number can say
+        if len(boxes) > _LINEAR_CELLS and math.isfinite(high_x - low_x) and math.isfinite(high_y - low_y):
+            levels = np.flatnonzero(np.bincount(level - level.min())) + level.min()
+            grids = [Grid.of(np.flatnonzero(level == one), boxes) for one in levels]
+        return cls(grids, (low_x, low_y, high_x, high_y), (min(mean_x, _LARGEST), min(mean_y, _LARGEST)))
 
 
 class SpatialIndex:
@@ -104,40 +211,19 @@ class SpatialIndex:
     ----------
     boxes
         (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame, finite, min <= max.
+    made
+        What was made of the same boxes before.
     """
 
-    def __init__(self, boxes: Floats) -> None:
+    def __init__(self, boxes: Floats, made: MadeOfBoxes | None = None) -> None:
         # column-major: the exact test reads one coordinate of many cells at a time
         self.boxes: Floats = np.asfortranarray(boxes)
-        self._grids: list[_Grid] = []
-        if len(boxes) > _LINEAR_CELLS and _has_extent(boxes):
-            level = np.empty(len(boxes), np.int16)
-            for block, (min_x, min_y, max_x, max_y) in _blocks(np.arange(len(boxes)), self.boxes):
-                level[block] = np.frexp(np.maximum(max_x - min_x, max_y - min_y))[1]
-            for exponent in np.unique(level):
-                self._grids.append(_Grid(np.flatnonzero(level == exponent), self.boxes))
-
-    @cached_property
-    def bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all boxes, metres, map frame; None where there are none."""
-        if not len(self.boxes):
-            return None
-        min_x, min_y = self.boxes[:, :2].min(axis=0).tolist()
-        max_x, max_y = self.boxes[:, 2:].max(axis=0).tolist()
-        return min_x, min_y, max_x, max_y
-
-    @cached_property
-    def mean_size(self) -> tuple[float, float]:
-        """Mean extent of the boxes along x and y, metres."""
-        if not len(self.boxes):
-            return 0.0, 0.0
-        min_x, min_y, max_x, max_y = self.boxes.T
-        return float((max_x - min_x).mean()), float((max_y - min_y).mean())
+        self.made = MadeOfBoxes.of(self.boxes) if made is None else made
 
     @property
     def nbytes(self) -> int:
         """Memory of the boxes and the search structure."""
-        return int(self.boxes.nbytes) + sum(grid.nbytes for grid in self._grids)
+        return int(self.boxes.nbytes) + sum(grid.nbytes for grid in self.made.grids)
 
     def query(self, area: Area, most: int | None = None) -> Indices:
         """Rows of ``boxes`` that touch ``area`` (closed borders, its z range ignored), ascending.
@@ -145,32 +231,38 @@ class SpatialIndex:
         If there are more than ``most``, some of them, more than ``most``, in no order: to find all takes
         time that grows with their number.
         """
-        if not self._grids:
+        grids = self.made.grids
+        if not grids:
             return np.flatnonzero(touches(area, self.boxes))
         min_x, min_y, max_x, max_y = area.bounds
         slack = _ROUNDING * max(abs(min_x), abs(min_y), abs(max_x), abs(max_y))
-        bounds = (min_x - slack, min_y - slack, max_x + slack, max_y + slack)
-        found = [grid.candidates(bounds) for grid in self._grids]
-        candidates = found[0] if len(found) == 1 else np.concatenate(found)
-        if most is not None and len(candidates) > _AT_ONCE:
-            hit = self._touching(area, candidates, most)
-            if len(hit) > most:
-                return hit
-        else:
-            hit = candidates[touches(area, self.boxes.T.take(candidates, axis=1).T)]
+        found, count = [], 0
+        for grid in grids:
+            begins, ends = grid.runs(area.bounds, slack, area if isinstance(area, Circle) else None)
+            for some in _candidates(grid.cells, begins, ends):
+                found.append(some[touches(area, self.boxes.T.take(some, axis=1).T)])
+                count += len(found[-1])
+                if most is not None and count > most:
+                    return np.concatenate(found).astype(np.intp)
+        hit = np.concatenate(found).astype(np.intp) if found else np.empty(0, np.intp)
         hit.sort()
         return hit
 
-    def _touching(self, area: Area, candidates: Indices, most: int) -> Indices:
-        """Those of many candidates that touch an area, until they are more than ``most``."""
-        found, count = [], 0
-        for begin in range(0, len(candidates), _AT_ONCE):
-            some = candidates[begin : begin + _AT_ONCE]
-            found.append(some[touches(area, self.boxes.T.take(some, axis=1).T)])
-            count += len(found[-1])
-            if count > most:
-                break
-        return np.concatenate(found)
+
+def _candidates(cells: NDArray[np.int32], begins: Indices, ends: Indices) -> Iterator[NDArray[np.int32]]:
+    """Return the cells of runs, at most `_AT_ONCE` at a time."""
+    lengths = ends - begins
+    total = int(lengths.sum())
+    if total <= _AT_ONCE:
+        if total:
+            pairs = zip(begins.tolist(), ends.tolist(), strict=True)
+            yield np.concatenate([cells[i:j] for i, j in pairs])
+        return
+    before = np.cumsum(lengths) - lengths
+    for first in range(0, total, _AT_ONCE):
+        places = np.arange(first, min(first + _AT_ONCE, total))
+        run = before.searchsorted(places, side="right") - 1
+        yield cells[begins[run] + (places - before[run])]
 
 
 def _blocks(cells: Indices, boxes: Floats) -> Iterator[tuple[slice, Floats]]:
@@ -178,12 +270,6 @@ def _blocks(cells: Indices, boxes: Floats) -> Iterator[tuple[slice, Floats]]:
     for begin in range(0, len(cells), _AT_ONCE):
         block = slice(begin, begin + _AT_ONCE)
         yield block, boxes.T.take(cells[block], axis=1)
-
-
-def _has_extent(boxes: Floats) -> bool:
-    """Whether a number says how far the outermost corners are apart: no grid spans more."""
-    with np.errstate(over="ignore"):
-        return bool(np.isfinite(boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)).all())
 
 
 def touches(area: Area, boxes: Floats) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import shmmap
+from shmmap.client import map_listing
 from shmmap.client.connection import Connection
 from shmmap.client.program_name import program_name
 from shmmap.errors import (
@@ -264,6 +265,26 @@ def test_metadata_and_what_changed_since(daemon: Factory, divided_map: DividedMa
         unknown = client.metadata(since=1)
         assert not unknown.since_known
         assert len(unknown) == len(divided_map.corners)
+
+
+def test_no_more_pages_are_asked_for_than_are_needed(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_listing, "_PAGE_ROWS", 10)
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        everything = client.metadata()
+        assert len(everything) == len(divided_map.corners) > 30
+        before = client.stats().counters["requests"]
+        some = client.metadata(most=15)
+        assert some[:] == everything[:20]
+        # each request is counted once it is answered, so the first look is among them
+        assert client.stats().counters["requests"] - before == 3
+        assert client.metadata(most=len(everything))[:] == everything[:]
+        assert (
+            client.metadata(shmmap.Circle(0, 0, 25), most=0)[:]
+            == client.metadata(shmmap.Circle(0, 0, 25))[:10]
+        )
 
 
 @BOTH

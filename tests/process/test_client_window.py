@@ -301,9 +301,9 @@ def test_a_broken_cell_is_a_hole_where_it_lies(
     listed: list[int] = []
     list_cells = map_listing.list_cells
 
-    def list_and_count(*arguments: Any) -> shmmap.MapListing:
+    def list_and_count(*arguments: Any, **options: Any) -> shmmap.MapListing:
         listed.append(1)
-        return list_cells(*arguments)
+        return list_cells(*arguments, **options)
 
     monkeypatch.setattr(map_listing, "list_cells", list_and_count)
     broken = Path(divided_map.id("20_0.pcd"))

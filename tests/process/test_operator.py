@@ -16,10 +16,14 @@ import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import shmmap as client_library
+from shmmap.cli.entry import main
+from shmmap.cli.verbs import map_view
+from shmmap.client.map_listing import MapListing
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
@@ -182,6 +186,44 @@ def test_metrics_and_files(shmmap: Shmmap, divided_map: DividedMap, tmp_path: Pa
     assert len(tree.findall(resident)) == len(divided_map.in_circle(0, 0, 25))
     assert "<!doctype html>" in page.read_text()
     assert "cannot write" in shmmap.run("map", "--svg", str(tmp_path / "no" / "map.svg")).stderr
+
+
+def test_a_picture_of_too_many_cells(
+    shmmap: Shmmap,
+    divided_map: DividedMap,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Those on disk are left out, and not even asked for; the map's extent and those in memory are there."""
+    shmmap("query", "--circle", "0,0,5")
+    for name, value in shmmap.environment.items():
+        if name.startswith("SHMMAP_"):
+            monkeypatch.setenv(name, value)
+    asked: list[object] = []
+    real = client_library.Client.metadata
+
+    def noted(client: client_library.Client, *args: Any, **options: Any) -> MapListing:
+        asked.append(args)
+        return real(client, *args, **options)
+
+    monkeypatch.setattr(client_library.Client, "metadata", noted)
+    monkeypatch.setattr(map_view, "MOST_ON_DISK", 10)
+    assert main(["map"]) == 0
+    assert not asked
+    drawn, said = capsys.readouterr().out.split("its area")
+    assert "#" in drawn
+    assert "." not in drawn.replace(". on disk", "")
+    flat = " ".join(said.split())
+    assert "x -60 .. 60 m, y -60 .. 60 m; 4 segments" in flat
+    assert f"{len(divided_map.corners)} cells in the map (too many to show those on disk)" in flat
+    assert main(["map", "--circle", "0,0,45"]) == 0
+    assert "more than 10 cells in the map (too many" in " ".join(capsys.readouterr().out.split())
+    assert main(["map", "--circle", "50,50,5"]) == 0
+    drawn, said = capsys.readouterr().out.split("its area")
+    assert "." in drawn.replace(". on disk", "")
+    assert "1 cell in the map" in " ".join(said.split())
+    assert main(["map", "--circle", "900,900,5"]) == 1
+    assert "the map spans x -60 .. 60 m, y -60 .. 60 m" in " ".join(capsys.readouterr().err.split())
 
 
 def test_while_the_daemon_is_stopped_and_after_it_was_killed(shmmap: Shmmap) -> None:

@@ -32,6 +32,7 @@ BASE = {
     "optional_packages",
     "compiling",
     "sharded_dict",
+    "sparse_table",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -48,6 +49,7 @@ PARTS = {
     "protocol": {"errors", "columns", "geometry"},
     "compiling": set[str](),
     "sharded_dict": set[str](),
+    "sparse_table": set[str](),
     "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "sharded_dict", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},

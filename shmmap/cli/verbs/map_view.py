@@ -8,7 +8,7 @@ import shutil
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
@@ -25,7 +25,25 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 MOST_ON_DISK: Final = 50_000
-"""More cells than this are left out of a picture where they are not in memory."""
+"""More cells than this are left out of a picture where they are not in memory, and not asked for."""
+
+
+class OnDisk(NamedTuple):
+    """What the daemon told of the part of the map that is drawn.
+
+    Attributes
+    ----------
+    cells
+        Names and boxes of its cells; none if there are more than `MOST_ON_DISK`.
+    total
+        How many there are, of too many in an area only that; None if the daemon did not tell.
+    everywhere
+        What the whole map spans; None where it has no cells, or the daemon did not tell.
+    """
+
+    cells: list[tuple[str, BoxTuple]]
+    total: int | None
+    everywhere: BoxTuple | None
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -64,10 +82,12 @@ def run(args: argparse.Namespace) -> int:
         scene, everywhere = _live_scene(args, area, found)
     else:
         what = "cell"
-        disk, silent = _on_disk(args, found, identity.id_prefix)
-        everywhere = around([box for _, box in disk] + [row.box for row in found.cells])
+        disk = _on_disk(args, area, found, identity.id_prefix)
+        silent = disk.total is None
+        boxes = [row.box for row in found.cells]
+        everywhere = around(boxes if disk.everywhere is None else [disk.everywhere, *boxes])
         title = f"{identity.map_path} ({identity.instance})"
-        scene = _scene(area, found, disk, everywhere, title, silent=silent)
+        scene = _scene(area, found, disk, everywhere, title)
     for path, make in ((args.svg, svg), (args.html, html_page)):
         if path is not None:
             write_text(path, make(scene))
@@ -113,13 +133,7 @@ def _live_scene(
 
 
 def _scene(
-    area: Area | None,
-    found: Snapshot,
-    disk: list[tuple[str, BoxTuple]],
-    everywhere: BoxTuple | None,
-    title: str,
-    *,
-    silent: bool,
+    area: Area | None, found: Snapshot, disk: OnDisk, everywhere: BoxTuple | None, title: str
 ) -> Scene:
     from shmmap.cli.screens.map_scene import Scene
     from shmmap.geometry import Box
@@ -130,45 +144,51 @@ def _scene(
         bounds = area.bounds
         shown = Box(*bounds)  # all of what is drawn
         rows = [rows[index] for index in those_in(shown, [row.box for row in rows])]
-        disk = [disk[index] for index in those_in(shown, [box for _, box in disk])]
-    left_out = len(disk) > MOST_ON_DISK
     return Scene(
         bounds=bounds,
-        disk=[] if left_out else disk,
+        disk=disk.cells,
         rows=rows,
         clients=found.clients,
         now_ns=time.monotonic_ns(),
         title=title,
-        note=_note(found, rows, len(disk), left_out=left_out, silent=silent),
-        empty=not disk and not rows,
+        note=_note(area, found, rows, disk),
+        empty=not disk.total and not rows,
     )
 
 
-def _on_disk(
-    args: argparse.Namespace, found: Snapshot, id_prefix: str
-) -> tuple[list[tuple[str, BoxTuple]], bool]:
-    """All cells of the map, if the daemon tells; and whether it does not."""
+def _on_disk(args: argparse.Namespace, area: Area | None, found: Snapshot, id_prefix: str) -> OnDisk:
+    """Ask for the cells that are drawn, unless they are too many or the daemon does not answer."""
     from shmmap.cli.daemon_address import connect
+    from shmmap.geometry import Box
 
+    nothing = OnDisk([], None, None)
     if found.state in ("dead", "stopped"):
-        return [], True
+        return nothing
     try:
         with connect(args) as client:
-            return [(cell.id.removeprefix(id_prefix), cell.box) for cell in client.metadata()], False
+            count, everywhere = client.welcome.cells, client.welcome.bounds
+            if area is None and count > MOST_ON_DISK:
+                return OnDisk([], count, everywhere)
+            listing = client.metadata(Box(*area.bounds) if area is not None else None, most=MOST_ON_DISK)
+            if len(listing) > MOST_ON_DISK:
+                return OnDisk([], len(listing), everywhere)
+            cells = [(cell.id.removeprefix(id_prefix), cell.box) for cell in listing]
+            return OnDisk(cells, len(cells), everywhere)
     except DaemonUnreachable:
-        return [], True
+        return nothing
 
 
-def _note(found: Snapshot, rows: list[CellRow], cells: int, *, left_out: bool, silent: bool) -> str:
+def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk) -> str:
     memory = sum(row.bytes for row in rows)
     segments, clients = counted(len(rows), "segment"), counted(len(found.clients), "client")
     note = f"{segments} in memory, {format_bytes(memory)}, {clients}"
-    if silent:
+    if disk.total is None:
         state = "paused" if found.state == "stopped" else found.state
         return f"{note}; the daemon is {state}: cells on disk are not shown"
-    return f"{note}, {counted(cells, 'cell')} in the map" + (
-        " (too many to show those on disk)" if left_out else ""
-    )
+    if disk.total <= MOST_ON_DISK:
+        return f"{note}, {counted(disk.total, 'cell')} in the map"
+    count = f"more than {MOST_ON_DISK:,}" if area is not None else f"{disk.total:,}"
+    return f"{note}, {count} cells in the map (too many to show those on disk)"
 
 
 def _print(scene: Scene) -> None:

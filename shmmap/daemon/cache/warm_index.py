@@ -15,6 +15,7 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.geometry import ZRange
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
+from shmmap.sparse_table import sparse_zeros
 
 __all__ = ["Heights", "WarmIndex"]
 
@@ -36,8 +37,8 @@ class Heights:
     """
 
     def __init__(self, cells: int) -> None:
-        self._z = np.zeros((cells, 2))  # takes memory as it is written
-        self._known = np.zeros(cells, np.bool_)
+        self._z = sparse_zeros((cells, 2), np.float64)
+        self._known = sparse_zeros(cells, np.bool_)
 
     def learn(self, index: int, z_min: float, z_max: float) -> None:
         """A cell was loaded."""
@@ -142,7 +143,7 @@ class WarmIndex:
             if 4 * len(self.layers[smallest]) > len(found):
                 return
             del self.tables[smallest]
-        table = self.tables[layer] = np.zeros(cells, np.uint64)
+        table = self.tables[layer] = sparse_zeros(cells, np.uint64)
         for index, resident in found.items():
             table[index] = resident.version
 

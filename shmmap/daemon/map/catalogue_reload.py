@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
+from shmmap.daemon.map.old_tables import give_back_apart
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue_change import CatalogueChange, compare
@@ -106,6 +107,8 @@ class Reloader:
         if result is not None:
             for answer in asked:
                 answer(result)
+        if isinstance(result, Reread) and self._served() is result.catalogue:
+            give_back_apart(result.change.old, result.catalogue)
         if self._next and not self._asked:
             self._begin()
 

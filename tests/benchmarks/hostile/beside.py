@@ -55,6 +55,8 @@ class Beside:
     ----------
     newcomers_too
         Whether new clients come all the time, and must get in.
+    over_idle_mib
+        How much the daemon's memory may grow.
 
     Attributes
     ----------
@@ -62,10 +64,18 @@ class Beside:
         Those of the daemon's loop since the block began.
     """
 
-    def __init__(self, told: Report, one: DaemonProcess, *, newcomers_too: bool = True) -> None:
+    def __init__(
+        self,
+        told: Report,
+        one: DaemonProcess,
+        *,
+        newcomers_too: bool = True,
+        over_idle_mib: float = OVER_IDLE_MIB,
+    ) -> None:
         self._told = told
         self._one = one
         self._newcomers_too = newcomers_too
+        self._over_idle_mib = over_idle_mib
         self._stack = ExitStack()
         self._ended = threading.Event()
         self._peak = 0
@@ -142,7 +152,7 @@ class Beside:
         mib = 1 << 20
         grown = (self._peak - self._idle) / mib
         told.tell(f"daemon's private memory: idle {self._idle / mib:.1f} MiB, peak {self._peak / mib:.1f}")
-        told.limit("over idle", grown, OVER_IDLE_MIB, "MiB")
+        told.limit("over idle", grown, self._over_idle_mib, "MiB")
         told.figures.update(
             p99=f"{np.percentile(probe.times_ms, 99):.1f}", probe=f"{longest:.0f}",
             echo=f"{longest_echo:.0f}", memory=f"{grown:+.0f}",

@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import struct
 import subprocess
 import tracemalloc
 from pathlib import Path
@@ -13,15 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from xxhash import xxh3_64_intdigest
 
 from shmmap.errors import MapDataError, MapMissing, ShmmapError
 from shmmap.geometry import Circle
-from shmmap.origin import map_directory
+from shmmap.origin import cell_names, map_directory, spatial_index
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_bytes import read_catalogue, write_catalogue
+from shmmap.origin.catalogue_bytes import Source, read_catalogue, write_catalogue
 from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory
 from shmmap.origin.reading_apart import read_apart
+from shmmap.segment.layout import SourceStamp
 
 HEAD = "x_resolution: 20\ny_resolution: 20\n"
 LONG = 100_000
@@ -163,6 +166,89 @@ def test_what_has_not_changed_is_shared(root: Path) -> None:
     assert np.array_equal(fourth.boxes, here.boxes)
     assert fourth.map_version == here.map_version
     assert compare(third, fourth).ids("removed") == (first.id(1),)
+
+
+def test_nothing_is_sorted_again_by_who_reads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is made of names and boxes comes with them; of the same ones it is that of the state before."""
+    monkeypatch.setattr(spatial_index, "_LINEAR_CELLS", 0)
+    for i in range(3):
+        folder = root / "pointcloud_map.pcd" / "more"
+        folder.mkdir(exist_ok=True)
+        (folder / f"d_{20 * i}_0.pcd").write_bytes(b"x")
+    write_metadata(root, "".join(f"d_{20 * i}_0.pcd: [{20 * i}, {500 * i}]\n" for i in range(3)))
+    here = origin(root).scanned()
+    assert len(here.made_of_boxes.grids) == 1
+    assert len(here.by_base) == len(here) == 6
+    out = io.BytesIO()
+    write_catalogue(out, "", (), here)
+    with monkeypatch.context() as patch:
+        patch.setattr(spatial_index.MadeOfBoxes, "of", None)
+        patch.setattr(cell_names, "order_by_base", None)
+        _, first = read_catalogue(io.BytesIO(out.getvalue()), len(out.getvalue()))
+        _, second = read_catalogue(io.BytesIO(out.getvalue()), before=first)
+    assert second.by_base is first.by_base
+    for found in (first, second):
+        assert found.find("d_40_0.pcd") == here.find("d_40_0.pcd") is not None
+        assert found.find("more/d_40_0.pcd") == here.find("d_40_0.pcd")
+        assert found.query(Circle(45.0, 1005.0, 1.0))[0].tolist() == [here.find("d_40_0.pcd")]
+        assert (
+            (found.bounds, found.mean_size) == (here.bounds, here.mean_size) == ((0, 0, 60, 1020), (20, 20))
+        )
+        ((grid, right),) = zip(found.made_of_boxes.grids, here.made_of_boxes.grids, strict=True)
+        assert grid.frame == right.frame
+        assert grid.keys.tolist() == right.keys.tolist()
+        assert grid.cells.tolist() == right.cells.tolist()
+
+
+def test_bytes_of_a_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `shmmap.origin.catalogue_bytes` says them: other bytes need another version of the layout."""
+    monkeypatch.setattr(spatial_index, "_LINEAR_CELLS", 0)
+    boxes = [(0.0, 0.0, 20.0, 20.0), (20.0, -20.0, 40.0, 0.0), (0.0, 40.0, 5.0, 45.0)]
+    names = ("a/two.pcd", "b/one.pcd", "b/two.pcd")
+    cells = [(f"/m/{names[n]}", boxes[n], SourceStamp(n, n + 1, n + 2)) for n in range(3)]
+    out = io.BytesIO()
+    write_catalogue(out, "key", (Source("/m", 0, 1, 2, 3),), Catalogue.from_cells(cells, ["odd"]))
+    written = out.getvalue()
+    fixed = xxh3_64_intdigest(
+        b"shmmap map 1\0/m/\0" + b"".join(map(str.encode, names)) + np.array(boxes).T.tobytes()
+    )
+    magic, version, header_bytes, digest = struct.unpack_from("<8sIIQ", written)
+    assert (magic, version, digest) == (b"SHMMAPCT", 2, xxh3_64_intdigest(written[24:]))
+    assert json.loads(written[24 : 24 + header_bytes]) == {
+        "key": "key", "sources": [["/m", 0, 1, 2, 3]], "prefix": "/m/", "cells": 3, "name_bytes": 9,
+        "problems": ["odd"], "by_base": 3, "bounds": [0, -20, 40, 45], "mean_size": [15, 15],
+        "grids": [[[0, 40, 5, 5, 5, 5, 1, 1], 1], [[0, -20, 20, 20, 20, 20, 2, 2], 2]],
+        "fixed_digest": fixed, "stamps_only": False,
+    }  # fmt: skip
+    rest = written[24 + -(-header_bytes // 8) * 8 :]
+    assert rest[:32] == b"a/two.pcdb/one.pcdb/two.pcd\0\0\0\0\0"
+    assert np.frombuffer(rest, "<f8", 12, 32).reshape(4, 3).T.tolist() == [list(box) for box in boxes]
+    assert np.frombuffer(rest, "<i8", 9, 128).tolist() == [0, 1, 2, 1, 2, 3, 2, 3, 4]
+    assert np.frombuffer(rest, "<i4", 4, 200).tolist() == [1, 0, 2, 0]  # one.pcd, two.pcd, two.pcd
+    assert np.frombuffer(rest, "<i8", 2, 216).tolist() == [0, 2]  # key and cell of the small one's grid
+    assert np.frombuffer(rest, "<i8", 2, 232).tolist() == [1, 1 << 32]
+    assert np.frombuffer(rest, "<i4", 2, 248).tolist() == [1, 0]
+    assert len(rest) == 256
+
+
+def test_who_has_names_and_boxes_gets_the_stamps_alone() -> None:
+    before, other = many(1_000_000), many(1_000_000, 5.0)
+    after = many(1_000_000)
+    after.set_stamp(CELLS - 1, before.stamp(0))
+    whole, short = io.BytesIO(), io.BytesIO()
+    write_catalogue(whole, "", (), after, other.fixed_digest)
+    write_catalogue(short, "", (), after, before.fixed_digest)
+    assert len(short.getvalue()) < CELLS * 24 + 1024 < len(whole.getvalue())
+    found = [read_catalogue(io.BytesIO(out.getvalue()), before=before)[1] for out in (whole, short)]
+    for one in found:
+        assert one.names is before.names
+        assert one.boxes is before.boxes
+        assert one.map_version == after.map_version != before.map_version
+        assert compare(before, one).changed.tolist() == [CELLS - 1]
+        assert one.query(Circle(505.0, 505.0, 1.0))[0].tolist() == [25 * 500 + 25]
+    for without in (None, other):
+        with pytest.raises(ValueError, match="stamps alone, of other cells"):
+            read_catalogue(io.BytesIO(short.getvalue()), len(short.getvalue()), without)
 
 
 CELLS = 200_000
