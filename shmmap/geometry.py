@@ -82,9 +82,9 @@ class Circle(msgspec.Struct, frozen=True):
         """How far its farthest point is from its center."""
         return self.radius
 
-    def around(self, x: float, y: float) -> Circle:
-        """Return the same area around another place."""
-        return Circle(x, y, self.radius, self.z)
+    def around(self, x: float, y: float, wider_m: float = 0.0) -> Circle:
+        """Return the same area around another place, wider by so much on each side."""
+        return Circle(x, y, self.radius + wider_m, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Whether a circle lies wholly in this one, border included."""
@@ -133,9 +133,9 @@ class AutowareSquare(msgspec.Struct, frozen=True):
         """How far its farthest point is from its center."""
         return math.sqrt(2.0) * self.radius
 
-    def around(self, x: float, y: float) -> AutowareSquare:
-        """Return the same area around another place."""
-        return AutowareSquare(x, y, self.radius, self.z)
+    def around(self, x: float, y: float, wider_m: float = 0.0) -> AutowareSquare:
+        """Return the same area around another place, wider by so much on each side."""
+        return AutowareSquare(x, y, self.radius + wider_m, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Whether a circle lies wholly in the square, as far as float32 lets one be sure."""
@@ -184,9 +184,10 @@ class Box(msgspec.Struct, frozen=True):
         """Where distance is measured from."""
         return (self.min_x + self.max_x) / 2, (self.min_y + self.max_y) / 2
 
-    def around(self, x: float, y: float) -> Box:
-        """Return the same area around another place."""
-        dx, dy = 0.5 * (self.max_x - self.min_x), 0.5 * (self.max_y - self.min_y)
+    def around(self, x: float, y: float, wider_m: float = 0.0) -> Box:
+        """Return the same area around another place, wider by so much on each side."""
+        dx = 0.5 * (self.max_x - self.min_x) + wider_m
+        dy = 0.5 * (self.max_y - self.min_y) + wider_m
         return Box(x - dx, y - dy, x + dx, y + dy, self.z)
 
     @property

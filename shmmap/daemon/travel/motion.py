@@ -16,8 +16,8 @@ MOST_SPEED_MPS: Final = 70.0
 """A pose that is farther away than this speed allows is a jump; nobody is taken to be faster."""
 LEARN_S: Final = 0.5
 """Time between two poses, at least, from which a velocity is learnt."""
-FORGET_S: Final = 10.0
-"""After so long without a pose nothing is known of how a client moves."""
+SILENT_S: Final = 10.0
+"""Who says nothing for longer may have stood: who is farther away than one comes in this time has jumped."""
 FASTEST_S: Final = 60.0
 """For about so long it is remembered how fast a client was: it will go on after a red light."""
 
@@ -56,6 +56,7 @@ class Motion:
     jumps: int = 0
     _vertices_hash: int = 0
     _told_route: Route | None = None
+    _come_m: float = 0.0
     _learnt: tuple[float, float, float] = field(default=(0.0, 0.0, -math.inf))
 
     @property
@@ -76,7 +77,7 @@ class Motion:
     def _move(self, x: float, y: float, vx: float, vy: float, now_s: float) -> None:
         x, y = _within(x), _within(y)
         step_m, took_s = math.hypot(x - self.x, y - self.y), now_s - self.told_s
-        if took_s > FORGET_S or step_m > MOST_SPEED_MPS * max(took_s, 1.0):
+        if took_s == math.inf or step_m > MOST_SPEED_MPS * min(max(took_s, 1.0), SILENT_S):
             self.jumps += 1
             self.vx = self.vy = self.fastest_mps = self.travelled_m = 0.0
             self._learnt = (x, y, now_s)
@@ -98,13 +99,11 @@ class Motion:
         if took_s < LEARN_S:
             return
         self._learnt = (self.x, self.y, now_s)
-        known = 0.5 if self.vx or self.vy else 0.0
-        self.vx = known * self.vx + (1.0 - known) * (self.x - x) / took_s
-        self.vy = known * self.vy + (1.0 - known) * (self.y - y) / took_s
+        self.vx, self.vy = (self.x - x) / took_s, (self.y - y) / took_s
 
     def _follow(self, vertices: tuple[tuple[float, float], ...]) -> None:
         """Find the client on the way that it says it will take."""
-        before: float | None = self.along_m if self.route is not None else None
+        before: float | None = self._come_m if self.route is not None else None
         told = hash(vertices)
         if told != self._vertices_hash:
             self._vertices_hash, before = told, None
@@ -112,6 +111,7 @@ class Motion:
         along_m = None if self._told_route is None else self._told_route.find(self.x, self.y, before)
         self.route = None if along_m is None else self._told_route
         self.along_m = along_m or 0.0
+        self._come_m = self.along_m if before is None else max(before, self.along_m)
 
 
 def _within(metres: float) -> float:

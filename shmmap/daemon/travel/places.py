@@ -31,10 +31,12 @@ NOWHERE: Final = np.empty((0, 8))
 MOST_PLACES: Final = 256
 """Scoring takes time for each: with more of them, of those near each other the first counts."""
 MOST_OF_A_CLIENT: Final = 128
-"""Places along a route; the longer it is, the farther apart they are."""
+"""Places along a route; the longer it is, the farther apart are those that come late."""
+NEAREST_M: Final = 10.0
+"""Places along a route are at least so far apart, and a quarter of the client's reach."""
 SLOWEST_MPS: Final = 3.0
 """A client that stands still may drive off."""
-STAY_M: Final = 20.0
+STAY_M: Final = 10.0
 """What is just beyond a client's reach stays, whatever its route says: it may turn round or leave it."""
 FIRST_SIDE_M: Final = 16.0
 """Places in one square of this side count as one at first, where there are too many."""
@@ -57,15 +59,19 @@ def places_of(motion: Motion, reach_m: float) -> Places:
         return np.array([[*here, math.inf, pace, *heading]])
     speed = max(motion.fastest_mps, SLOWEST_MPS)
     left_m = route.length_m - motion.along_m
-    count = min(MOST_OF_A_CLIENT - 2, max(1, math.ceil(left_m / max(reach_m / 4.0, 10.0))))
-    ahead_m = np.linspace(0.0, left_m, count + 1)[1:]
+    near_m = max(reach_m / 4.0, NEAREST_M)
+    count = min(MOST_OF_A_CLIENT - 2, max(1, math.ceil(left_m / near_m)))
+    # the first ones ``near_m`` apart; if that needs too many, later ones farther
+    power = max(1.0, math.log(left_m / near_m) / math.log(count)) if count > 1 else 1.0
+    ahead_m = left_m * (np.arange(1, count + 1) / count) ** power
+    apart_m = np.diff(ahead_m, prepend=0.0)
     found = np.zeros((count + 2, 8))
     found[0] = [*here, STAY_M, pace, *heading]
     found[1:-1, :2] = route.at(motion.along_m + ahead_m)
     # what comes into reach between two places is needed before the client is at the second
-    found[1:-1, 2] = motion.told_s + (ahead_m - 0.5 * left_m / count) / speed
+    found[1:-1, 2] = motion.told_s + (ahead_m - 0.5 * apart_m) / speed
     found[1:-1, 3] = reach_m
-    found[1:-1, 4] = 0.25 * left_m / count
+    found[1:-1, 4] = 0.25 * apart_m
     found[-1] = [*found[-2, :2], motion.told_s + left_m / speed, reach_m, math.inf, pace, 0.0, 0.0]
     return found
 

@@ -15,13 +15,13 @@ __all__ = ["FARTHEST_M", "MOST_VERTICES", "Route"]
 FARTHEST_M: Final = 1e8
 """Coordinates beyond this, in metres, count as this."""
 MOST_VERTICES: Final = 512
-"""Of a route with more, so many places along it are kept, equally far apart."""
+"""Of a route with more, so many are kept, most of them where it bends."""
 OFF_ROUTE_M: Final = 100.0
 """A client farther away than this from its route is not on it."""
 SLACK_M: Final = 10.0
 """Of two stretches of a route that are both so near (to this), the client is on the one that comes first."""
-BEHIND_M: Final = 50.0
-"""So far back on its route, at most, a client is looked for that was on it before."""
+BEHIND_M: Final = 20.0
+"""So far back on its route, at most, a client is looked for that had come farther: streets are taken both ways."""
 
 
 class Route:
@@ -45,7 +45,7 @@ class Route:
         self._along = _along(self._at)
         self.length_m = float(self._along[-1])
         if len(self._at) > MOST_VERTICES:
-            self._at = self.at(np.linspace(0.0, self.length_m, MOST_VERTICES))
+            self._at = self._at[_telling(self._at, self._along)]
             self._along = _along(self._at)
             self.length_m = float(self._along[-1])
         steps, lengths = np.diff(self._at, axis=0), np.diff(self._along)
@@ -66,7 +66,7 @@ class Route:
         Parameters
         ----------
         from_m
-            How far along it was before, if it was on this route: where a route passes a place twice, the
+            How far along it has come, if it was on this route: where a route passes a place twice, the
             client is where it comes to next.
         """
         here = np.array([x, y])
@@ -101,3 +101,21 @@ def _along(at: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far along a polyline each of its vertices is, metres."""
     steps = np.diff(at, axis=0)
     return np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+
+
+def _telling(at: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Which vertices tell most of a polyline's course, at most `MOST_VERTICES`, its ends among them.
+
+    Chords stay about equally near to a curve if their ends are as dense as the square root of its
+    curvature; half of the vertices are spread so, the others evenly.
+    """
+    steps = np.diff(at, axis=0)
+    heading = np.arctan2(steps[:, 1], steps[:, 0])
+    turn = np.abs((np.diff(heading) + math.pi) % (2.0 * math.pi) - math.pi)
+    bend = np.concatenate(([0.0], np.cumsum(np.sqrt(turn * 0.5 * (along[2:] - along[:-2]))), [0.0]))
+    bend[-1] = bend[-2]
+    rank = along / max(along[-1], 1e-9) + bend / max(bend[-1], 1e-9)
+    wanted = np.linspace(0.0, rank[-1], MOST_VERTICES)
+    kept = np.unique(np.clip(np.searchsorted(rank, wanted), 0, len(at) - 1))
+    kept[-1] = len(at) - 1
+    return kept

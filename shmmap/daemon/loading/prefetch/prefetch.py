@@ -3,7 +3,8 @@
 
 Nothing here loads or waits: the scheduler asks for a wish when nobody's demand can use a loader
 (`Prefetch.next`), and tells how loads ended.  How far ahead is looked, in seconds of travel, is the longest
-time without the origin that is to be ridden out, and what a load takes, slow ones and a second try included.
+time without the origin that is to be ridden out, and what a load takes, slow ones included.  Where nobody
+knows the way, an outage is prepared for only after there was one: much of that is fetched in vain.
 """
 
 from __future__ import annotations
@@ -13,15 +14,23 @@ from collections.abc import Callable, Hashable
 from typing import Final, NamedTuple
 
 from shmmap.daemon.loading.prefetch.origin_health import OriginHealth
-from shmmap.daemon.loading.prefetch.way_ahead import PASS_S, WayAhead
+from shmmap.daemon.loading.prefetch.way_ahead import PASS_S, LookAhead, WayAhead
 from shmmap.daemon.map.catalogue_view import CatalogueView
 
 __all__ = ["Prefetch", "Wish"]
 
 LOOKS_AT_ONCE: Final = 2
 """Steps along clients' ways that are looked at for one wish: a fifth of a millisecond."""
-SLACK_S: Final = 2.0
-"""Beside all that is measured: requests come a step of the window apart."""
+LOADS: Final = 1.6
+"""Slow ones, one after the other, that a cell may have to wait for."""
+SLACK_S: Final = 3.0
+"""Beside all that is measured: requests come a step of the window apart, and so do looks along the way."""
+SPARE: Final = 1.25
+"""What was used up in an outage comes back slowly; until it has, cells come just in time or a little late."""
+AFTER_S: Final = 2.0
+"""Until loads are known to succeed again after they did not, and the first ones have come."""
+GUESSED_S: Final = 10.0
+"""Nobody goes straight on for longer than this."""
 SHORTEST_STEP_M: Final = 5.0
 
 
@@ -60,16 +69,22 @@ class Prefetch:
         self.ways: dict[Hashable, WayAhead] = {}
         self.health = OriginHealth()
         self.more = False
+        self._out_since_s = math.inf
+        self._away_s = 0.0
 
     @property
-    def look_ahead_s(self) -> float:
+    def look_ahead(self) -> LookAhead:
         """How far ahead is looked: what comes into reach later is not wished for yet."""
-        return self._ride_out_s + 3.0 * self.health.slow_s + SLACK_S
+        load_s = LOADS * self.health.slow_s + SLACK_S
+        way_s = load_s + SPARE * self._ride_out_s + PASS_S + AFTER_S
+        straight_s = load_s + min(self._ride_out_s, self._away_s, GUESSED_S)
+        return LookAhead(way_s, straight_s, load_s)
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
-        """Return what is needed first of what is absent; None if nothing is, or not known yet (see `more`)."""
+        """Return what is needed first of what is absent; None if nothing is, or not known yet (`more`)."""
         self.more = False
-        if catalogue is not self._catalogue:  # indices mean other cells now
+        if catalogue is not self._catalogue or self._is_back(now_s):
+            # indices mean other cells now, or what was passed over because it had failed may be tried
             self._catalogue = catalogue
             for way in self.ways.values():
                 way.begin(now_s)
@@ -84,15 +99,26 @@ class Prefetch:
                 return wish
             if behind is None:
                 return None
-            behind.look(catalogue, self.look_ahead_s, step_m)
+            behind.look(catalogue, self.look_ahead, step_m)
         self.more = True
         return None
+
+    def _is_back(self, now_s: float) -> bool:
+        """Whether loads succeed again; and for how long they did not."""
+        if self.health.is_out:
+            self._out_since_s = min(self._out_since_s, now_s)
+            return False
+        if self._out_since_s == math.inf:
+            return False
+        self._away_s = max(now_s - self._out_since_s, 0.5 * self._away_s)
+        self._out_since_s = math.inf
+        return True
 
     def _least_far(self, now_s: float) -> WayAhead | None:
         """The way of which least is known ahead; None if all were looked over."""
         least: WayAhead | None = None
         for way in self.ways.values():
-            if way.over and way.moves and now_s - way.began_s >= PASS_S:
+            if way.moves and now_s - way.began_s >= PASS_S and (way.over or way.first() is not None):
                 way.begin(now_s)
             if not way.over and (least is None or way.ahead_m * way.pace_s < least.ahead_m * least.pace_s):
                 least = way

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cells one client will ask for next, nearest in time first; without any I/O.
 
-The area that a client asks for is moved along its way, a step at a time: cells that come into it at a step are
-needed when the client is there.  The way is the route that the client told; without one, and beyond its end,
-straight on and to both sides of that, because nobody knows where it turns.  What it will ask for along a kilometre is not
-kept: the way is looked over again and again (a *pass*), and what is not in memory is wished for.  So a wish
-is never out of date, whatever moves, changes or gives way meanwhile.
+The area that a client asks for is moved along its way, a step at a time: cells that come into it at a step
+are needed when the client is there.  The way is the route that the client told; without one, and beyond its
+end, straight on and, a little later, to both sides of that, because nobody knows where it turns.  What it will
+ask for along a kilometre is not kept: the way is looked over again and again (a *pass*), and what is not in
+memory is wished for.  So a wish is never out of date, whatever moves, changes or gives way meanwhile.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Area
 
-__all__ = ["PASS_S", "WayAhead"]
+__all__ = ["PASS_S", "LookAhead", "WayAhead"]
 
 PASS_S: Final = 2.0
 """How often the way is looked over from its beginning."""
@@ -32,10 +32,19 @@ MOST_AHEAD_M: Final = 5000.0
 MOST_CELLS: Final = 20_000
 """Of an area with more cells nothing is fetched ahead."""
 SPREAD_RAD: Final = 0.5
-"""So far to both sides of straight on a client without a route may turn."""
-SIDES_S: Final = 8.0
-"""To the sides, and beyond a route's end, it is looked ahead so long only: much of it is fetched in vain."""
-_NONE: Final = np.empty(0, np.intp)
+"""So far to both sides of straight on a client without a route is taken to turn."""
+LATER_S: Final = 1.0
+"""So much later than what lies straight on is fetched what lies to the sides."""
+BESIDE_M: Final = 3.0
+"""So far to either side of the way told a client may be: in the next lane, almost."""
+
+
+class LookAhead(NamedTuple):
+    """How many seconds ahead is looked: along a way told; where none is known straight on; to its sides."""
+
+    way_s: float
+    straight_s: float
+    sides_s: float
 
 
 @dataclass(eq=False, slots=True)
@@ -75,18 +84,14 @@ class WayAhead:
 
     @property
     def pace_s(self) -> float:
-        """Seconds that the client takes for a metre."""
-        return 1.0 / max(self._speed_mps, SLOWEST_MPS)
-
-    @property
-    def _speed_mps(self) -> float:
-        motion = self.motion
-        return motion.fastest_mps if motion.route is not None else motion.speed_mps
+        """Seconds that the client takes for a metre: as fast as it was of late it may soon be again."""
+        return 1.0 / max(self.motion.fastest_mps, SLOWEST_MPS)
 
     @property
     def moves(self) -> bool:
         """Whether it is known where the client will be."""
-        return self._speed_mps >= SLOWEST_MPS
+        motion = self.motion
+        return (motion.fastest_mps if motion.route is not None else motion.speed_mps) >= SLOWEST_MPS
 
     def begin(self, now_s: float) -> None:
         """Begin another pass."""
@@ -99,7 +104,7 @@ class WayAhead:
         self._entered = (0.0, 0)
 
     def first(self) -> tuple[float, int] | None:
-        """What is needed next of what was found: in how many seconds, and its index; None where all was taken."""
+        """What is needed next of what was found: in how many seconds, and its index; None if all was taken."""
         if not self._found:
             return None
         ahead_m, index = self._found[0]
@@ -109,24 +114,24 @@ class WayAhead:
         """The first one is seen to."""
         self._found.popleft()
 
-    def look(self, catalogue: CatalogueView, look_ahead_s: float, step_m: float) -> None:
+    def look(self, catalogue: CatalogueView, ahead: LookAhead, step_m: float) -> None:
         """Go a step further along the way."""
         motion = self.motion
         if self._jumps != motion.jumps:
             self.begin(self.began_s)
         moved_m, self._travelled_m = motion.travelled_m - self._travelled_m, motion.travelled_m
         self.ahead_m = max(0.0, self.ahead_m - moved_m)
-        end_m = self._end_m(look_ahead_s)
+        end_m = self._end_m(ahead)
         if self.ahead_m >= end_m or not self.moves:
             self.over = True
             return
         if self._inside is None:
-            self._inside, _ = catalogue.query(self.area, MOST_CELLS)
+            self._inside, _ = catalogue.query(self.area.around(*self.area.center, self._wider_m), MOST_CELLS)
         if len(self._inside) > MOST_CELLS:
             self.over = True
             return
         here_m, self.ahead_m = self.ahead_m, min(self.ahead_m + step_m, end_m)
-        inside = self._around(catalogue, self.ahead_m)
+        inside = self._around(catalogue, self.ahead_m, self.ahead_m * self.pace_s <= ahead.sides_s)
         new = np.setdiff1d(inside, self._inside, assume_unique=True)
         needed_m = motion.travelled_m + here_m
         self._found.extend((needed_m, index) for index in new.tolist())
@@ -134,11 +139,13 @@ class WayAhead:
         self._entered = metres + self.ahead_m - here_m, cells + len(new)
         self._inside = inside
 
-    def _end_m(self, look_ahead_s: float) -> float:
+    def _end_m(self, ahead: LookAhead) -> float:
         """How far ahead is looked."""
-        speed = self._speed_mps
-        end_m = min(speed * look_ahead_s, MOST_AHEAD_M)
-        return end_m if self.motion.route is None else min(end_m, max(self._left_m, speed * SIDES_S))
+        speed = 1.0 / self.pace_s
+        if self.motion.route is None:
+            return min(speed * ahead.straight_s, MOST_AHEAD_M)
+        known_m = min(speed * ahead.way_s, self._left_m)
+        return min(max(known_m, speed * ahead.sides_s), MOST_AHEAD_M)
 
     @property
     def _left_m(self) -> float:
@@ -146,19 +153,26 @@ class WayAhead:
         route = self.motion.route
         return 0.0 if route is None else route.length_m - self.motion.along_m
 
-    def _around(self, catalogue: CatalogueView, ahead_m: float) -> NDArray[np.intp]:
-        """Cells that the client may need when it has come so far."""
+    @property
+    def _wider_m(self) -> float:
+        """Nobody drives in the very middle of the way."""
+        return BESIDE_M if self.motion.route is not None else 0.0
+
+    def _around(self, catalogue: CatalogueView, ahead_m: float, sides: bool) -> NDArray[np.intp]:
+        """Cells that the client may need when it has come so far, to the sides of where nobody knows, too."""
         motion, left_m = self.motion, self._left_m
         x, y, heading = motion.x, motion.y, math.atan2(motion.vy, motion.vx)
         if motion.route is not None:
             x, y = motion.route.at(motion.along_m + ahead_m).tolist()
             heading = motion.route.last_heading
         beyond_m = max(ahead_m - left_m, 0.0)
-        both = beyond_m > 0.0 and ahead_m * self.pace_s <= SIDES_S
-        found = [
-            catalogue.query(
-                self.area.around(x + beyond_m * math.cos(angle), y + beyond_m * math.sin(angle)), MOST_CELLS
-            )[0]
-            for angle in ((heading, heading + SPREAD_RAD, heading - SPREAD_RAD) if both else (heading,))
+        ways = [(heading, beyond_m)]
+        if sides and beyond_m:
+            side_m = max(0.0, beyond_m - LATER_S / self.pace_s)
+            ways += [(heading + SPREAD_RAD, side_m), (heading - SPREAD_RAD, side_m)]
+        areas = [
+            self.area.around(x + far_m * math.cos(angle), y + far_m * math.sin(angle), self._wider_m)
+            for angle, far_m in ways
         ]
+        found = [catalogue.query(area, MOST_CELLS)[0] for area in areas]
         return found[0] if len(found) == 1 else np.unique(np.concatenate(found))
