@@ -213,7 +213,9 @@ class CellRequests:
         """Count what a client that moves on has to wait for: somebody could have known that it would come."""
         load = self._scheduler.loads.by_key.get(key)
         if load is None or load.prefetch:
-            self._statistics.add("cells_late", wanted.session.motion.travelled_m > 0.0)
+            if wanted.session.motion.travelled_m > 0.0:
+                self._statistics.add("cells_late")
+                self._cache.events.late.note(wanted.session, self._cache.wire_id(key.cell_id), key.layer)
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:

@@ -44,7 +44,7 @@ class Prefetcher:
         self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, ride_out_s: float
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
-        self.share = share
+        self.share, self.ride_out_s = share, ride_out_s
         self.prefetch = Prefetch(self._is_absent, ride_out_s)
         self._now_s = 0.0
         self._next_s = -math.inf
@@ -143,6 +143,13 @@ class Prefetcher:
         """There is no such load any more."""
         self._running.pop(load, None)
         self._next_s = -math.inf
+
+    def shortage(self, now_s: float) -> int:
+        """What keeps cells from being fetched ahead: 0 nothing, 1 their share is full, 2 the budget is."""
+        ledger = self._cache.ledger
+        if ledger.prefetched_bytes + sum(self._running.values()) >= self.share * ledger.budget_bytes:
+            return 1 if self.share else 0
+        return 2 if now_s < self._full_until_s else 0
 
     @property
     def next_s(self) -> float:
