@@ -104,7 +104,7 @@ class KeepingAhead:
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         loaders = max(limit - 1, 1)  # one is kept for what somebody waits for
         statistics.set("loadable_per_1000s", int(1e3 * loaders / health.mean_s) if health.mean_s else 0)
-        statistics.set("origin_out", health.is_out)
+        statistics.set("origin_out", int(health.is_out))
         if health.is_out and self._out_since_s is None:
             self._out_since_s = now_s
             statistics.add("origin_outages")
