@@ -77,6 +77,8 @@ class InnerDaemon:
         cache_dir: str,
         shm_dir: str = "",
         name: str = "inner",
+        prefetch_share: float = 0.0,
+        ride_out_s: float = 0.0,
     ) -> None:
         prepare_process()
         self.shm_dir = shm_dir or tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
@@ -107,7 +109,10 @@ class InnerDaemon:
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(self.cache, self.map_switch, self.pool, clock=self.now_s)
+        self.scheduler = Scheduler(
+            self.cache, self.map_switch, self.pool, clock=self.now_s, prefetch_share=prefetch_share,
+            ride_out_s=ride_out_s,
+        )  # fmt: skip
         self.loads = self.scheduler.loads
         self.watched.watch(self.reclaimer.closer.fd, self.scheduler.hear_of_freed)
         self.watched.watch(pins.fd, lambda: self.scheduler.hear_of_closes(self.now_s()))
