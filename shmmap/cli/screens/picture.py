@@ -245,6 +245,7 @@ def _legend(states: set[str], with_route: bool, with_clients: bool) -> list[tupl
     names = {
         "": "cell on disk",
         "resident": "cell in shared memory",
+        "fetched": "fetched ahead",
         "stale": "stale cell",
         "zombie": "zombie",
         "saved": "chunk on disk",
