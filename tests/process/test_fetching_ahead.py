@@ -145,19 +145,26 @@ def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path)
 
 
 def test_load_times_by_what_was_done(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:
-    one = daemon(divided_map.root, "--cache-dir", str(tmp_path / "cache"), "--prefetch-share", "0")
+    """A daemon that keeps nothing in memory for the next one finds computed layers on disk."""
+    one = daemon(divided_map.root, "--cache-dir", str(tmp_path / "cache"))
     shmmap = Shmmap(one, tmp_path)
-    with connect(one.endpoint, timeout=PATIENCE_S) as client:
-        client.area(Circle(0, 0, 1), "voxel(leaf=2.0)", wait=PATIENCE_S).raise_for_failures()
-        client.release()
-        client.evict()
-        client.area(Circle(0, 0, 1), "voxel(leaf=2.0)", wait=PATIENCE_S).raise_for_failures()
-        client.area(Circle(0, 0, 1), wait=PATIENCE_S).raise_for_failures()
-    waiting = Patience()
-    while waiting((found := shmmap.json("top")["latency_s"])["load"]["count"] < 12):
-        pass
     names = ("load", "load_points", "load_computed", "load_cached")
-    assert [found[name]["count"] for name in names] == [12, 4, 4, 4]
-    assert all(found[name]["p50"] > 0.0 for name in names)
+
+    def counts(wanted: tuple[int, ...]) -> None:
+        with connect(one.endpoint, timeout=PATIENCE_S) as client:
+            for layer in ("voxel(leaf=2.0)", "points"):
+                client.area(Circle(0, 0, 1), layer, wait=PATIENCE_S).raise_for_failures()
+        waiting = Patience()
+        while waiting((found := shmmap.json("top")["latency_s"])["load"]["count"] < sum(wanted)):
+            pass
+        assert [found[name]["count"] for name in names] == [sum(wanted), *wanted]
+        assert all(found[name]["p50"] > 0.0 for name in names if found[name]["count"])
+
+    counts((4, 4, 0))
+    assert all(title in shmmap("top") for title in ("  of points", "  computed"))
+    assert one.stop() == 0
+    one.start()
+    counts((4, 0, 4))
     shown = shmmap("top")
-    assert all(title in shown for title in ("  of points", "  computed", "  disk cache"))
+    assert "  disk cache" in shown
+    assert "  computed" not in shown
