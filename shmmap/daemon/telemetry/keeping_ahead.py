@@ -75,6 +75,8 @@ class KeepingAhead:
     def look(self, now_s: float) -> None:
         """Go on looking, and bring the gauges up to date."""
         self._look_at_origin(now_s)
+        if self._cache.unentered:  # after a reload it takes a moment until what is in memory is found
+            return
         for _ in range(LOOKS_A_BEAT):
             current = self._round
             if current is None or current.catalogue is not self._cache.catalogue:
@@ -91,16 +93,13 @@ class KeepingAhead:
 
     def _look_at_origin(self, now_s: float) -> None:
         """What loads tell of where the map comes from, and what keeps cells from being fetched ahead."""
-        prefetcher, statistics, ledger = (
-            self._scheduler.prefetcher,
-            self._cache.statistics,
-            self._cache.ledger,
-        )
+        prefetcher, statistics = self._scheduler.prefetcher, self._cache.statistics
+        budget_bytes = self._cache.ledger.budget_bytes
         health, limit = prefetcher.prefetch.health, self._scheduler.pool.limit
         statistics.set("most_workers", limit)
         statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
         statistics.set("look_ahead_ns", int(prefetcher.prefetch.look_ahead_s * 1e9))
-        statistics.set("prefetch_budget_bytes", int(prefetcher.share * ledger.budget_bytes))
+        statistics.set("prefetch_budget_bytes", int(prefetcher.share * budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         loaders = max(limit - 1, 1)  # one is kept for what somebody waits for
         statistics.set("loadable_per_1000s", int(1e3 * loaders / health.mean_s) if health.mean_s else 0)
