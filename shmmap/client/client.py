@@ -15,6 +15,7 @@ from shmmap.client.cell_set import CellSet
 from shmmap.client.discovery import candidates
 from shmmap.client.held import Held, HeldCells
 from shmmap.client.operator_requests import OperatorRequests, several
+from shmmap.client.route import sendable
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest
 from shmmap.protocol import messages
@@ -156,7 +157,8 @@ class Client(OperatorRequests):
             Seconds the daemon may take to load what is not in memory; None: take what is there, the
             rest is `CellSet.pending`.
         intent
-            Where this process is and goes; the daemon keeps what is near.
+            Where this process is and goes: the daemon fetches what it will ask for next, and keeps what is
+            near.
 
         Raises
         ------
@@ -168,8 +170,8 @@ class Client(OperatorRequests):
             This user may not read the segments, or the process has no room for more mappings.
         """
         specs = several(layers)
-        message = messages.area_to_message(area)
-        return self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, intent), wait)
+        message, sent = messages.area_to_message(area), sendable(intent)
+        return self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
 
     def differential(
         self,
@@ -203,10 +205,10 @@ class Client(OperatorRequests):
         Other parameters and errors are those of `area`.
         """
         specs = several(layers)
-        message = messages.area_to_message(area)
+        message, sent = messages.area_to_message(area), sendable(intent)
         mine = HeldCells(held, by_name=by_name)
         return self._session.ask_cells(
-            lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, intent),
+            lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, sent),
             wait,
             removed=mine.removed,
             populate=populate,
@@ -227,8 +229,8 @@ class Client(OperatorRequests):
         parameters and errors are those of `area`.
         """
         specs = several(layers)
-        wanted = several(ids)
-        return self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, intent), wait)
+        wanted, sent = several(ids), sendable(intent)
+        return self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, sent), wait)
 
     def release(self) -> int:
         """Tell the daemon now what this process let go since the last request; returns how many versions.

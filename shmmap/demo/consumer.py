@@ -4,7 +4,8 @@
 ``python -m shmmap.demo.consumer shared ENDPOINT RADIUS TASK`` follows through a `MapWindow`;
 ``... private MAP RADIUS TASK`` reads the same PCD files into memory of its own, as a program does that
 knows no shared memory.  All else is the same.  It reads one pose a line from stdin and answers with one
-line on stdout, both JSON, until stdin ends.  A pose with ``"drive_on": true`` is answered with what is there,
+line on stdout, both JSON, until stdin ends; a line with a ``"route"``, the way that the poses will take, is
+not answered.  A pose with ``"drive_on": true`` is answered with what is there,
 complete or not, as a control loop must.
 """
 
@@ -14,7 +15,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeAlias
 
@@ -63,9 +64,13 @@ class Cloud:
 
 
 class MapAround(Protocol):
-    """The cells around a vehicle."""
+    """The cells around a vehicle.
+
+    ``route`` is the way that it will take, (x, y) each, metres, map frame.
+    """
 
     clouds: dict[str, Cloud]
+    route: Sequence[tuple[float, float]]
 
     def follow(self, pose: Pose) -> None:
         """What a control loop calls at every pose."""
@@ -95,13 +100,14 @@ class SharedMap:
         import shmmap
 
         self.clouds: dict[str, Cloud] = {}
+        self.route: Sequence[tuple[float, float]] = ()
         self._window = shmmap.MapWindow(
             endpoint, radius, update_distance=_UPDATE_METRES, name="demo consumer"
         )
 
     def follow(self, pose: Pose) -> None:
         """Tell the window where the vehicle is; its thread does the rest."""
-        self._window.move_to(pose.x, pose.y, heading=pose.heading)
+        self._window.move_to(pose.x, pose.y, heading=pose.heading, route=self.route)
 
     def complete(self) -> list[Cloud]:
         """Wait for the window's thread; returns the cells that are new."""
@@ -148,6 +154,7 @@ class PrivateMap:
         from shmmap.origin.map_directory import open_map
 
         self.clouds: dict[str, Cloud] = {}
+        self.route: Sequence[tuple[float, float]] = ()
         self._new: list[Cloud] = []
         self._catalogue = open_map(map_path).load()
         self._radius = radius
@@ -251,6 +258,9 @@ def main(argv: list[str]) -> int:
     _say({"ready": True})
     for line in sys.stdin:
         order = json.loads(line)
+        if "route" in order:
+            around.route = [(x, y) for x, y in order["route"]]
+            continue
         drive_on = order.pop("drive_on")
         pose = Pose(**order)
         current = not drive_on or around.current()

@@ -148,7 +148,7 @@ def run_demo(
         private = show.private(many)
         with DaemonProcess(town.path, *options, command=with_us()) as daemon:
             watched = WatchedDaemon(daemon)
-            with Fleet("shared", daemon.endpoint, settings.radius, many) as fleet:
+            with Fleet("shared", daemon.endpoint, settings.radius, many, town.way) as fleet:
                 rounds[many] = Round(show.shared(fleet, watched), private)
                 traffic, resident = watched.traffic(), statistics_now(daemon).cells
                 progress.stage(f"Killing the daemon while {many} processes keep driving", len(town.onward))
@@ -177,12 +177,12 @@ class _Show:
         private = self.private(count)
         with DaemonProcess(self._town.path, *self._options, command=with_us()) as daemon:
             watched = WatchedDaemon(daemon)
-            with Fleet("shared", daemon.endpoint, self._settings.radius, count) as fleet:
+            with Fleet("shared", daemon.endpoint, self._settings.radius, count, self._town.way) as fleet:
                 return self.shared(fleet, watched), private
 
     def private(self, count: int) -> DriveResult:
         """Drive with a copy each."""
-        with Fleet("private", self._town.path, self._settings.radius, count) as fleet:
+        with Fleet("private", self._town.path, self._settings.radius, count, self._town.way) as fleet:
             self._stage(
                 f"{_processes(count)} with a private copy each" if count > 1 else "1 process, private copy"
             )

@@ -90,6 +90,11 @@ class TownMap:
     onward: tuple[Pose, ...]
     build_s: float
 
+    @property
+    def way(self) -> tuple[Pose, ...]:
+        """All of the way through it."""
+        return self.route + self.onward
+
 
 class Progress(Protocol):
     """What is told while the demonstration runs."""

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import IO, Final, Literal
@@ -74,6 +75,8 @@ class Fleet:
         Of every consumer's window, metres.
     processes
         How many.
+    route
+        The way that they will be sent along.
 
     Used as a context manager: all consumers are ready on entry, and gone on exit.
 
@@ -89,11 +92,13 @@ class Fleet:
         source: str,
         radius: float,
         processes: int = len(TASKS),
+        route: Sequence[Pose] = (),
     ) -> None:
         tasks = list(itertools.islice(itertools.cycle(TASKS), processes))
         self._commands = [
             [sys.executable, "-m", "shmmap.demo.consumer", kind, source, str(radius), task] for task in tasks
         ]
+        self._route = [(pose.x, pose.y) for pose in route]
         self._processes: list[subprocess.Popen[str]] = []
         self._complaints: list[IO[str]] = []
 
@@ -119,6 +124,7 @@ class Fleet:
                     )
                     self._processes.append(process)
             self._answers()
+            self._tell({"route": self._route})
         except BaseException:
             self.stop()
             raise
@@ -137,7 +143,12 @@ class Fleet:
         drive_on
             Whether they answer with the cells they have, instead of waiting until none is missing.
         """
-        line = json.dumps({**asdict(pose), "drive_on": drive_on}) + "\n"
+        self._tell({**asdict(pose), "drive_on": drive_on})
+        return [StepReport(**json.loads(answer)) for answer in self._answers()]
+
+    def _tell(self, order: dict[str, object]) -> None:
+        """Send a line to everybody."""
+        line = json.dumps(order) + "\n"
         for index, process in enumerate(self._processes):
             assert process.stdin is not None  # noqa: S101  it is a pipe, see above
             try:
@@ -145,7 +156,6 @@ class Fleet:
                 process.stdin.flush()
             except BrokenPipeError:
                 raise self._failure(index, "ended") from None
-        return [StepReport(**json.loads(answer)) for answer in self._answers()]
 
     def stop(self) -> None:
         """End all consumers."""

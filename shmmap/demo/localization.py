@@ -166,5 +166,5 @@ class Localization:
             "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.endpoint, "--json",
             "--json-lines", "/dev/stdout", "--quiet",
             "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(SEEN_METRES),
-            "--update-distance", "10",
+            "--update-distance", "10", "--route", str(self._work / "truth.txt"),
         ]  # fmt: skip

@@ -10,11 +10,13 @@ from typing import Final, NamedTuple
 
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
+from shmmap.doctor.keeping_ahead import ahead_verdict
 from shmmap.doctor.patient import Machine, Patient
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
 __all__ = [
+    "check_ahead",
     "check_cache",
     "check_container",
     "check_huge_pages",
@@ -91,6 +93,15 @@ def check_cache(patient: Patient) -> Finding:
         return skip(name, "no daemon runs")
     verdict = cache_verdict(patient.seen.counters)
     return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
+
+
+def check_ahead(patient: Patient) -> Finding:
+    """Are cells in memory before clients come to them?  The verdict of ``status``."""
+    name = "fetching ahead"
+    if not patient.alive or patient.seen is None:
+        return skip(name, "no daemon runs")
+    verdict = ahead_verdict(patient.seen.counters)
+    return (ok if verdict.is_good else warn)(name, verdict.text, verdict.hint)
 
 
 def check_container(patient: Patient) -> Finding:

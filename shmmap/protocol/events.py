@@ -25,6 +25,7 @@ __all__ = [
     "Evicted",
     "Failed",
     "Joined",
+    "Late",
     "Left",
     "LiveChanged",
     "LiveDamaged",
@@ -63,7 +64,7 @@ class Loaded(_Numbered, tag="loaded", frozen=True):
     """A segment can be handed out; ``load_ns`` is 0 for one that was retired, still whole and wanted again.
 
     ``again`` says that this very version had been evicted to make room; ``replaces`` is the version
-    that it supersedes, 0 for none.
+    that it supersedes, 0 for none; ``ahead`` says that nobody had asked for it yet.
     """
 
     id: str
@@ -74,6 +75,7 @@ class Loaded(_Numbered, tag="loaded", frozen=True):
     load_ns: int
     again: bool = False
     replaces: int = 0
+    ahead: bool = False
 
 
 class Changed(_Numbered, tag="changed", frozen=True):
@@ -127,6 +129,20 @@ class Pressure(_Numbered, tag="pressure", frozen=True):
     used_bytes: int
     pinned_bytes: int
     zombie_bytes: int
+
+
+class Late(_Numbered, tag="late", frozen=True):
+    """A client on its way had to wait for cells: how many since the last such event, and one of them.
+
+    At most one a second for each client.
+    """
+
+    session: int
+    pid: int
+    client: str
+    cells: int
+    id: str
+    layer: str
 
 
 class Reloaded(_Numbered, tag="reload", frozen=True):
@@ -223,6 +239,7 @@ Event: TypeAlias = (
     | Failed
     | Retried
     | Pressure
+    | Late
     | Reloaded
     | LongTurn
     | Joined

@@ -107,4 +107,4 @@ __all__ = [
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (1, 4)
+PROTOCOL_VERSION: Final = (1, 5)

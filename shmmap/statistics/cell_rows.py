@@ -21,6 +21,7 @@ ID_BYTES: Final = 104
 LAYER_BYTES: Final = 40
 ID_CUT: Final = 1
 LAYER_CUT: Final = 2
+AHEAD: Final = 4
 
 
 @dataclass(slots=True)
@@ -52,6 +53,8 @@ class CellRow:
         When it was last handed out, CLOCK_MONOTONIC.
     load_ns
         How long loading it took.
+    ahead
+        It was fetched ahead, and nobody has asked for it yet.
     """
 
     id: str
@@ -67,6 +70,7 @@ class CellRow:
     load_ns: int = 0
     id_cut: bool = False
     layer_cut: bool = False
+    ahead: bool = False
 
 
 def _fit(text: str, limit: int, *, keep_end: bool) -> tuple[bytes, bool]:
@@ -85,7 +89,7 @@ def pack_cell(row: CellRow) -> bytes:
     """Return the 256 bytes of one cell row."""
     cell_id, id_cut = _fit(row.id, ID_BYTES, keep_end=True)
     layer, layer_cut = _fit(row.layer, LAYER_BYTES, keep_end=False)
-    flags = id_cut * ID_CUT + layer_cut * LAYER_CUT
+    flags = id_cut * ID_CUT + layer_cut * LAYER_CUT + row.ahead * AHEAD
     packed = CELL_ROW.pack(
         row.version, row.bytes, row.points, *row.box, row.hits, row.last_use_monotonic_ns, row.load_ns,
         row.segment.encode(), CELL_STATES.index(row.state), flags, len(cell_id), len(layer), 0,
@@ -124,4 +128,5 @@ def unpack_cell(data: memoryview) -> CellRow | None:
         load_ns=load_ns,
         id_cut=bool(flags & ID_CUT),
         layer_cut=bool(flags & LAYER_CUT),
+        ahead=bool(flags & AHEAD),
     )

@@ -31,8 +31,9 @@ WINDOWED: Final = {
     "evictions": "Segments retired to make room",
     "loads_after_eviction": "Loads of cells that had been evicted to make room",
     "refused_over_budget": "Cells refused because the budget is full",
+    "cells_late": "Cells that a client on its way asked for and had to wait for",
 }
-"""Counters of which the last 10 s, 1 min and 10 min are told: whether the cache is large enough."""
+"""Counters of which the last 10 s, 1 min and 10 min are told: what the present state is judged by."""
 
 TURN_KINDS: Final = {
     "clients": "clients were heard",
@@ -98,7 +99,7 @@ COUNTERS: Final = (
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
-    Counter("cells_late", "counter", "", "Cells that a client on its way asked for and had to wait for"),
+    Counter("cells_late", "counter", "", WINDOWED["cells_late"]),
     Counter("prefetch_started", "counter", "", "Loads begun before anybody asked for the cell"),
     Counter("prefetch_used", "counter", "", "Segments fetched ahead that somebody then asked for"),
     Counter(
@@ -106,7 +107,50 @@ COUNTERS: Final = (
     ),
     Counter("prefetch_overtaken", "counter", "", "Cells asked for while they were being fetched ahead"),
     Counter("bytes_prefetched", "gauge", "bytes", "Memory of what was fetched ahead and not asked for yet"),
-    Counter("bytes_used", "counter", "bytes", "Segment bytes handed out for the first time"),
+    Counter(
+        "bytes_used",
+        "counter",
+        "bytes",
+        "Segment bytes handed out for the first time; bytes_loaded by this: over-fetch",
+    ),
+    Counter(
+        "prefetch_budget_bytes", "gauge", "bytes", "Most that bytes_prefetched may come to; 0: never ahead"
+    ),
+    Counter(
+        "prefetch_short",
+        "gauge",
+        "",
+        "What keeps cells from being fetched ahead: 0 nothing, 1 their share is full, 2 the budget is",
+    ),
+    Counter(
+        "ride_out_ns", "gauge", "ns", "For so long the map's files may be out of reach unnoticed (setting)"
+    ),
+    Counter("look_ahead_ns", "gauge", "ns", "How far ahead cells are fetched"),
+    Counter(
+        "ahead_ns",
+        "gauge",
+        "ns",
+        "All that moving clients will need for so long is in memory, of the least one",
+    ),
+    Counter("moving_clients", "gauge", "", "Clients that move, and will need other cells"),
+    Counter("routed_clients", "gauge", "", "Those of them that are on a route that they told"),
+    Counter("fastest_mm_per_s", "gauge", "mm/s", "Speed of the fastest of them"),
+    Counter(
+        "needed_per_1000s",
+        "gauge",
+        "",
+        "Loads in 1000 s that the clients' motion needs, as far ahead as cells are fetched",
+    ),
+    Counter(
+        "loadable_per_1000s",
+        "gauge",
+        "",
+        "Loads in 1000 s that loaders can do, as long as the last ones took",
+    ),
+    Counter("most_workers", "gauge", "", "Most loader processes that there may be"),
+    Counter("origin_out", "gauge", "", "1 while no load succeeds: the map's files are out of reach"),
+    Counter("origin_outages", "counter", "", "Times that no load succeeded"),
+    Counter("last_outage_ns", "gauge", "ns", "How long the last time lasted, or the present one does"),
     Counter(
         "live_restarts", "counter", "", "Times the process that keeps live maps ended, and was started anew"
     ),
@@ -128,4 +172,7 @@ HISTOGRAMS: Final = (
     Counter("turn", "histogram", "ns", "Processor time of a turn of the serving loop: others wait so long"),
     Counter("wait", "histogram", "ns", "From a request that had to wait for loads to its answer"),
     Counter("load", "histogram", "ns", "From handing a load to a worker to its published segment"),
+    Counter("load_points", "histogram", "ns", "A loader's own time for points read from the map's file"),
+    Counter("load_computed", "histogram", "ns", "A loader's own time for a layer that it computed"),
+    Counter("load_cached", "histogram", "ns", "A loader's own time for a layer out of the disk cache"),
 )

@@ -17,6 +17,7 @@ from shmmap.statistics.reader import read_statistics
 from tests.cpp.conftest import DaemonFactory
 from tests.support.cpp_client import CppProgram
 from tests.support.divided_map import DividedMap
+from tests.support.patience import Patience
 
 LAYERS = ("points", "ndt(leaf=2.0)")
 STATES = ("resident", "stale", "zombie")
@@ -39,7 +40,11 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
     """Of a daemon that was stopped: nothing changes between the two readers."""
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint, name="somebody") as client:
-        client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, intent=shmmap.Intent(1.5, 2.0))
+        going = shmmap.Intent(1.5, 2.0, vx=5.0, route=((0.0, 0.0), (60.0, 0.0)))
+        client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, intent=going)
+        waiting = Patience()
+        while waiting(not any(row.ahead for row in read_statistics(one.instance, one.shm_dir).cells)):
+            pass
         one.send(signal.SIGSTOP)
         os.waitid(os.P_PID, one.pid, os.WSTOPPED)
         answer = program.told("statistics", one.instance, one.shm_dir)
@@ -64,11 +69,13 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
         [
             cell.id, cell.layer, cell.segment, str(cell.version), str(cell.bytes), str(cell.points),
             str(1 + STATES.index(cell.state)), str(cell.hits), " ".join(f"{side:.17g}" for side in cell.box),
+            str(int(cell.ahead)),
         ]
         for cell in python.cells
     ]  # fmt: skip
     assert sorted(rows(answer, "cell")) == sorted(cells)
     assert len(cells) > 10
+    assert {cell.ahead for cell in python.cells} == {False, True}
     (listed,) = python.clients
     assert rows(answer, "client") == [
         [

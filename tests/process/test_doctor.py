@@ -49,6 +49,7 @@ def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) ->
         "map",
         "shared memory",
         "cache size",
+        "fetching ahead",
         "leases",
         "open files",
         "leftovers",

@@ -21,8 +21,10 @@ from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
+from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.drive_sender import PERIOD_S, to_and_fro
+from tests.support.patience import Patience
 from tests.support.town_drive import TownDrive, make_town_drive
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher"]
@@ -67,7 +69,7 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     words += ["--steady", "--odometry", str(drive.truth), "--tum", str(tmp_path / "out.tum")]
     address = f"ipc://{tmp_path}/poses"
     words += ["--plot", str(tmp_path / "out.svg"), "--publish", address, "--listener-wait", "60", "--json"]
-    words += ["--json-lines", str(tmp_path / "out.jsonl")]
+    words += ["--json-lines", str(tmp_path / "out.jsonl"), "--route", str(drive.truth)]
     listener = subprocess.Popen(
         [sys.executable, "-m", "tests.support.pose_listener", address, "36"],
         stdout=subprocess.PIPE,
@@ -186,6 +188,43 @@ def test_a_map_that_cannot_be_made_is_an_error_and_not_the_end(
         assert other.cells.keys() != first.cells.keys()
         assert made == 4
         assert maps.error is None
+
+
+def test_the_daemon_is_told_the_way_ahead(drive: TownDrive, daemon: DaemonFactory) -> None:
+    """Also when the map is only looked after: what is said then is as true as what was said before."""
+    one = daemon(drive.map_dir)
+    rules = MapRules(update_distance=10.0, map_radius=30.0, lidar_radius=15.0)
+    x, y = drive.poses[0, :2]
+    waiting = Patience()
+    with (
+        StatisticsReader(one.instance, one.shm_dir) as statistics,
+        MapUpdater(one.endpoint, rules, route=drive.poses[:, :2]) as maps,
+    ):
+        maps.map_at(x, y, vx=3.0, vy=4.0)
+        before = statistics.snapshot(tables=False)
+        while waiting((now := statistics.snapshot(tables=False)).counters["routed_clients"] < 1):
+            pass
+        while waiting(now.counters["requests"] < before.counters["requests"] + 4):  # one a second
+            now = statistics.snapshot(tables=False)
+        told = now.counters["moving_clients"], now.counters["fastest_mm_per_s"]
+        assert told == (1, 5000)
+
+
+@pytest.mark.parametrize(("name", "code"), [("none.csv", 66), ("empty.csv", 65)])
+def test_a_route_that_cannot_be_read(drive: TownDrive, tmp_path: Path, name: str, code: int) -> None:
+    (tmp_path / "empty.csv").touch()
+    words = [
+        "follow",
+        "--scans",
+        str(drive.scans),
+        "--truth",
+        str(drive.truth),
+        "--route",
+        str(tmp_path / name),
+    ]
+    done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    assert name in done.stderr
 
 
 def test_rules_that_make_no_sense_are_refused() -> None:

@@ -156,7 +156,8 @@ void print_statistics(const std::string& instance, const std::string& shm_dir) {
   for (const auto& one : found.cells)
     std::cout << "cell\t" << one.id << "\t" << one.layer << "\t" << one.segment << "\t" << one.version << "\t"
               << one.bytes << "\t" << one.points << "\t" << static_cast<int>(one.state) << "\t" << one.hits << "\t"
-              << one.min_x << " " << one.min_y << " " << one.max_x << " " << one.max_y << "\n";
+              << one.min_x << " " << one.min_y << " " << one.max_x << " " << one.max_y << "\t" << one.ahead
+              << "\n";
   for (const auto& one : found.clients)
     std::cout << "client\t" << one.session << "\t" << one.pid << "\t" << one.uid << "\t" << one.cells << "\t"
               << one.bytes << "\t" << one.client << "\t" << one.command << "\t"

@@ -23,6 +23,7 @@ BoxTuple: TypeAlias = tuple[float, float, float, float]
 GLYPHS: Final = {
     # state: glyph, style on a terminal
     "resident": ("#", "green"),
+    "fetched": ("+", "cyan"),
     "stale": ("s", "yellow"),
     "zombie": ("r", "magenta"),
     "disk": (".", "bright_black"),
@@ -36,7 +37,7 @@ GLYPHS: Final = {
     "client": ("@", "bold red"),
     "none": (" ", ""),
 }
-_ORDER: Final = ("zombie", "stale", "resident")  # the last one of a cell's states is what is drawn
+_ORDER: Final = ("zombie", "stale", "fetched", "resident")  # the last of a cell's states is what is drawn
 CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wide
 
 
@@ -77,9 +78,19 @@ class Scene:
     def by_cell(self) -> dict[str, list[CellRow]]:
         """Segments of each cell, the most telling state last."""
         found: dict[str, list[CellRow]] = {}
-        for row in sorted(self.rows, key=lambda row: _ORDER.index(row.state) if row.state in _ORDER else -1):
+        for row in sorted(self.rows, key=_rank):
             found.setdefault(row.id, []).append(row)
         return found
+
+
+def state_of(row: CellRow) -> str:
+    """Name in `GLYPHS` of a segment's state; ``fetched`` is one that nobody has asked for yet."""
+    return "fetched" if row.ahead else row.state
+
+
+def _rank(row: CellRow) -> int:
+    state = state_of(row)
+    return _ORDER.index(state) if state in _ORDER else -1
 
 
 # --- on a terminal ------------------------------------------------------------------------------------
@@ -117,7 +128,7 @@ def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
     for _, box in scene.disk:
         fill(box, "disk")
     for rows in scene.by_cell().values():
-        fill(rows[-1].box, rows[-1].state)
+        fill(rows[-1].box, state_of(rows[-1]))
     for square in scene.chunks:
         fill(square.box, square.state)
     for client in scene.clients:
@@ -154,7 +165,8 @@ def svg(scene: Scene) -> str:
     known = scene.by_cell()
     cells = [CellSquare(box, "", f"{name}\non disk") for name, box in scene.disk if name not in known]
     cells += [
-        CellSquare(rows[-1].box, rows[-1].state, _cell_title(rows, scene.now_ns)) for rows in known.values()
+        CellSquare(rows[-1].box, state_of(rows[-1]), _cell_title(rows, scene.now_ns))
+        for rows in known.values()
     ]
     cells += scene.chunks
     vehicles, windows = [], []
@@ -177,7 +189,7 @@ def _cell_title(rows: Sequence[CellRow], now_ns: int) -> str:
     lines = [rows[-1].id]
     for row in rows:
         idle_s = max(now_ns - row.last_use_monotonic_ns, 0) * 1e-9
-        state = "retired" if row.state == "zombie" else row.state
+        state = {"zombie": "retired", "fetched": "fetched ahead"}.get(state_of(row), row.state)
         lines.append(
             f"{row.layer}: {state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
             f" used {format_duration(idle_s)} ago, loaded in {format_duration(row.load_ns * 1e-9)}"

@@ -30,6 +30,7 @@ _STYLE: Final = """
   .title { font-size: 17px; font-weight: 600; }
   .cell { fill: none; stroke: #52606d; stroke-opacity: .28; stroke-width: .6; }
   .resident { fill: #0b7285; fill-opacity: .20; stroke: #0b7285; stroke-opacity: .75; stroke-width: .9; }
+  .fetched { fill: #5f3dc4; fill-opacity: .18; stroke: #5f3dc4; stroke-opacity: .75; stroke-width: .9; }
   .stale { fill: #e8590c; fill-opacity: .30; stroke: #e8590c; stroke-width: .9; }
   .zombie { fill: #868e96; fill-opacity: .40; stroke: #495057; stroke-width: .9; stroke-dasharray: 3 2; }
   .saved { stroke: #9aa5b1; stroke-opacity: .8; }
@@ -244,6 +245,7 @@ def _legend(states: set[str], with_route: bool, with_clients: bool) -> list[tupl
     names = {
         "": "cell on disk",
         "resident": "cell in shared memory",
+        "fetched": "fetched ahead",
         "stale": "stale cell",
         "zombie": "zombie",
         "saved": "chunk on disk",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from shmmap.cli.screens.live_maps import STATE_STYLES, live_problems
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
 from shmmap.doctor.cache_size import cache_verdict
+from shmmap.doctor.keeping_ahead import ahead_verdict, over_fetch
 from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
@@ -35,6 +36,16 @@ _STATE_STYLES: Final = {
     "hung": "bold red",
     "dead": "bold red",
 }
+_LATENCIES: Final = {
+    "request": "requests",
+    "wait": "load waits",
+    "load": "load time",
+    "load_points": "  of points",
+    "load_computed": "  computed",
+    "load_cached": "  disk cache",
+}
+_SOURCES: Final = ("load_points", "load_computed", "load_cached")
+"""A loader's own time by what it did, told of where it was done."""
 _PARTS: Final = (
     # part, what it is called, glyph, style
     ("in_use", "in use", "█", "cyan"),
@@ -95,6 +106,7 @@ def screen(
     lines += _flowing("cache", words, width, gap=1)
     if verdict.hint:
         lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
+    lines += _ahead(counters, width)
     lines += _latencies(found, earlier)
     lines += _flowing("loop", _longest_turns(counters), width)
     lines += _flowing("queue", _loads(counters), width)
@@ -187,12 +199,34 @@ def _hits(counters: dict[str, int]) -> list[Line]:
     return pieces
 
 
+def _ahead(counters: dict[str, int], width: int) -> list[Line]:
+    """Whether cells are in memory before clients come to them, and what was done for that."""
+    verdict, ratio = ahead_verdict(counters), over_fetch(counters)
+    first, *rest = verdict.text.split(": ", 1)
+    state = (first + ":" * bool(rest), "green" if verdict.is_good else "bold red")
+    words: list[Line] = [[state], *([(word, "")] for word in "".join(rest).split())]
+    lines = _flowing("ahead", words, width, gap=1)
+    if verdict.hint:
+        lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
+    late, lately = counters.get("cells_late", 0), counters.get("cells_late_1min", 0)
+    if counters.get("prefetch_started") or late:
+        done: list[Line] = [
+            [(f"fetched ahead {counters['prefetch_started']:,}", "")],
+            [(f"then asked for {counters['prefetch_used']:,}", "")],
+            [(f"in vain {counters['prefetch_in_vain']:,}", "")],
+            [(f"late {late:,} ({lately:,} in 1 min)", "red" if lately else "")],
+        ]
+        if ratio is not None:
+            done.append([(f"loaded {ratio:.2f} times what was used", "")])
+        lines += _flowing("", done, width)
+    return lines
+
+
 def _latencies(found: Snapshot, earlier: Snapshot | None) -> list[Line]:
     lines = []
-    titles = (("request", "requests"), ("wait", "load waits"), ("load", "load time"))
-    for name, title in titles:
+    for name, title in _LATENCIES.items():
         histogram: Histogram | None = found.histograms.get(name)
-        if histogram is None:
+        if histogram is None or (name in _SOURCES and not histogram.total):
             continue
         since = "since the start"
         if earlier is not None and earlier.identity == found.identity and name in earlier.histograms:

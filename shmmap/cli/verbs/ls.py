@@ -28,7 +28,8 @@ __all__ = ["add_parser", "run"]
 _JSON = """\
   {"state": as in `shmmap status`, "epoch": hex, "not_listed": segments the table has no room for,
    "cells": [{"id", "version": hex, "layer", "state": "resident" | "stale" | "zombie", "segment",
-              "bytes", "points", "box": [minx, miny, maxx, maxy] in metres, "hits", "idle_s", "load_s"}]}
+              "ahead": bool, fetched ahead and not asked for yet, "bytes", "points",
+              "box": [minx, miny, maxx, maxy] in metres, "hits", "idle_s", "load_s"}]}
 A zombie is a retired segment: no client gets it any more, its memory is freed when nobody maps it.
 An id of more than 104 bytes is cut at its start, and begins with an ellipsis then.
 Exit code: 0, also when nothing is in memory; 1 when an area touches no cell in memory, 69 when the daemon
@@ -49,8 +50,8 @@ _COLUMNS = (
 )
 
 
-_STATES = {"resident": "resident", "stale": "stale", "retired": "zombie"}
-"""States as they are shown, and as the statistics and JSON name them."""
+_STATES = ("resident", "ahead", "stale", "retired")
+"""States as they are shown; JSON has ``zombie`` for the last, and ``ahead`` apart."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -64,8 +65,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
         "`shmmap stop`.\n"
         "X, Y, SIZE: lower corner and side, metres, map frame.\n"
-        "STATE: resident; stale when a newer version exists that is not loaded yet; retired (in JSON: "
-        "zombie) when it left service, to be freed when no process maps it.\n"
+        "STATE: resident; ahead when it was fetched before a client asked for it, and none has yet; stale "
+        "when a newer version exists that is not loaded yet; retired (in JSON: zombie) when it left service, "
+        "to be freed when no process maps it.\n"
         "ROWS: points, or what a layer has instead, such as voxels.\n"
         "HITS, LAST USED: how often it was given to clients, and how long ago the last time.\n"
         "LOAD: how long loading took.",
@@ -77,7 +79,7 @@ def add_parser(subparsers: Subparsers) -> None:
         default="id",
         help="largest first, but for id (default: id)",
     )
-    parser.add_argument("--state", choices=tuple(_STATES), help="only these")
+    parser.add_argument("--state", choices=_STATES, help="only these")
     add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
     add_allow_empty(parser)
     add_statistics_options(parser)
@@ -106,7 +108,8 @@ def _list(args: argparse.Namespace) -> int:
     if area is not None:
         rows = [rows[index] for index in those_in(area, [row.box for row in rows])]
     nothing_there = there is not None and not rows
-    rows = [row for row in rows if args.state is None or row.state == _STATES[args.state]]
+    if args.state is not None:
+        rows = [row for row in rows if args.state in (_shown_state(row), row.state)]
     if args.sort != "id":
         name = {"used": "last_use_monotonic_ns", "load": "load_ns"}.get(args.sort, args.sort)
         rows.sort(key=lambda row: int(getattr(row, name)), reverse=True)
@@ -137,6 +140,12 @@ def _list(args: argparse.Namespace) -> int:
     return 0
 
 
+def _shown_state(row: CellRow) -> str:
+    if row.ahead:
+        return "ahead"
+    return "retired" if row.state == "zombie" else row.state
+
+
 def _idle_s(row: CellRow, now_ns: int) -> float | None:
     return max(now_ns - row.last_use_monotonic_ns, 0) * 1e-9 if row.last_use_monotonic_ns else None
 
@@ -152,6 +161,7 @@ def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[s
         "layer": row.layer,
         "state": row.state,
         "segment": retired_name(segment) if row.state == "zombie" else segment,
+        "ahead": row.ahead,
         "bytes": row.bytes,
         "points": row.points,
         "box": list(row.box),
@@ -172,7 +182,7 @@ def _as_text(row: CellRow, now_ns: int) -> list[str]:
         format_metres(row.box[0]),
         format_metres(row.box[1]),
         f"{format_metres(max(row.box[2] - row.box[0], row.box[3] - row.box[1]))} m",
-        "retired" if row.state == "zombie" else row.state,
+        _shown_state(row),
         row.layer,
         f"{row.points:,}",
         format_bytes(row.bytes),

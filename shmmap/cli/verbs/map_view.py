@@ -181,6 +181,8 @@ def _on_disk(args: argparse.Namespace, area: Area | None, found: Snapshot, id_pr
 def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk) -> str:
     memory = sum(row.bytes for row in rows)
     segments, clients = counted(len(rows), "segment"), counted(len(found.clients), "client")
+    ahead = sum(row.ahead for row in rows)
+    segments += f" ({ahead:,} of them fetched ahead, not asked for yet)" if ahead else ""
     note = f"{segments} in memory, {format_bytes(memory)}, {clients}"
     if disk.total is None:
         state = "paused" if found.state == "stopped" else found.state
@@ -197,7 +199,8 @@ def _print(scene: Scene) -> None:
 
     size = shutil.get_terminal_size((100, 40))
     grid = terminal_rows(scene, size.columns, max(size.lines - 6, 10))
-    cells = {"resident": "in memory", "stale": "stale", "zombie": "retired", "disk": "on disk"}
+    cells = {"resident": "in memory", "fetched": "fetched ahead", "stale": "stale", "zombie": "retired"}
+    cells["disk"] = "on disk"
     legend = {**(LIVE_STATES if scene.chunks else cells), "client": "client", "window": "its area"}
     if not wants_style():
         for row in grid:
@@ -208,8 +211,8 @@ def _print(scene: Scene) -> None:
         from rich.text import Text
 
         console = Console(highlight=False)
-        solid = {"resident": "█", "stale": "▓", "zombie": "▒", "disk": "·", "window": "○", "client": "●"}
-        solid |= {**dict.fromkeys(LIVE_STATES, "█"), "saved": "·"}
+        solid = {"resident": "█", "fetched": "▓", "stale": "▓", "zombie": "▒", "disk": "·"}
+        solid |= {"window": "○", "client": "●", **dict.fromkeys(LIVE_STATES, "█"), "saved": "·"}
         for row in grid:
             console.print(Text.assemble(*((solid.get(state, " "), GLYPHS[state][1]) for state in row)))
         console.print(Text.assemble(*((f"{solid[s]} {text}  ", GLYPHS[s][1]) for s, text in legend.items())))

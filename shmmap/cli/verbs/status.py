@@ -18,6 +18,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
 )
 from shmmap.doctor.cache_size import cache_verdict
+from shmmap.doctor.keeping_ahead import ahead_as_json, ahead_verdict, over_fetch
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -31,6 +32,14 @@ _JSON = """\
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
+   "ahead": {"state": "off" | "standing": no client moves | "enough" | "filling" | "out": the map's files are
+                      out of reach | "slow": loaders | "full": memory | "late": cells come late all the same,
+             "why", "hint": text, may be empty,
+             "ahead_s": so long all that moving clients need is in memory, or null, "ride_out_s", "speed_mps",
+             "needed_per_s", "loadable_per_s": loads, the latter may be null, "origin_out": bool,
+             "last_outage_s", "moving_clients", "routed_clients", "cells_late", "prefetch_started",
+             "prefetch_used", "prefetch_in_vain", "prefetch_overtaken", "bytes_prefetched",
+             "over_fetch": bytes loaded by bytes handed out at least once, or null},
    "live": [{"name", "problem": text, may be empty, "chunks": in memory, "active": known voxels in them,
              "bytes", "budget_bytes", "loading", "dirty", "saving", "evicting", "evicting_bytes",
              "waiting_bytes", "files", "file_bytes", "scans", "durable", "damaged", "mappers", "change"}]}
@@ -44,9 +53,10 @@ def add_parser(subparsers: Subparsers) -> None:
         "status",
         run,
         help="state of the daemon: memory, clients, requests, cache size",
-        description="Show the state of the daemon: memory, clients, requests, loads, live maps, and whether "
-        "the cache is large enough.  Reads its statistics in shared memory: works while the daemon is paused "
-        "(SIGSTOP, a debugger) or hangs; not after `shmmap stop`.",
+        description="Show the state of the daemon: memory, clients, requests, loads, live maps, whether the "
+        "cache is large enough, and whether cells are in memory before moving clients come to them.  Reads "
+        "its statistics in shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs; "
+        "not after `shmmap stop`.",
         json=_JSON,
     )
     add_statistics_options(parser)
@@ -76,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
                 "frame_id": identity.frame_id,
                 "shm_dir": identity.shm_dir,
                 "counters": found.counters,
+                "ahead": ahead_as_json(found.counters),
                 "live": [row._asdict() for row in found.live],
             }
         )
@@ -147,9 +158,26 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     lines.append(("cache", verdict.text))
     if verdict.hint:
         lines.append(("", verdict.hint))
+    lines += _ahead(count)
     if count["refused_quota"]:
         over = (
             f"{count['refused_quota']:,} cells refused since the start: a client asked for more than its part"
         )
         lines.append(("quota", f"{over} (--session-quota)"))
+    return lines
+
+
+def _ahead(count: dict[str, int]) -> list[tuple[str, str]]:
+    """Whether fetching ahead keeps up, and what it has done."""
+    verdict, ratio = ahead_verdict(count), over_fetch(count)
+    lines = [("ahead", verdict.text)]
+    if verdict.hint:
+        lines.append(("", verdict.hint))
+    if count.get("prefetch_started") or count.get("cells_late"):
+        loaded = f", {ratio:.2f} times the bytes used were loaded" if ratio is not None else ""
+        done = (
+            f"{count['prefetch_started']:,} fetched ahead, {count['prefetch_used']:,} then asked for,"
+            f" {count['prefetch_in_vain']:,} in vain, {count['cells_late']:,} late{loaded}"
+        )
+        lines.append(("", done))
     return lines

@@ -30,7 +30,7 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   one object a line: {"event": "epoch" | "loaded" | "changed" | "evicted" | "failed" | "retried" |
-  "pressure" | "reload" | "long_turn" | "joined" | "left" | "live_started" | "live_ended" |
+  "pressure" | "late" | "reload" | "long_turn" | "joined" | "left" | "live_started" | "live_ended" |
   "live_problem" | "live_damaged" | "live_changed", "seq", "epoch": hex, "time": Unix seconds, and what
   the protocol's table of events says of that kind; versions and sessions as hex}, or
   {"event": "missed", "epoch": hex, "first", "last"} for events that the daemon does not keep any more.
@@ -49,9 +49,10 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="events: loads, evictions, failures, clients",
         description="Print the events of the last minute, then new ones as they happen: cells loaded, "
-        "changed, evicted, failed, retried; cells refused for lack of memory; reloads; turns of the "
-        "daemon's loop that took long; clients that connect and leave; the daemon's start and end; what is "
-        "wrong with live maps.  That a live map changes is told with --json alone, twice a second.",
+        "changed, evicted, failed, retried; cells refused for lack of memory; cells that a moving client had "
+        "to wait for; reloads; turns of the daemon's loop that took long; clients that connect and leave; "
+        "the daemon's start and end; what is wrong with live maps.  That a live map changes is "
+        "told with --json alone, twice a second.",
         json=_JSON,
     )
     parser.add_argument(
@@ -144,7 +145,8 @@ def _print_text(happening: Happening | None) -> None:
 
 def _loaded(f: dict[str, Any]) -> str:
     took = f"in {format_duration(f['load_ns'] * 1e-9)}" if f["load_ns"] else "retired before, back in service"
-    why = ", was evicted to make room before" if f["again"] else ""
+    why = ", ahead of the clients" if f["ahead"] else ""
+    why += ", was evicted to make room before" if f["again"] else ""
     why += ", replaces an older version" if f["replaces"] else ""
     rows = rows_text(f["points"], f["layer"])
     return f"{f['id']} {f['layer']}  {format_bytes(f['bytes'])}, {rows}, {took}{why}"
@@ -168,6 +170,11 @@ def _pressure(f: dict[str, Any]) -> str:
         f"{format_bytes(f['used_bytes'])} of"
         f" {format_bytes(f['budget_bytes'])} used, {format_bytes(f['pinned_bytes'])} in use by clients"
     )
+
+
+def _late(f: dict[str, Any]) -> str:
+    who = f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}"
+    return f"{who} had to wait for {counted(f['cells'], 'cell')}, such as {f['id']} {f['layer']}"
 
 
 def _reload(f: dict[str, Any]) -> str:
@@ -210,6 +217,7 @@ _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "failed": lambda f: f"{f['id']} {f['layer']}  {f['code']}: {f['message']}",
     "retried": lambda f: f"{f['id']} {f['layer']}  again after {f['code']}",
     "pressure": _pressure,
+    "late": _late,
     "reload": _reload,
     "long_turn": _long_turn,
     "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",

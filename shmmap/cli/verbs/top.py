@@ -33,7 +33,10 @@ _JSON = """\
    "budget": the same by older names: {"pinned": in use, "idle", "zombie": retired,
               "reserved": loading and statistics, "free"},
    "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
-   "latency_s": {"request", "wait", "load": {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
+   "ahead": as in `shmmap status`,
+   "latency_s": {"request", "wait", "load", and a loader's own time: "load_points" from the map's files,
+                 "load_computed", "load_cached" from the disk cache, "turn" of the daemon's loop:
+                 {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
    "evictions": for lack of room, "refused_over_budget", "refused_quota",
    "live": as in `shmmap status`,
    "clients": [{"client", "command", "pid", "uid", "cells", "bytes", "requests", "idle_s", "pose"}]}
@@ -65,7 +68,10 @@ def add_parser(subparsers: Subparsers) -> None:
         "retired (out of service, freed when no process maps it), loading (reserved for loads under way), "
         "statistics (what this view reads), free.\n"
         "Requests: the daemon's own time for one.  Load waits: how long clients waited for loads.  "
-        "Load time: of one cell.\n"
+        "Load time: of one cell, from when a loader was given it; below it the loaders' own time for points "
+        "out of the map's files, for layers computed, and for layers out of the disk cache.\n"
+        "Ahead: whether cells are in memory before moving clients come to them.  Late: cells that a moving "
+        "client had to wait for.\n"
         "GIVEN: memory of the cells a client was given and has not returned.",
         json=_JSON,
     )
@@ -158,7 +164,7 @@ def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
         found,
         found.identity,
         width=width,
-        max_clients=max(height - 18 - 2 * len(found.live), 1),
+        max_clients=max(height - 24 - 2 * len(found.live), 1),
         earlier=earlier[0] if earlier else None,
     )
     if not earlier or found.beat_monotonic_ns - earlier[-1].beat_monotonic_ns > 1e9:
@@ -176,6 +182,7 @@ def _styled(line: Line) -> Any:
 def _as_json(found: Snapshot) -> dict[str, object]:
     from shmmap.cli.screens.top_screen import budget_parts
     from shmmap.doctor.cache_size import cache_verdict
+    from shmmap.doctor.keeping_ahead import ahead_as_json
     from shmmap.statistics.counters import SPANS
 
     count = found.counters
@@ -199,6 +206,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
         "cache_too_small": verdict.too_small,
         "cache": verdict.why,
         "hint": verdict.hint,
+        "ahead": ahead_as_json(count),
         "latency_s": {
             name: {"p50": h.quantile_s(0.5), "p99": h.quantile_s(0.99), "count": h.total}
             for name, h in found.histograms.items()

@@ -69,6 +69,7 @@ class BlockingFollower:
         now_s = time.monotonic()
         state = self.state
         due = now_s - self._asked_s >= self._refresh_interval_s or self.error is not None
+        due = due or now_s >= self._refresher.tell_at_s(pose)
         if state.settled and not due and not moved(state, pose, self._update_distance):
             return
         deadline_s = now_s + wait_s

@@ -75,6 +75,7 @@ class WindowFollower:
         self._called = False
         self._stopping = False
         self._pause_s = 0.0
+        self._due_s = math.inf  # nothing to ask before there is a pose
         self._waiters: list[weakref.ref[SimpleQueue[None]]] = []
         self._over: SimpleQueue[None] = SimpleQueue()
         self._ended = False
@@ -110,7 +111,9 @@ class WindowFollower:
                 "this window's thread lives in the parent process", hint="make a window after the fork"
             )
         self._pose = pose
-        if not self._called and moved(self.state, pose, self._update_distance):
+        if not self._called and (
+            moved(self.state, pose, self._update_distance) or self._refresher.tell_at_s(pose) < self._due_s
+        ):
             self._called = True  # once is enough, however often poses come
             self._mailbox.put(None)
         return (self.wait_until_current(wait_s) if wait_s else None) or self.state
@@ -158,15 +161,16 @@ class WindowFollower:
         self._thread = _thread.get_ident()
         running.add(self)
         try:
-            due_s = math.inf  # nothing to ask before there is a pose
-            while self._wait(due_s):
+            while self._wait(self._due_s):
                 pose = self._pose
                 if pose is None:
                     continue
                 if self.error is None and (not self.answers(self.state) or self._refresher.lost):
-                    due_s = 0.0
-                if time.monotonic() >= due_s:
-                    due_s = time.monotonic() + self._refresh(pose)
+                    self._due_s = 0.0
+                if time.monotonic() >= self._due_s:
+                    self._due_s = time.monotonic() + self._refresh(pose)
+                if self.error is None:  # of the latest pose: it may have come meanwhile, and called nobody
+                    self._due_s = min(self._due_s, self._refresher.tell_at_s(self._pose or pose))
         except BaseException as error:
             self._publish(self.state, InternalError(f"the window's thread ended: {error!r}"))
             raise

@@ -40,6 +40,9 @@ class MapWindow:
 
     With ``background=False`` everything happens in `move_to`, which raises what goes wrong.
 
+    The daemon fetches what the window will ask for next before it does: along the ``route`` of `move_to`,
+    without one straight ahead and to both sides of that.  A radius larger than what is needed brings nothing.
+
     After a fork the child can read what the window held, but not move it.
 
     Parameters
@@ -57,8 +60,8 @@ class MapWindow:
         Metres the pose moves before the daemon is asked again (20 in Autoware).
     refresh_interval
         Seconds after which it is asked anyhow, to learn of a changed map.  A request that is certain to
-        bring nothing is not sent, except to tell the pose every second or 5 m; so small steps and short
-        intervals cost little, where the daemon's statistics can be read.
+        bring nothing is not sent, except to tell the pose every second or 5 m, and a route that is another
+        one; so small steps and short intervals cost little, where the daemon's statistics can be read.
     retention
         What to keep attached of what has left the window; default nothing.
     background
@@ -186,11 +189,13 @@ class MapWindow:
         x, y
             Metres, map frame.
         vx, vy
-            Metres per second, map frame.
+            Metres per second, map frame; both 0: the daemon learns them from the poses.
         heading
             Radians, counter-clockwise from the map's x axis.
         route
-            The polyline ahead, (x, y) each or (N, 2); the daemon keeps what lies along it.
+            The polyline ahead, (x, y) each or (N, 2): give it with every pose.  The daemon fetches what lies
+            along it before the window asks for it, and keeps it longest.  Of more than 512 places so many
+            are sent, equally far apart.
         wait
             Seconds this call may take until the window is current.  None: no waiting in the background mode,
             5 s in the blocking one, which waits no longer than half a second for cells that do not fit in

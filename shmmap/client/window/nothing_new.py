@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.client.window.change_counter import ChangeCounter
 
-__all__ = ["NothingNew"]
+__all__ = ["NothingNew", "says_more"]
 
 TELL_S: Final = 1.0
 TELL_M: Final = 5.0
 """The daemon is told the pose after so long or so far, whether anything is new or not."""
+TELL_MPS: Final = 1.0
+"""A velocity that differs by so much, or a pose by `TELL_M`, is worth telling for its own sake."""
 AROUND_M: Final = 50.0
 MOST_CELLS: Final = 4096
 
@@ -116,6 +118,7 @@ class NothingNew:
             and last.changes == counter.read()
             and now_s - last.asked_s < TELL_S
             and math.hypot(pose.x - last.pose.x, pose.y - last.pose.y) < TELL_M
+            and pose.route == last.pose.route
             and session.lost_since is None
             and (session.welcome.epoch, session.handshakes) == self._opened_for
             and ((pose.x == at.x and pose.y == at.y) or self._touches_the_same(state, area))
@@ -146,6 +149,15 @@ class NothingNew:
         elif listing.map_version == map_version:
             self._around = _Neighbourhood(map_version, region, listing.boxes)
         return self._around
+
+
+def says_more(pose: Intent, told: Intent) -> bool:
+    """Whether a pose says more of where a client goes than what the daemon was told last."""
+    return (
+        pose.route != told.route
+        or math.hypot(pose.vx - told.vx, pose.vy - told.vy) >= TELL_MPS
+        or math.hypot(pose.x - told.x, pose.y - told.y) >= TELL_M
+    )
 
 
 def _inside(area: geometry.Area, region: geometry.Box) -> bool:

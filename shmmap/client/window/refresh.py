@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Final, TypeAlias
@@ -14,8 +15,9 @@ from shmmap import geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client
+from shmmap.client.window import nothing_new
 from shmmap.client.window.failed_boxes import FailedBoxes
-from shmmap.client.window.nothing_new import NothingNew
+from shmmap.client.window.nothing_new import NothingNew, says_more
 from shmmap.client.window.retention import Departed, RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
@@ -92,11 +94,20 @@ class WindowRefresher:
         self._nothing_new = NothingNew(client, timeout_s)
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
+        self._told: tuple[Intent, float] | None = None
 
     @property
     def lost(self) -> bool:
         """Whether the connection to the daemon is broken at present."""
         return self._client.disconnected_since is not None
+
+    def tell_at_s(self, pose: Intent) -> float:
+        """When the daemon should hear of a pose at the latest: infinity if it says nothing new of the way.
+
+        Whoever has told of another route or velocity less than a second ago lets that second pass.
+        """
+        told = self._told
+        return told[1] + nothing_new.TELL_S if told is not None and says_more(pose, told[0]) else math.inf
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
         """Ask the daemon once, unless it is certain that nothing would come (`NothingNew`).
@@ -129,6 +140,7 @@ class WindowRefresher:
             answer = self._ask(state, area, pose, wait_s, by_name=True)
             del first
         now_s = self._clock()
+        self._told = pose, asked_s
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
             # what is kept beyond the window may be outdated, or in the way of what is in it
             self.retained.clear()

@@ -32,6 +32,7 @@ class CellRows:
             resident.key.cell_id.removeprefix(self.id_prefix), resident.key.layer, resident.version,
             resident.name.removeprefix(self.segment_prefix), state, resident.nbytes, resident.points,
             resident.box, resident.hits, int(resident.last_use_s * 1e9), resident.load_ns,
+            ahead=resident.prefetched and state == "resident",
         )  # fmt: skip
         self.statistics.cell_changed(resident.name, row)
 

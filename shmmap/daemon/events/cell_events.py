@@ -7,8 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from shmmap.daemon.events.eviction_history import EvictionHistory
+from shmmap.daemon.events.late_cells import LateCells
 from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
+from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.statistics.writer import StatisticsWriter
@@ -26,17 +28,34 @@ class CellEvents:
         Makes of a cell id what replies and events carry.
     pressure
         Tells of cells that were refused for lack of memory.
+
+    Attributes
+    ----------
+    late
+        Tells of cells that clients on their way had to wait for.
     """
 
     event_log: EventLog
     statistics: StatisticsWriter
     wire_id: Callable[[str], str]
     pressure: PressureEvents
+    late: LateCells = field(init=False)
     _history: EvictionHistory = field(default_factory=EvictionHistory)
 
-    def loaded(self, resident: Resident, took_ns: int, replaces: int) -> None:
-        """A segment was loaded and published; ``took_ns`` from handing the load to a worker."""
-        again = self._tell_loaded(resident, resident.load_ns, replaces)
+    def __post_init__(self) -> None:
+        self.late = LateCells(self.event_log)
+
+    def loaded(self, resident: Resident, took_ns: int, replaces: int, cached: bool, ahead: bool) -> None:
+        """A segment was loaded and published; ``took_ns`` from handing the load to a worker.
+
+        ``cached`` says that it came out of the disk cache, ``ahead`` that nobody had asked for it yet.
+        """
+        again = self._tell_loaded(resident, resident.load_ns, replaces, ahead)
+        points = resident.key.layer == LAYER
+        source = "load_cached" if cached else "load_points" if points else "load_computed"
+        self.statistics.add_duration(source, resident.load_ns)
+        self.statistics.add("loads_from_cache", cached)
+        self.statistics.add("layers_computed", source == "load_computed")
         self.statistics.add("loads_finished")
         self.statistics.add("bytes_loaded", resident.nbytes)
         self.statistics.add("loads_after_eviction", again)
@@ -44,14 +63,14 @@ class CellEvents:
 
     def revived(self, resident: Resident) -> None:
         """A retired segment is in service again, without a load."""
-        self._tell_loaded(resident, 0, 0)
+        self._tell_loaded(resident, 0, 0, ahead=False)
 
-    def _tell_loaded(self, resident: Resident, load_ns: int, replaces: int) -> bool:
+    def _tell_loaded(self, resident: Resident, load_ns: int, replaces: int, ahead: bool) -> bool:
         """Tell of a segment in service; returns whether it had been evicted to make room."""
         again = self._history.loaded(resident.key, resident.version)
         self.event_log.publish(
             events.Loaded, self.wire_id(resident.key.cell_id), resident.key.layer, resident.version,
-            resident.nbytes, resident.points, load_ns, again, replaces,
+            resident.nbytes, resident.points, load_ns, again, replaces, ahead,
         )  # fmt: skip
         return again
 

@@ -278,9 +278,8 @@ class Scheduler:
         except OSError as error:
             self._fail(load, failure_code(error), f"cannot publish: {error.strerror}", None, now_s)
             return
-        cache.tell(cache.events.loaded, resident, int((now_s - load.started_s) * 1e9), replaces)
-        self._statistics.add("loads_from_cache", done.cached)
-        self._statistics.add("layers_computed", not done.cached and key.layer != LAYER)
+        took_ns = int((now_s - load.started_s) * 1e9)
+        cache.tell(cache.events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)
         for warning in done.warnings:
             log.info("loaded with a warning", cell=key.cell_id, layer=key.layer, warning=warning)
         if done.dropped:

@@ -209,6 +209,7 @@ class CellRequests:
         load = self._scheduler.loads.by_key.get(key)
         if load is None or load.prefetch:
             wanted.session.cold_cells += 1
+            wanted.session.cold_key = key
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:

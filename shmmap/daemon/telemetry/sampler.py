@@ -15,6 +15,7 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.telemetry.keeping_ahead import KeepingAhead
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import SessionRows
 from shmmap.daemon.transport.sessions import Sessions
@@ -55,8 +56,12 @@ class Sampler:
     _beating: Iterator[None] | None = None
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _rows: SessionRows = field(default_factory=SessionRows)
+    _ahead: KeepingAhead = field(init=False)
     _told_s: float = float("-inf")
     _last_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._ahead = KeepingAhead(self.cache, self.scheduler, self.sessions)
 
     @property
     def next_s(self) -> float:
@@ -112,6 +117,7 @@ class Sampler:
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
         cache.events.pressure.turn(now_s)
+        cache.events.late.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
             self.event_log.beat()
@@ -135,6 +141,8 @@ class Sampler:
             cache.statistics.show_clients(self._rows.of(self.sessions))
             yield
             self._show_used()
+            yield
+            self._ahead.look(now_s)
             yield
         self.measure()
         cache.ledger.overhead_bytes = cache.statistics.size_bytes

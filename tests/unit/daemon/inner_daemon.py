@@ -74,10 +74,11 @@ class InnerDaemon:
         quota_bytes: int = 64 << 20,
         workers: int = 1,
         load_timeout_s: float = 30.0,
-        prefetch_share: float = 0.0,
         cache_dir: str,
         shm_dir: str = "",
         name: str = "inner",
+        prefetch_share: float = 0.0,
+        ride_out_s: float = 10.0,
     ) -> None:
         prepare_process()
         self.shm_dir = shm_dir or tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
@@ -109,8 +110,8 @@ class InnerDaemon:
         self.stopped_at_s: float | None = None
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(
-            self.cache, self.map_switch, self.pool, clock=self.now_s,
-            prefetch_share=prefetch_share, ride_out_s=10.0,
+            self.cache, self.map_switch, self.pool, clock=self.now_s, prefetch_share=prefetch_share,
+            ride_out_s=ride_out_s,
         )  # fmt: skip
         self.loads = self.scheduler.loads
         self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.hear_of_freed)

@@ -18,9 +18,9 @@ EVENTS: list[tuple[Any, list[Any], str]] = [
         "98a565706f6368010203a773746172746564040506",
     ),
     (
-        e.Loaded(1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8),
-        ["loaded", 1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8],
-        "9ca66c6f61646564010203a161a6706f696e747304050607c308",
+        e.Loaded(1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8, True),
+        ["loaded", 1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8, True],
+        "9da66c6f61646564010203a161a6706f696e747304050607c308c3",
     ),
     (
         e.Changed(1, 2, 3, "a", 4, "changed"),
@@ -46,6 +46,11 @@ EVENTS: list[tuple[Any, list[Any], str]] = [
         e.Pressure(1, 2, 3, "a", "points", "over_budget", 4, 5, 6, 7, 8),
         ["pressure", 1, 2, 3, "a", "points", "over_budget", 4, 5, 6, 7, 8],
         "9ca87072657373757265010203a161a6706f696e7473ab6f7665725f6275646765740405060708",
+    ),
+    (
+        e.Late(1, 2, 3, 4, 5, "c", 6, "a", "points"),
+        ["late", 1, 2, 3, 4, 5, "c", 6, "a", "points"],
+        "9aa46c6174650102030405a16306a161a6706f696e7473",
     ),
     (
         e.Reloaded(1, 2, 3, 4, 5, 6, 7, 8, "no"),
@@ -103,6 +108,12 @@ def test_golden_bytes(event: e.Event, elements: list[Any], golden: str) -> None:
     assert unpack(data) == elements
     assert e.decode_event(data) == event
     assert e.decode_event(pack([*elements, "something new"])) == event
+
+
+def test_an_earlier_daemon_says_less() -> None:
+    """Before 1.5 nobody said whether a cell was fetched ahead."""
+    loaded = e.decode_event(bytes.fromhex("9ca66c6f61646564010203a161a6706f696e747304050607c308"))
+    assert loaded == e.Loaded(1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8, ahead=False)
 
 
 def test_a_kind_of_a_later_version_is_left_out() -> None:

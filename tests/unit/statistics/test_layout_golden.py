@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 
 import pytest
@@ -21,12 +22,12 @@ TWO = (
 )
 LOAD = (Counter("load", "histogram", "ns", "How long"),)
 GOLDEN_START = (
-    "53484d5354415401 0100 0300 04030201"  # magic, 1.3, byte order
+    "53484d5354415401 0100 0400 04030201"  # magic, 1.4, byte order
     "80000000 02000000 a0000000"  # descriptions at 128: 2 of 160 bytes
     "80020000 00400000"  # identity at 640, 16384 bytes each
     "80820000 80040000"  # state at 33408, 1152 bytes each
     "808b0000 00100200 00010000 00000200"  # table 35712, rows at 135168 of 256, at most 131072
-    "5bfbe278"
+    "7ef9a300"
     "01000000 82000000 00900000 00010000 00010000"  # 1 histogram of 130; clients at 36864, 256 of 256
     "c08b0000 00900100 00020000 40000000"
     + "00" * 24
@@ -136,6 +137,15 @@ def test_identity() -> None:
 def test_row() -> None:
     assert pack_cell(ROW) == bytes.fromhex(GOLDEN_ROW)
     assert unpack_cell(memoryview(bytes.fromhex(GOLDEN_ROW))) == ROW
+
+
+def test_a_row_of_what_nobody_has_asked_for_yet() -> None:
+    """Its flag is the third bit; a reader of layout 1.3 takes it for any resident one."""
+    packed = pack_cell(dataclasses.replace(ROW, state="resident", ahead=True))
+    assert packed[96:98] == bytes([1, 4])
+    row = unpack_cell(memoryview(packed))
+    assert row is not None
+    assert (row.state, row.ahead, row.id_cut, row.layer_cut) == ("resident", True, False, False)
 
 
 def test_a_torn_row_is_noticed() -> None:

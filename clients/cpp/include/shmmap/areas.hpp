@@ -42,10 +42,12 @@ struct Box {
 
 using Area = std::variant<Circle, Square, Box>;
 
-/// Where the client is and is going: it decides what stays in memory longest.  Metres, m/s, radians.
+/// Where the client is and is going: it decides what the daemon fetches before it is asked for, and what stays in
+/// memory longest.  Metres, m/s (both 0: the daemon learns them from the poses), radians.
 struct Intent {
   double x = 0.0, y = 0.0, vx = 0.0, vy = 0.0;
   std::optional<double> heading = std::nullopt;
+  /// The polyline ahead, to be given with every pose; of more than 512 places so many are sent, equally far apart.
   std::vector<std::array<double, 2>> route = {};
 };
 
@@ -111,6 +113,29 @@ inline bool overlaps(const Area& area, const Sides& cell) {
   const double x = as_float(square.x), y = as_float(square.y), radius = as_float(square.radius);
   return as_float(cell.min_x) - radius <= x && x <= as_float(cell.max_x) + radius &&
          as_float(cell.min_y) - radius <= y && y <= as_float(cell.max_y) + radius;
+}
+
+/// A route of at most 512 places: itself, or places equally far apart along it, its ends among them.
+inline std::vector<std::array<double, 2>> thinned(std::vector<std::array<double, 2>> route) {
+  constexpr std::size_t most_places = 512;
+  constexpr double farthest_m = 1e8;  // what is farther away counts as this, as in the daemon
+  if (route.size() <= most_places) return route;
+  std::vector<double> along(route.size(), 0.0);
+  for (auto& place : route)
+    for (auto& side : place) side = std::clamp(side, -farthest_m, farthest_m);
+  for (std::size_t at = 1; at < route.size(); ++at)
+    along[at] = along[at - 1] + std::hypot(route[at][0] - route[at - 1][0], route[at][1] - route[at - 1][1]);
+  if (along.back() == 0.0) return {route.front()};
+  std::vector<std::array<double, 2>> found;
+  for (std::size_t number = 0, at = 0; number + 1 < most_places; ++number) {
+    const double here = static_cast<double>(number) * (along.back() / static_cast<double>(most_places - 1));
+    while (at + 2 < route.size() && along[at + 1] <= here) ++at;
+    const double step = along[at + 1] - along[at], share = step > 0.0 ? std::min((here - along[at]) / step, 1.0) : 0.0;
+    found.push_back({route[at][0] + share * (route[at + 1][0] - route[at][0]),
+                     route[at][1] + share * (route[at + 1][1] - route[at][1])});
+  }
+  found.push_back(route.back());
+  return found;
 }
 
 inline void check_circle(double x, double y, double radius) {

@@ -58,18 +58,19 @@ namespace detail {
 
 struct KindOfEvent {
   std::string_view kind;
-  std::array<std::string_view, 8> fields;
+  std::array<std::string_view, 9> fields;
 };
 
 /// Names of what stands in an event behind its kind, number, epoch and time.
-inline constexpr std::array<KindOfEvent, 16> kinds_of_events{{
+inline constexpr std::array<KindOfEvent, 17> kinds_of_events{{
     {"epoch", {"what", "map_version", "cells", "adopted"}},
-    {"loaded", {"id", "layer", "version", "bytes", "points", "load_ns", "again", "replaces"}},
+    {"loaded", {"id", "layer", "version", "bytes", "points", "load_ns", "again", "replaces", "ahead"}},
     {"changed", {"id", "version", "how"}},
     {"evicted", {"id", "layer", "version", "bytes", "why"}},
     {"failed", {"id", "layer", "code", "message", "retry_s"}},
     {"retried", {"id", "layer", "code"}},
     {"pressure", {"id", "layer", "code", "refused", "budget_bytes", "used_bytes", "pinned_bytes", "zombie_bytes"}},
+    {"late", {"session", "pid", "client", "cells", "id", "layer"}},
     {"reload", {"map_version", "changed", "added", "removed", "told", "error"}},
     {"long_turn", {"kind", "cpu_ns"}},
     {"joined", {"session", "pid", "uid", "client"}},

@@ -78,6 +78,7 @@ struct KeptCell {
   std::uint64_t version = 0, bytes = 0, points = 0, hits = 0;
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
   std::int64_t last_use_monotonic_ns = 0, load_ns = 0;
+  bool ahead = false;  ///< fetched ahead, and nobody has asked for it yet
 };
 
 /// One client of the daemon.
@@ -393,6 +394,7 @@ class StatisticsReader {
         cell.last_use_monotonic_ns = read_at<std::int64_t>(row, 64), cell.load_ns = read_at<std::int64_t>(row, 72);
         cell.segment = detail::fixed_text(row + 80, 16);
         cell.state = static_cast<KeptCell::State>(row[96]);
+        cell.ahead = (row[97] & 4U) != 0;
         cell.layer = detail::fixed_text(row + 104, std::min<std::size_t>(read_at<std::uint16_t>(row, 100), 40));
         cell.id = detail::fixed_text(row + 144, std::min<std::size_t>(read_at<std::uint16_t>(row, 98), 104));
         found.cells.push_back(std::move(cell));

@@ -103,6 +103,9 @@ struct WindowUpdate {
 
 /// The cells around a moving pose.  Everything happens in `move_to`, in the thread that calls it.
 ///
+/// The daemon fetches what the window will ask for next: along the route of the pose, without one straight ahead and
+/// to both sides of that.  A radius larger than what is needed brings nothing.
+///
 /// A daemon that fails costs an exception there, and the window keeps what it has; a restarted one is found again
 /// by itself, and nothing that has not changed is mapped anew.
 class Window {
@@ -239,7 +242,9 @@ class Window {
   /// Ask until nothing is missing, nothing more comes, or time is up.
   void become_current(double wait) {
     auto now = Clock::now();
-    const bool is_due = seconds(now - asked_at_) >= options_.refresh_interval || error_;
+    const bool is_to_tell = told_ && detail::NothingNew::says_more(*pose_, *told_) &&
+                            now - told_at_ >= detail::NothingNew::tell;
+    const bool is_due = seconds(now - asked_at_) >= options_.refresh_interval || error_ || is_to_tell;
     if (is_settled() && !is_due && !has_moved(*pose_)) return;
     const auto deadline = now + std::chrono::duration_cast<Clock::duration>(detail::Seconds(std::min(wait, 1e6)));
     auto progressed = now;
@@ -288,6 +293,7 @@ class Window {
       const Answer first = std::exchange(answer, ask(named(), {}));
     }
     const auto now = Clock::now();
+    told_ = pose, told_at_ = asked_at;
     if (answer.map_version != map_version_ || std::any_of(answer.failed.begin(), answer.failed.end(), [](const auto& one) {
           return one.code == "over_budget";
         }))
@@ -428,11 +434,11 @@ class Window {
   std::vector<std::string> canonical_;
   std::map<std::string, Box4> failed_boxes_;
   std::set<std::string> sought_;
-  std::optional<Intent> pose_, asked_;
+  std::optional<Intent> pose_, asked_, told_;
   std::optional<Area> area_;
   std::optional<Error> error_;
   std::optional<Clock::time_point> stale_since_;
-  Clock::time_point asked_at_{};
+  Clock::time_point asked_at_{}, told_at_{};
   std::uint64_t epoch_ = 0, map_version_ = 0, boxes_of_ = 0;
   bool covered_ = true;
 };

@@ -49,10 +49,12 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
     from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+    from shmmap_clients.scans.route_file import read_route
     from shmmap_clients.scans.scan_source import open_scans
     from shmmap_clients.streams import is_endpoint
 
     statistics, plot = DriveStatistics(), DrivePlot()
+    route = read_route(args.route) if args.route is not None else ()
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: who waits for this program's subscription finds it
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
@@ -82,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         )
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(
-            MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads)
+            MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
         )
         relocalizer = None
         if args.relocalize or args.rough is not None:

@@ -120,6 +120,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="range of the scanner: a scan waits where the map does not reach so far (default: 100)",
     )
+    window.add_argument(
+        "--route",
+        metavar="FILE",
+        help="the way the vehicle will take, in the map's frame: a TUM file, or x,y a line in a .csv; the"
+        " daemon fetches the map along it beforehand (default: along the predicted motion)",
+    )
     _add_relocalization_options(parser)
     add_alignment_options(parser)
     _add_output_options(parser)

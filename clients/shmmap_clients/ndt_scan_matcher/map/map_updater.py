@@ -13,10 +13,13 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
 from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
@@ -88,6 +91,9 @@ class MapUpdater:
         Where ``prepare`` counts what it writes to a device, `NdtMatcher.uploads`; for the statistics.
     name
         Of its own session, for ``shmmap clients``.
+    route
+        The way that the vehicle will take, (N, 2), metres, map frame, as far as it is known: the daemon
+        fetches what lies along it before it is asked for.
 
     Raises
     ------
@@ -103,11 +109,14 @@ class MapUpdater:
         prepare: Callable[[VoxelMap], VoxelMap] = lambda voxel_map: voxel_map,
         uploads: UploadStatistics | None = None,
         name: str = "shmmap-ndt",
+        route: NDArray[np.float64] | Sequence[tuple[float, float]] = (),
     ) -> None:
         self.rules = rules if rules is not None else MapRules()
         self.statistics = UpdateStatistics(uploads)
         self.too_slow = 0
         self._prepare = prepare
+        self._route = route
+        self._velocity = (0.0, 0.0)
         self._window = MapWindow(
             client,
             self.rules.map_radius,
@@ -162,7 +171,7 @@ class MapUpdater:
         x, y
             Where the vehicle is, metres, map frame.
         vx, vy
-            Its velocity, metres per second: what lies ahead is loaded first.
+            Its velocity, metres per second: what lies ahead is loaded before it is asked for.
         jumped
             The pose was corrected: that the map does not reach so far does not count as ``too_slow``.
 
@@ -175,6 +184,7 @@ class MapUpdater:
         """
         rules = self.rules
         with self._changed:
+            self._velocity = vx, vy
             reached = (
                 self._latest is not None and self._distance(x, y) + rules.lidar_radius <= rules.map_radius
             )
@@ -228,7 +238,7 @@ class MapUpdater:
                 if asked is None and self._failed is not None:
                     asked = self._failed
                 elif asked is None and self._latest is not None:
-                    asked = (*self._latest[1], 0.0, 0.0)  # has the map itself changed?
+                    asked = (*self._latest[1], *self._velocity)  # has the map itself changed?
                 self._failed = None
             if asked is not None:
                 self._update(*asked)
@@ -250,7 +260,7 @@ class MapUpdater:
 
     def _follow(self, x: float, y: float, vx: float, vy: float) -> None:
         begin_s = time.perf_counter()
-        self._window.move_to(x, y, vx=vx, vy=vy, wait=_REQUEST_S)
+        self._window.move_to(x, y, vx=vx, vy=vy, route=self._route, wait=_REQUEST_S)
         cells = self._window.cells
         if not cells and not self._window.complete:
             raise NoAnswer("none of the cells could be loaded", hint="`shmmap status` tells why")

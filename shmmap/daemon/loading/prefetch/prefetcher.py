@@ -55,7 +55,7 @@ class Prefetcher:
         self._cache, self._loads, self._pool = cache, loads, pool
         self._sessions = cache.reclaimer.sessions
         self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MOST_ENDED)
-        self.share = share
+        self.share, self.ride_out_s = share, ride_out_s
         self.prefetch = Prefetch(self._is_absent, ride_out_s)
         self._now_s = 0.0
         self._next_s = -math.inf
@@ -75,6 +75,15 @@ class Prefetcher:
         elif way is not None or len(ways) < MOST_WAYS:
             ways[session] = WayAhead(session.motion, session.area, session.layers)
 
+    def _note_late(self, session: Session) -> None:
+        """Count what a client on its way had to wait for; had it just come or jumped, nobody could know."""
+        count, session.cold_cells = session.cold_cells, 0
+        key, session.cold_key = session.cold_key, None
+        if key is not None and session.motion.travelled_m > 0.0:
+            self._cache.statistics.add("cells_late", count)
+            wire_id = self._cache.wire_id(key.cell_id)
+            self._cache.tell(self._cache.events.late.note, session, count, wire_id, key.layer)
+
     # --- a chore of the serving loop --------------------------------------------------------------
 
     @property
@@ -89,9 +98,7 @@ class Prefetcher:
         self._now_s = now_s
         for session in self._sessions.follow_moves():
             self._follow(session)
-            cold, session.cold_cells = session.cold_cells, 0
-            if session.motion.travelled_m > 0.0:  # else it has just come, or jumped: nobody could know
-                self._cache.statistics.add("cells_late", cold)
+            self._note_late(session)
         while self.ended:
             self._learn(*self.ended.popleft())
         if now_s < self._full_until_s:
@@ -153,3 +160,10 @@ class Prefetcher:
         self._running.pop(load, None)
         if ran and load.sources and self.prefetch.health.ended(took_s, failed=failed):
             self._loads.forget_failures()
+
+    def shortage(self, now_s: float) -> int:
+        """What keeps cells from being fetched ahead: 0 nothing, 1 their share is full, 2 the budget is."""
+        ledger = self._cache.ledger
+        if ledger.prefetched_bytes + sum(self._running.values()) >= self.share * ledger.budget_bytes:
+            return 1 if self.share else 0
+        return 2 if now_s < self._full_until_s else 0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
@@ -110,6 +111,47 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
         "retired 4,096", "stale 0", "crashed 3", "-1234.5,-9876.5", "a_perception",
     ):  # fmt: skip
         assert piece in " ".join(shown.split()), piece
+
+
+DRIVING = FULL | counters(
+    prefetch_budget_bytes=50 * MIB, moving_clients=1, routed_clients=1, fastest_mm_per_s=12_000,
+    ahead_ns=4 * 10**9, ride_out_ns=10**10, needed_per_1000s=14_100, loadable_per_1000s=17_500,
+    most_workers=8,
+    prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, cells_late=7, cells_late_1min=2,
+    bytes_loaded=105, bytes_used=100, budget_bytes=100 * MIB,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_whether_cells_are_there_before_clients_come_to_them(width: int) -> None:
+    found = snapshot(FULL | {name: value for name, value in DRIVING.items() if value}, [])
+    shown = text(found, width=width)
+    assert max(map(len, shown.splitlines())) <= width
+    for piece in (
+        "ahead NOT ENOUGH: clients need 14 loads/s at 12.0 m/s, loaders can do 18 loads/s",
+        "give the daemon more --workers (9), or the clients a smaller radius or a layer with fewer bytes",
+        "fetched ahead 120 then asked for 100 in vain 3 late 7 (2 in 1 min) loaded 1.05 times what was used",
+    ):
+        assert piece in " ".join(shown.split()), piece
+    quiet = " ".join(text(snapshot(FULL, []), width=width).split())
+    assert "ahead off load" not in quiet
+    assert "ahead off requests" in quiet
+    assert "fetched ahead" not in quiet
+
+
+def test_load_times_by_what_was_loaded() -> None:
+    """Only of what there was."""
+    found = snapshot(FULL, [])
+    each = 1 + BUCKETS
+    values = list(found._values.histograms)  # type: ignore[union-attr]
+    names = [h.name for h in HISTOGRAMS]
+    values[names.index("load_points") * each + 1 + 40] = 5
+    values[names.index("load_cached") * each + 1 + 80] = 2
+    found._values = found._values._replace(histograms=values)  # type: ignore[union-attr]
+    lines = {line[:12].strip(): line for line in text(found).splitlines()}
+    assert {"of points", "disk cache"} <= set(lines)
+    assert "computed" not in lines
+    assert lines["of points"].split()[-4:] == ["5", "since", "the", "start"]
 
 
 LIVE = LiveRow(
@@ -222,6 +264,22 @@ def test_the_picture_is_xml_with_tooltips() -> None:
     assert sum("on disk" in title for title in titles) == 15 - 3
     boxed = CLIENT._replace(window=Window("square", 50.0, 30.0, 25.0, 25.0), heading=None)
     assert 'rect class="window"' in svg(Scene(**{**vars(SCENE), "clients": [boxed]}))
+
+
+def test_cells_fetched_ahead_are_marked_until_somebody_asks() -> None:
+    ahead = dataclasses.replace(cell("0_0.pcd", 0, 0, "resident"), ahead=True)
+    both = dataclasses.replace(cell("80_0.pcd", 80, 0, "resident"), ahead=True, layer="ndt(leaf=2.0)")
+    rows = [ahead, both, cell("80_0.pcd", 80, 0, "resident"), cell("40_0.pcd", 40, 0, "stale")]
+    scene = Scene(**{**vars(SCENE), "rows": rows, "clients": []})
+    grid = terminal_rows(scene, 50, 30)
+    assert grid[-1][0] == "fetched"
+    assert grid[-1][-1] == "resident", "a layer of it was asked for"
+    assert grid[-1][20] == "stale"
+    picture = svg(scene)
+    ElementTree.fromstring(picture)
+    assert picture.count('class="cell fetched"') == 2, "it, and in the legend"
+    assert "points: fetched ahead, 4.0 KiB" in picture
+    assert "fetched ahead</text>" in picture
 
 
 def test_names_of_clients_on_one_another_stand_side_by_side() -> None:

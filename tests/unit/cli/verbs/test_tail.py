@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `tail` says of live maps."""
+"""What `tail` says of live maps, and of cells on the way of clients."""
 
 from __future__ import annotations
 
@@ -30,6 +30,26 @@ def test_what_is_wrong_with_live_maps(capsys: pytest.CaptureFixture[str], event:
     _print_text(event)
     _, _, said = capsys.readouterr().out.partition("  ")
     assert said == f"live      {told}\n"
+
+
+def test_cells_that_a_client_had_to_wait_for(capsys: pytest.CaptureFixture[str]) -> None:
+    late = e.Late(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
+    _print_text(late)
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.endswith("late planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points")
+    _print_json(late)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["event"], told["session"], told["cells"]) == ("late", "00000000000000ab", 4)
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_cells_that_were_fetched_ahead(capsys: pytest.CaptureFixture[str], ahead: bool) -> None:
+    loaded = e.Loaded(1, 2, 3, "0_0.pcd", "points", 4, 4096, 10, 5_000_000, ahead=ahead)
+    _print_text(loaded)
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.endswith("in 5.0 ms" + ", ahead of the clients" * ahead)
+    _print_json(loaded)
+    assert json.loads(capsys.readouterr().out)["ahead"] is ahead
 
 
 def test_that_they_change_is_for_programs(capsys: pytest.CaptureFixture[str]) -> None:

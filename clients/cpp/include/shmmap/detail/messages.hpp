@@ -52,8 +52,9 @@ inline void write(Writer& to, const std::optional<Intent>& intent) {
   to.array(6);
   for (const double value : {intent->x, intent->y, intent->vx, intent->vy}) to.real(value);
   write(to, intent->heading);
-  to.array(intent->route.size());
-  for (const auto& [x, y] : intent->route) {
+  const auto route = thinned(intent->route);
+  to.array(route.size());
+  for (const auto& [x, y] : route) {
     to.array(2);
     to.real(x);
     to.real(y);

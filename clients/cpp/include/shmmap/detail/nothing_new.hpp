@@ -52,14 +52,24 @@ class NothingNew {
   bool certain(Client& client, const Intent& pose, const Area& area, const Intent& last_pose, const Area& last,
                std::uint64_t map_version, Clock::time_point now) {
     return answered_ && counter_ && answered_->changes == counter_->read() && now - answered_->asked < tell &&
-           std::hypot(pose.x - answered_->pose.x, pose.y - answered_->pose.y) < tell_m && client.is_connected() &&
+           std::hypot(pose.x - answered_->pose.x, pose.y - answered_->pose.y) < tell_m &&
+           pose.route == answered_->pose.route && client.is_connected() &&
            opened_for_ == std::pair(client.epoch(), client.handshakes_) &&
            ((pose.x == last_pose.x && pose.y == last_pose.y) || touch_the_same(client, area, last, map_version));
   }
 
+  /// The daemon is told the pose after so long or so far, anyhow.
+  static constexpr Seconds tell{1.0};
+  static constexpr double tell_m = 5.0, tell_mps = 1.0;
+
+  /// Whether a pose says more of where a client goes than what the daemon was told last.
+  static bool says_more(const Intent& pose, const Intent& told) {
+    return pose.route != told.route || std::hypot(pose.vx - told.vx, pose.vy - told.vy) >= tell_mps ||
+           std::hypot(pose.x - told.x, pose.y - told.y) >= tell_m;
+  }
+
  private:
-  static constexpr Seconds tell{1.0};  // the daemon is told the pose after so long or so far, anyhow
-  static constexpr double tell_m = 5.0, around_m = 50.0;
+  static constexpr double around_m = 50.0;
   static constexpr std::size_t most_cells = 4096;
 
   struct Answered {

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells are loaded before somebody asks for them: with real loaders, and what is free of memory and of them."""
+"""Cells are loaded before somebody asks for them: with real loaders, and memory that is really short."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -59,11 +59,11 @@ def idle(one: InnerDaemon) -> bool:
 
 
 @pytest.fixture
-def prefetching(inner: Inner, street: DividedMap) -> Iterator[Callable[..., InnerDaemon]]:
+def prefetching(inner: Inner, street: DividedMap) -> Callable[..., InnerDaemon]:
     def factory(**options: object) -> InnerDaemon:
         return inner(street.root, **{"prefetch_share": 0.5, "workers": 2, **options})
 
-    yield factory
+    return factory
 
 
 def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[..., InnerDaemon]) -> None:
@@ -199,7 +199,7 @@ def test_no_more_than_its_share_of_the_budget(prefetching: Callable[..., InnerDa
 
 
 def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., InnerDaemon]) -> None:
-    """A full cache: what lies behind gives way, what is nearer ahead does not; nothing is refused or failed."""
+    """What lies behind gives way, what is nearer ahead does not; nothing is refused or failed."""
     one = prefetching(prefetch_share=1.0)
     drive = Drive(one)
     one.run_until(lambda: idle(one))

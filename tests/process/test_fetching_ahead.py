@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fetching ahead as clients and operators see it: through a time without the map's files, and after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmmap import Circle, EventStream, MapWindow, connect
+from shmmap.protocol import events as e
+from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Shmmap
+from tests.support.cpp_client import CppEventStream
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, make_map
+from tests.support.patience import Patience
+
+PATIENCE_S = 60.0
+EAST = [(-160.0, 0.0), (160.0, 0.0)]
+Listen = Callable[[DaemonProcess], list[Any]]
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> DividedMap:
+    """Return a map of two cells beside one another every 20 m, from -160 to 160 m along x."""
+    return make_map(tmp_path / "street", columns=16, rows=2, points=60)
+
+
+@pytest.fixture
+def listen(daemon: DaemonFactory, cpp_program: Path) -> Iterator[Listen]:
+    """Open event streams in Python and in C++, closed before the daemon is judged."""
+    opened: list[Any] = []
+
+    def both(to: DaemonProcess) -> list[Any]:
+        opened.append(EventStream(to.endpoint, since=60, timeout=PATIENCE_S))
+        opened.append(CppEventStream(cpp_program, to.endpoint, since=60))
+        return opened
+
+    assert daemon
+    yield both
+    for stream in opened:
+        stream.close()
+
+
+def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
+    """Return the first event that fits."""
+    while True:
+        happening = stream.next(PATIENCE_S)
+        assert happening is not None
+        if fits(happening):
+            return happening
+
+
+def until_ahead(shmmap: Shmmap, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """Look at the status until it says of fetching ahead what fits."""
+    waiting = Patience()
+    while waiting(not fits(told := shmmap.json("status")["ahead"])):
+        pass
+    return told
+
+
+def ids(rows: list[dict[str, Any]]) -> set[str]:
+    return {Path(row["id"]).name for row in rows}
+
+
+def test_a_drive_through_a_time_without_the_files(
+    daemon: DaemonFactory, street: DividedMap, listen: Listen, tmp_path: Path
+) -> None:
+    """The client says that it drives at 5 m/s along its route, and moves when the test says so."""
+    one = daemon(street.root, "--workers", "3", environment={"SHMMAP_TEST_WORKER": "offline:"})
+    shmmap, streams = Shmmap(one, tmp_path), listen(one)
+    assert shmmap.json("status")["ahead"]["state"] == "standing"
+    marks = [Path(street.id(name) + ".offline") for name in street.corners]
+    with MapWindow(one.endpoint, 9.0, name="driver") as window:
+        assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
+        told = until_ahead(shmmap, lambda ahead: ahead["state"] == "enough")
+        assert told["ahead_s"] >= told["ride_out_s"] == 10.0
+        assert (told["speed_mps"], told["moving_clients"], told["routed_clients"]) == (5.0, 1, 1)
+        assert told["needed_per_s"] > 0.0
+        assert (told["cells_late"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
+        for stream in streams:
+            event = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "-120_0.pcd")
+            assert event.ahead
+        fetched = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}
+        assert ids(shmmap.json("ls", "--state", "ahead")["cells"]) >= fetched
+        assert (
+            ids(shmmap.json("ls", "--state", "resident")["cells"]) >= {"-160_0.pcd", "-160_-20.pcd"} | fetched
+        )
+        assert "+ fetched ahead" in shmmap("map").splitlines()[-2]
+
+        for mark in marks:
+            mark.touch()
+        assert window.move_to(-100, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
+        told = until_ahead(shmmap, lambda ahead: ahead["state"] == "out")
+        assert (told["cells_late"], told["origin_out"]) == (0, True), "nobody has noticed"
+        assert told["prefetch_used"] == 4
+        shown = {row["id"]: row["ahead"] for row in shmmap.json("ls")["cells"]}
+        assert not shown[street.id("-100_0.pcd")]
+        assert shown[street.id("-140_0.pcd")], "it was passed by"
+        (finding,) = [f for f in shmmap.json("doctor")["findings"] if f["name"] == "fetching ahead"]
+        assert (finding["state"], finding["advice"]) == ("warn", "`shmmap tail` says why loads fail")
+        assert "OUT OF REACH: no load has succeeded" in " ".join(shmmap("status").split())
+
+        window.move_to(-40, 0, vx=5.0, route=EAST)
+        for stream in streams:
+            late = until(stream, lambda h: isinstance(h, e.Late))
+            assert (late.client, late.layer) == ("driver", "points")
+            assert 1 <= late.cells <= 4
+            assert late.id in {f"{x}_{y}.pcd" for x in (-60, -40) for y in (-20, 0)}
+        assert any(" late " in line and "driver" in line for line in shmmap("tail").splitlines())
+        assert shmmap.json("status")["counters"]["cells_late"] >= late.cells
+
+        for mark in marks:
+            mark.unlink()
+        assert window.wait_until_current(PATIENCE_S)
+        told = until_ahead(shmmap, lambda ahead: not ahead["origin_out"] and (ahead["ahead_s"] or 0) >= 10.0)
+        assert told["last_outage_s"] > 0.0
+        assert told["over_fetch"] > 1.0
+        top = shmmap.json("top")
+        assert top["ahead"].keys() == told.keys()
+        assert top["latency_s"]["load_points"]["count"] == top["latency_s"]["load"]["count"] > 8
+        metrics = shmmap("metrics")
+        for line in (
+            "shmmap_origin_outages_total{",
+            "shmmap_ahead_seconds{",
+            "shmmap_load_points_seconds_count{",
+        ):
+            (value,) = [text.split()[-1] for text in metrics.splitlines() if text.startswith(line)]
+            assert float(value) > 0.0, line
+
+
+def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path) -> None:
+    """What clients have to wait for is told all the same."""
+    one = daemon(street.root, "--prefetch-share", "0")
+    shmmap = Shmmap(one, tmp_path)
+    with MapWindow(one.endpoint, 9.0, background=False) as window:
+        window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S)
+        window.move_to(-110, 0, vx=5.0, route=EAST, wait=PATIENCE_S)
+        told = until_ahead(shmmap, lambda ahead: ahead["cells_late"] > 0 and "late" in ahead["why"])
+    assert (told["state"], told["hint"]) == ("off", "raise --prefetch-share")
+    assert (told["cells_late"], told["prefetch_started"]) == (2, 0)
+
+
+def test_load_times_by_what_was_done(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:
+    """A daemon that keeps nothing in memory for the next one finds computed layers on disk."""
+    one = daemon(divided_map.root, "--cache-dir", str(tmp_path / "cache"))
+    shmmap = Shmmap(one, tmp_path)
+    names = ("load", "load_points", "load_computed", "load_cached")
+
+    def counts(wanted: tuple[int, ...]) -> None:
+        with connect(one.endpoint, timeout=PATIENCE_S) as client:
+            for layer in ("voxel(leaf=2.0)", "points"):
+                client.area(Circle(0, 0, 1), layer, wait=PATIENCE_S).raise_for_failures()
+        waiting = Patience()
+        while waiting((found := shmmap.json("top")["latency_s"])["load"]["count"] < sum(wanted)):
+            pass
+        assert [found[name]["count"] for name in names] == [sum(wanted), *wanted]
+        assert all(found[name]["p50"] > 0.0 for name in names if found[name]["count"])
+
+    counts((4, 4, 0))
+    assert all(title in shmmap("top") for title in ("  of points", "  computed"))
+    assert one.stop() == 0
+    one.start()
+    counts((4, 0, 4))
+    shown = shmmap("top")
+    assert "  disk cache" in shown
+    assert "  computed" not in shown

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Routes of any length are sent as at most 512 places, equally far apart."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmmap import BadRequest, Intent
+from shmmap.client.route import FARTHEST_M, MOST_PLACES, sendable, thinned
+from shmmap.client.window.pose import pose_intent
+
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def spiral(places: int) -> np.ndarray:
+    turns = np.linspace(0.0, 12.0, places)
+    return np.stack([30.0 * turns * np.cos(turns), 30.0 * turns * np.sin(turns)], axis=-1)
+
+
+def test_a_short_one_is_sent_as_it_is() -> None:
+    route = spiral(MOST_PLACES)
+    assert thinned(route) is route
+    assert pose_intent(1, 2, 0, 0, None, route).route == tuple(map(tuple, route.tolist()))
+    intent = Intent(1.0, 2.0, route=((3.0, 4.0),))
+    assert sendable(intent) is intent
+    assert sendable(None) is None
+
+
+def test_of_a_long_one_places_equally_far_apart() -> None:
+    route = spiral(20_000)
+    found = thinned(route)
+    assert found.shape == (MOST_PLACES, 2)
+    assert found[0].tolist() == route[0].tolist()
+    assert found[-1] == pytest.approx(route[-1], abs=1e-9)
+    apart = np.hypot(*np.diff(found, axis=0).T)
+    assert apart.max() / apart.min() < 1.01
+    nearest = np.hypot(*(found[:, np.newaxis] - route[np.newaxis]).transpose(2, 0, 1)).min(axis=1)
+    assert nearest.max() < 0.15, "they lie on the route"
+    sent = sendable(Intent(1.0, 2.0, 3.0, 4.0, 0.5, tuple(map(tuple, route.tolist()))))
+    assert sent is not None
+    assert sent == pose_intent(1, 2, 3, 4, 0.5, route)
+    assert sent.route == tuple(map(tuple, found.tolist()))
+
+
+def test_places_passed_twice_and_places_stood_at() -> None:
+    there_and_back = np.concatenate([spiral(400), spiral(400)[::-1], np.tile(spiral(400)[0], (300, 1))])
+    found = thinned(there_and_back)
+    assert len(found) == MOST_PLACES
+    assert found[0].tolist() == found[-1].tolist() == [0.0, 0.0]
+    assert np.hypot(*found.T).max() > 359.0, "it turns at the far end"
+    assert thinned(np.tile([7.0, 8.0], (5000, 1))).tolist() == [[7.0, 8.0]]
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=40), st.integers(14, 40))
+def test_whatever_is_finite_stays_so(some: list[tuple[float, float]], repeats: int) -> None:
+    found = thinned(np.array(some * repeats))
+    assert len(found) <= max(MOST_PLACES, 1)
+    assert np.isfinite(found).all()
+    if len(some) * repeats > MOST_PLACES:
+        assert np.abs(found).max() <= FARTHEST_M
+
+
+@pytest.mark.parametrize(
+    "route",
+    [[(1.0, 2.0), (3.0,)], [(1.0, 2.0, 3.0)], [1.0, 2.0], [("x", "y")], [(1.0, math.nan)], [(None, 1)]],
+)
+def test_what_is_no_route_is_refused(route: Any) -> None:
+    with pytest.raises(BadRequest):
+        pose_intent(0, 0, 0, 0, None, route)
+    if not isinstance(route[0], float):
+        with pytest.raises(BadRequest):
+            sendable(Intent(0.0, 0.0, route=tuple(route) * 600))
+
+
+@pytest.mark.parametrize(
+    "route",
+    [[(1, 2), [3, 4]], np.array([[1, 2], [3, 4]]), np.array([[1, 2], [3, 4]], np.float32), ((1, 2), (3, 4))],
+)
+def test_as_planners_have_them(route: Any) -> None:
+    assert pose_intent(0, 0, 0, 0, None, route).route == ((1.0, 2.0), (3.0, 4.0))
+    assert pose_intent(0, 0, 0, 0, None, ()).route == ()
+    assert pose_intent(0, 0, 0, 0, None, np.empty((0, 2))).route == ()
