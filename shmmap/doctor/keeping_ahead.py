@@ -15,6 +15,8 @@ AheadState = Literal["off", "standing", "enough", "filling", "out", "slow", "ful
 
 MOST_BUSY: Final = 0.8
 """Loaders that keep up may be busy for this much of their time: loads take unequal times."""
+FILLED: Final = 0.9
+"""How much is in memory is known to a step of the way, and what is just being loaded comes and goes."""
 MOST_LATE: Final = 0.02
 """Of what is asked for so much comes late where nobody knows where clients will turn."""
 AHEAD_COUNTS: Final = (
@@ -95,7 +97,7 @@ def ahead_verdict(counters: Mapping[str, int]) -> AheadVerdict:
         return AheadVerdict(
             "out", f"no load has succeeded for {since}; {memory}", "`shmmap tail` says why loads fail"
         )
-    if ahead_s < ride_out_s:
+    if ahead_s < FILLED * ride_out_s:
         short = f"{memory}, less than --ride-out ({format_duration(ride_out_s)})"
         if given and needed > MOST_BUSY * given:
             return AheadVerdict(
@@ -116,7 +118,7 @@ def ahead_verdict(counters: Mapping[str, int]) -> AheadVerdict:
                 "full", f"{short}; the budget of {budget} is full of what is in use or needed sooner",
                 "raise --budget, or give the clients a smaller radius or a layer with fewer bytes",
             )  # fmt: skip
-        return AheadVerdict("filling", short)
+        return AheadVerdict("filling", short + (f"; {came_late}" if late else ""))
     outage_s = counters["last_outage_ns"] * 1e-9
     if late and outage_s > ride_out_s:
         away = f"the map's files were out of reach for {format_duration(outage_s)}"

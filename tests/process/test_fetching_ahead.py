@@ -77,7 +77,7 @@ def test_a_drive_through_a_time_without_the_files(
     with MapWindow(one.endpoint, 9.0, name="driver") as window:
         assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
         told = until_ahead(shmmap, lambda ahead: ahead["state"] == "enough")
-        assert told["ahead_s"] >= told["ride_out_s"] == 10.0
+        assert told["ahead_s"] >= 0.9 * told["ride_out_s"] == 9.0
         assert (told["speed_mps"], told["moving_clients"], told["routed_clients"]) == (5.0, 1, 1)
         assert told["needed_per_s"] > 0.0
         assert (told["cells_late"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
@@ -116,7 +116,7 @@ def test_a_drive_through_a_time_without_the_files(
         for mark in marks:
             mark.unlink()
         assert window.wait_until_current(PATIENCE_S)
-        told = until_ahead(shmmap, lambda ahead: not ahead["origin_out"] and (ahead["ahead_s"] or 0) >= 10.0)
+        told = until_ahead(shmmap, lambda ahead: not ahead["origin_out"] and (ahead["ahead_s"] or 0) >= 9.0)
         assert told["last_outage_s"] > 0.0
         assert told["over_fetch"] > 1.0
         top = shmmap.json("top")

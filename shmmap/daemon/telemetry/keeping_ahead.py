@@ -26,7 +26,7 @@ from shmmap.daemon.transport.sessions import Session, Sessions
 
 __all__ = ["KeepingAhead"]
 
-LOOKS_A_BEAT: Final = 4
+LOOKS_A_BEAT: Final = 3
 """Steps along clients' ways at one beat: half a millisecond."""
 STEP_M: Final = 10.0
 MOST_COUNTED: Final = 1 << 16

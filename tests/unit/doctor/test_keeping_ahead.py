@@ -45,7 +45,17 @@ def driving(**values: int) -> dict[str, int]:
             "enough", f"enough: {AHEAD}; 1 cell came late in the last 10 min", "",
         ),
         (driving(needed_per_1000s=17_000), "enough", f"enough: {AHEAD}; {RATES.replace('14', '17')}", ""),
+        (
+            driving(ahead_ns=9 * S, needed_per_1000s=17_000, prefetch_short=1),
+            "enough",
+            f"enough: {AHEAD.replace('12.0 s', '9.0 s')}; {RATES.replace('14', '17')}",
+            "",
+        ),
         (driving(ahead_ns=4 * S, loadable_per_1000s=0), "filling", f"not yet filled: {SHORT}", ""),
+        (
+            driving(ahead_ns=4 * S, needed_per_1000s=1, cells_late_10min=9),
+            "filling", f"not yet filled: {SHORT}; 9 cells came late in the last 10 min", "",
+        ),
         (
             driving(ahead_ns=4 * S, needed_per_1000s=14_100),
             "slow", "NOT ENOUGH: clients need 14 loads/s at 12.0 m/s, loaders can do 18 loads/s",
