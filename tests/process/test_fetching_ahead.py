@@ -39,7 +39,6 @@ def listen(daemon: DaemonFactory, cpp_program: Path) -> Iterator[Listen]:
         opened.append(CppEventStream(cpp_program, to.endpoint, since=60))
         return opened
 
-    assert daemon
     yield both
     for stream in opened:
         stream.close()
@@ -57,8 +56,9 @@ def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
 def until_ahead(shmmap: Shmmap, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Look at the status until it says of fetching ahead what fits."""
     waiting = Patience()
-    while waiting(not fits(told := shmmap.json("status")["ahead"])):
-        pass
+    told: dict[str, Any] = shmmap.json("status")["ahead"]
+    while waiting(not fits(told)):
+        told = shmmap.json("status")["ahead"]
     return told
 
 
@@ -74,7 +74,7 @@ def test_a_drive_through_a_time_without_the_files(
     shmmap, streams = Shmmap(one, tmp_path), listen(one)
     assert shmmap.json("status")["ahead"]["state"] == "standing"
     marks = [Path(street.id(name) + ".offline") for name in street.corners]
-    with MapWindow(one.endpoint, 9.0, name="driver") as window:
+    with MapWindow(one.endpoint, 6.0, name="driver") as window:
         assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
         told = until_ahead(shmmap, lambda ahead: ahead["state"] == "enough")
         assert told["ahead_s"] >= 0.9 * told["ride_out_s"] == 9.0
@@ -136,7 +136,7 @@ def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path)
     """What clients have to wait for is told all the same."""
     one = daemon(street.root, "--prefetch-share", "0")
     shmmap = Shmmap(one, tmp_path)
-    with MapWindow(one.endpoint, 9.0, background=False) as window:
+    with MapWindow(one.endpoint, 6.0, background=False) as window:
         window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S)
         window.move_to(-110, 0, vx=5.0, route=EAST, wait=PATIENCE_S)
         told = until_ahead(shmmap, lambda ahead: ahead["cells_late"] > 0 and "late" in ahead["why"])

@@ -15,7 +15,7 @@ import pytest
 import shmmap
 from shmmap.client.route import MOST_PLACES, thinned
 from shmmap.client.window import nothing_new
-from shmmap.daemon.travel.motion import Motion
+from shmmap.daemon.requests import dispatch, limits
 from shmmap.protocol.messages import Intent
 from tests.support.cpp_client import CppWindow
 from tests.support.divided_map import DividedMap
@@ -43,13 +43,12 @@ def make(request: pytest.FixtureRequest) -> MakeWindow:
 def told(monkeypatch: pytest.MonkeyPatch) -> list[Intent]:
     """What clients have said to the daemon of where they are and go."""
     found: list[Intent] = []
-    hears = Motion.told
 
-    def hear(motion: Motion, intent: Intent, now_s: float) -> None:
+    def hear(intent: Intent) -> None:
         found.append(intent)
-        hears(motion, intent, now_s)
+        limits.check_intent(intent)
 
-    monkeypatch.setattr(Motion, "told", hear)
+    monkeypatch.setattr(dispatch, "check_intent", hear)
     return found
 
 

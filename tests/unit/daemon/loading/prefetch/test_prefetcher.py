@@ -16,6 +16,7 @@ from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
 from tests.support.daemon_process import stop
 from tests.support.divided_map import DividedMap, make_map
+from tests.support.moving import says
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon, names
 
 RADIUS_M = 30.0
@@ -41,8 +42,7 @@ class Drive:
         """Say where it is, and ask for what is around; returns the cells."""
         self.request += 1
         session = self.session
-        session.intent = session.told = Intent(x, 10.0, vx=SPEED_MPS)
-        session.says_where, session.last_request_s = True, self.one.now_s()
+        says(session, Intent(x, 10.0, vx=SPEED_MPS, route=((x, 10.0), (400.0, 10.0))), self.one.now_s())
         area = CircleMessage(x, 10.0, RADIUS_M)
         self.one.ask(session, Area(self.request, area, self.layers, wait=wait))
         return names(self.one.cells_of(self.request))
