@@ -4,17 +4,17 @@
     python -m tests.benchmarks.eviction_traces [--quick]
 
 A vehicle asks for a circle of 200 m every 20 m (12 m/s, cells of 20 m).  Of the cells that come into the
-circle, those still in memory are hits; those inside never give way.  What gives way is chosen by an exact sort
-by the daemon's own scores (its order of segments, `tests.benchmarks.eviction`, differs from that by scores
-that are a little out of date).  "time" knows where the vehicle is, "route" its whole way, too; "Belady" knows
-when each cell will be asked for: no policy has more hits where all cells are equally large.
+circle, those still in memory are hits; those inside never give way.  What gives way is chosen by an exact
+sort by the daemon's own scores (its order of segments differs from that by scores that are a little out of
+date).  "time" knows where the vehicle is, "route" its whole way, too; "belady" knows when each cell will be
+asked for: no policy has more hits where all cells are equally large.
 
 Traces: ten rounds of a loop of 2.9 km, five of one of 9.9 km, three times 5.5 km there and back, 60 km
 of a taxi by chance, two taxis with one memory, and cells of different sizes (log-normal, sigma 1): of those,
 the share of the bytes.
 
-Checked: "route" has at least the hits of "lru" and of "distance", and on loops 0.9 of Belady's; "time" at most
-0.5 percentage points fewer than the better of the two.
+Checked: "route" has at least the hits of "lru" and of "distance", and on loops 0.9 of "belady"'s; "time" at
+most 0.5 percentage points fewer than the better of the two.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ MOST_PLACES: Final = 256
 MOST_OF_A_CLIENT: Final = 128
 """Places along a route; the longer it is, the farther apart are those that come late."""
 NEAREST_M: Final = 10.0
-"""Places along a route are at least so far apart, and a quarter of the client's reach."""
+"""Places along a route are at least so far apart, and an eighth of the client's reach."""
 SLOWEST_MPS: Final = 3.0
 """A client that stands still may drive off."""
 STAY_M: Final = 10.0
@@ -59,7 +59,7 @@ def places_of(motion: Motion, reach_m: float) -> Places:
         return np.array([[*here, math.inf, pace, *heading]])
     speed = max(motion.fastest_mps, SLOWEST_MPS)
     left_m = route.length_m - motion.along_m
-    near_m = max(reach_m / 4.0, NEAREST_M)
+    near_m = max(reach_m / 8.0, NEAREST_M)
     count = min(MOST_OF_A_CLIENT - 2, max(1, math.ceil(left_m / near_m)))
     # the first ones ``near_m`` apart; if that needs too many, later ones farther
     power = max(1.0, math.log(left_m / near_m) / math.log(count)) if count > 1 else 1.0
@@ -71,7 +71,7 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     # what comes into reach between two places is needed before the client is at the second
     found[1:-1, 2] = motion.told_s + (ahead_m - 0.5 * apart_m) / speed
     found[1:-1, 3] = reach_m
-    found[1:-1, 4] = 0.25 * apart_m
+    found[1:-1, 4] = 0.5 * apart_m  # between two places the client is no farther from either
     found[-1] = [*found[-2, :2], motion.told_s + left_m / speed, reach_m, math.inf, pace, 0.0, 0.0]
     return found
 

@@ -21,7 +21,8 @@ OFF_ROUTE_M: Final = 100.0
 SLACK_M: Final = 10.0
 """Of two stretches of a route that are both so near (to this), the client is on the one that comes first."""
 BEHIND_M: Final = 20.0
-"""So far back on its route, at most, a client is looked for that had come farther: streets are taken both ways."""
+"""So far back on its route, at most, a client is looked for that had come farther: it may be a street that
+is taken both ways."""
 
 
 class Route:

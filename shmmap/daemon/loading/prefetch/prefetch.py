@@ -83,7 +83,8 @@ class Prefetch:
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
         """Return what is needed first of what is absent; None if nothing is, or not known yet (`more`)."""
         self.more = False
-        if catalogue is not self._catalogue or self._is_back(now_s):
+        is_back = self._is_back(now_s)
+        if is_back or catalogue is not self._catalogue:
             # indices mean other cells now, or what was passed over because it had failed may be tried
             self._catalogue = catalogue
             for way in self.ways.values():

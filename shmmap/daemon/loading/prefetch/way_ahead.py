@@ -3,9 +3,9 @@
 
 The area that a client asks for is moved along its way, a step at a time: cells that come into it at a step
 are needed when the client is there.  The way is the route that the client told; without one, and beyond its
-end, straight on and, a little later, to both sides of that, because nobody knows where it turns.  What it will
-ask for along a kilometre is not kept: the way is looked over again and again (a *pass*), and what is not in
-memory is wished for.  So a wish is never out of date, whatever moves, changes or gives way meanwhile.
+end, straight on and, a little later, to both sides of that, because nobody knows where it turns.  What it
+will ask for along a kilometre is not kept: the way is looked over again and again (a *pass*), and what is not
+in memory is wished for.  So a wish is never out of date, whatever moves, changes or gives way meanwhile.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ SPREAD_RAD: Final = 0.5
 """So far to both sides of straight on a client without a route is taken to turn."""
 LATER_S: Final = 1.0
 """So much later than what lies straight on is fetched what lies to the sides."""
-BESIDE_M: Final = 3.0
-"""So far to either side of the way told a client may be: in the next lane, almost."""
+BESIDE_M: Final = 2.0
+"""So far to either side of the way told a client may be: what is told is the middle of a lane."""
 
 
 class LookAhead(NamedTuple):
@@ -104,7 +104,7 @@ class WayAhead:
         self._entered = (0.0, 0)
 
     def first(self) -> tuple[float, int] | None:
-        """What is needed next of what was found: in how many seconds, and its index; None if all was taken."""
+        """What is needed next of what was found: in how many seconds, and its index; None if all is taken."""
         if not self._found:
             return None
         ahead_m, index = self._found[0]
@@ -126,7 +126,7 @@ class WayAhead:
             self.over = True
             return
         if self._inside is None:
-            self._inside, _ = catalogue.query(self.area.around(*self.area.center, self._wider_m), MOST_CELLS)
+            self._inside, _ = catalogue.query(self.area, MOST_CELLS)
         if len(self._inside) > MOST_CELLS:
             self.over = True
             return

@@ -11,17 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction.eviction_policy import (
-    MOST_PLACES,
     POLICIES,
     by_distance,
     by_last_use,
-    places_of,
+    by_time_until_needed,
+    score_of,
 )
-from shmmap.daemon.config import load_config
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.transport.sessions import SQUARE_M, squares_of
+from shmmap.daemon.travel.motion import Motion
+from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_of, until_needed
+from shmmap.protocol.messages import Intent
 
 coordinates = st.floats(-1e5, 1e5)
+points = st.tuples(coordinates, coordinates)
 
 
 @st.composite
@@ -45,6 +47,13 @@ def residents(draw: st.DrawFn) -> list[Resident]:
     return found
 
 
+def client(x: float, y: float, vx: float = 0.0, vy: float = 0.0, *route: tuple[float, float]) -> Places:
+    """Where a client with a reach of 50 m will be."""
+    motion = Motion()
+    motion.told(Intent(x, y, vx, vy, route=route), 0.0)
+    return places_of(motion, 50.0)
+
+
 def distance(resident: Resident, x: float, y: float) -> float:
     """Distance from (x, y) to the nearest point of a resident's box."""
     nearest_x = min(max(x, resident.box[0]), resident.box[2])
@@ -52,78 +61,103 @@ def distance(resident: Resident, x: float, y: float) -> float:
     return math.hypot(x - nearest_x, y - nearest_y)
 
 
-def ordered(policy: str, some: list[Resident], *places: tuple[float, float]) -> list[Resident]:
+def ordered(policy: str, some: list[Resident], *clients: Places) -> list[Resident]:
     """Sorted as a policy says, the one that goes first in front."""
-    scores = POLICIES[policy](some, np.array(places, dtype=np.float64).reshape(-1, 2)).tolist()
+    scores = POLICIES[policy](some, merged_places(clients), 0.0).tolist()
     ranks = {one: (-score, one.last_use_s) for one, score in zip(some, scores, strict=True)}
     return sorted(some, key=ranks.__getitem__)
 
 
-@given(residents(), st.lists(st.tuples(coordinates, coordinates), max_size=4))
+@given(residents(), st.lists(points, max_size=4))
 def test_least_recently_used(candidates: list[Resident], places: list[tuple[float, float]]) -> None:
-    for policy in ("lru", "distance"):
-        found = ordered(policy, candidates, *(places if policy == "lru" else []))
-        times = [resident.last_use_s for resident in found]
+    """Always so, or where no client is anywhere."""
+    for policy in POLICIES:
+        clients = [client(*place) for place in places] if policy == "lru" else []
+        times = [resident.last_use_s for resident in ordered(policy, candidates, *clients)]
         assert times == sorted(times)
 
 
-@given(residents(), st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=4))
+@given(residents(), st.lists(points, min_size=1, max_size=4))
 def test_farthest_from_every_client(candidates: list[Resident], places: list[tuple[float, float]]) -> None:
     """The distance to the nearest client counts, weighted by size."""
-    scores = by_distance(candidates, np.array(places))
+    scores = by_distance(candidates, merged_places(client(*place) for place in places), 0.0)
     for resident, score in zip(candidates, scores.tolist(), strict=True):
         expected = min(distance(resident, x, y) for x, y in places) * math.sqrt(resident.nbytes)
         assert score == pytest.approx(expected, rel=1e-9, abs=1e-6)
 
 
-@given(st.lists(st.tuples(coordinates, coordinates), max_size=600))
-def test_places_in_few_squares(points: list[tuple[float, float]]) -> None:
-    """Each is within half a square of one of the middles; above a number the squares are larger."""
-    squares = {square for point in points for square in squares_of([point])}
-    found = places_of(squares)
-    assert len(found) == len(squares) if len(squares) <= MOST_PLACES else len(found) <= MOST_PLACES
-    if len(points) > 0:
-        offsets = np.abs(np.array(points)[:, np.newaxis] - found).max(axis=2).min(axis=1)
-        half = SQUARE_M / 2
-        while len(squares) > MOST_PLACES and half < offsets.max():
-            half *= 2.0
-        assert offsets.max() <= half <= 2e5
-    assert len(places_of({})) == 0
+@given(residents(), st.lists(points, min_size=1, max_size=4), st.floats(0, 100))
+def test_needed_last(candidates: list[Resident], places: list[tuple[float, float]], now_s: float) -> None:
+    """The time until any client comes to it counts, weighted by size."""
+    clients = merged_places(client(*place, 10.0, 5.0) for place in places)
+    scores = by_time_until_needed(candidates, clients, now_s)
+    boxes = np.array([resident.box for resident in candidates]).reshape(-1, 4)
+    times = until_needed(boxes, clients, now_s)
+    for resident, score, until_s in zip(candidates, scores.tolist(), times.tolist(), strict=True):
+        assert score == pytest.approx(until_s * math.sqrt(resident.nbytes))
 
 
-def test_a_crowd_costs_no_more_than_so_many_places() -> None:
-    """300 clients with routes all over the map, and two that drive apart from them."""
-    crowd = {square for n in range(300) for square in squares_of([(n * 131.0, n * 77.0), (4e4, n * 100.0)])}
-    assert len(crowd) > 10 * MOST_PLACES
-    assert MOST_PLACES // 8 < len(places_of(crowd)) <= MOST_PLACES
+@given(residents(), points, points)
+def test_one_more_client_keeps_nothing_from_being_needed_sooner(
+    candidates: list[Resident], one: tuple[float, float], other: tuple[float, float]
+) -> None:
+    for policy in (by_distance, by_time_until_needed):
+        alone = policy(candidates, client(*one), 0.0)
+        both = policy(candidates, merged_places([client(*one), client(*other)]), 0.0)
+        assert (both <= alone + 1e-6).all()
 
 
-def made(name: str, x: float, nbytes: int = 100, last_use_s: float = 0.0) -> Resident:
+def made(name: str, x: float, y: float = 0.0, nbytes: int = 100, last_use_s: float = 0.0) -> Resident:
     return Resident(
-        name, Key(name, "points"), 1, nbytes, 0, (x, 0.0, x + 10, 10.0), 0.0, 0.0, last_use_s=last_use_s
+        name, Key(name, "points"), 1, nbytes, 0, (x, y, x + 10, y + 10.0), 0.0, 0.0, last_use_s=last_use_s
     )
 
 
-def test_examples() -> None:
-    near, middle, far = made("near", 0), made("middle", 100), made("far", 500)
-    assert [r.name for r in ordered("distance", [near, far, middle], (5.0, 5.0))] == ["far", "middle", "near"]
-    assert ordered("distance", [near, far, middle], (5.0, 5.0), (505.0, 5.0))[0] is middle
-    large = made("large", 300, nbytes=400)
-    assert ordered("distance", [near, middle, far, large], (5.0, 5.0))[0] is large
-    old, new = made("old", 50, last_use_s=1.0), made("new", 50, last_use_s=2.0)
-    assert ordered("distance", [new, old], (0.0, 0.0)) == [old, new]
-    assert ordered("distance", [new, old]) == [old, new]
-    assert by_last_use([], np.zeros((0, 2))).shape == (0,)
+@pytest.mark.parametrize("policy", ["distance", "time"])
+def test_examples(policy: str) -> None:
+    near, middle, far = made("near", 60), made("middle", 150), made("far", 500)
+    here = client(5.0, 5.0)
+    assert [r.name for r in ordered(policy, [near, far, middle], here)] == ["far", "middle", "near"]
+    assert ordered(policy, [near, far, middle], here, client(505.0, 5.0))[0] is middle
+    large = made("large", 350, nbytes=400)
+    assert ordered(policy, [near, middle, far, large], here)[0] is large
+    old, new = made("old", 150, last_use_s=1.0), made("new", 150, last_use_s=2.0)
+    assert ordered(policy, [new, old], client(0.0, 0.0)) == [old, new]
+    assert ordered(policy, [new, old]) == [old, new]
 
 
-@pytest.mark.parametrize(("name", "first"), [("distance", "far, just used"), ("lru", "near, long unused")])
+def test_nothing_to_score() -> None:
+    for policy in POLICIES.values():
+        for places in (NOWHERE, client(0.0, 0.0)):
+            assert policy([], places, 0.0).shape == (0,)
+
+
+def test_behind_goes_before_ahead() -> None:
+    behind, beside, ahead = made("behind", -310), made("beside", -5, 300), made("ahead", 300)
+    driver = client(0.0, 0.0, 10.0, 0.0)
+    assert ordered("time", [ahead, behind, beside], driver) == [behind, beside, ahead]
+
+
+def test_a_route_counts() -> None:
+    """What the client comes to after a turn stays; what is nearer, but not on its way, goes."""
+    driver = client(0.0, 0.0, 10.0, 0.0, (0.0, 0.0), (400.0, 0.0), (400.0, 800.0))
+    on_the_way, nearer = made("on the way", 390, 780), made("nearer", -200, 0)
+    assert ordered("time", [on_the_way, nearer], driver) == [nearer, on_the_way]
+    assert ordered("time", [on_the_way, nearer], client(0.0, 0.0, 10.0, 0.0)) == [on_the_way, nearer]
+
+
+def test_scores_of_sizes() -> None:
+    assert score_of(3.0, 4.0) == pytest.approx(6.0)
+    assert score_of(np.array([1.0, 2.0]), np.array([9.0, 16.0])) == pytest.approx([3.0, 8.0])
+    assert by_last_use([], NOWHERE, 0.0).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("name", "first"),
+    [("time", "far, just used"), ("distance", "far, just used"), ("lru", "near, long unused")],
+)
 def test_a_policy_does_what_its_name_says(name: str, first: str) -> None:
     candidates = [made("near, long unused", 0, last_use_s=1.0), made("far, just used", 500, last_use_s=2.0)]
     for order in (candidates, candidates[::-1]):
-        assert ordered(name, order, (5.0, 5.0))[0].name == first
-        assert ordered(name, order)[0].name == "near, long unused", "of distance without any place"
-
-
-def test_every_policy_can_be_configured() -> None:
-    for name in POLICIES:
-        assert load_config({"map_path": "/map", "eviction": name}, environ={}).eviction == name
+        assert ordered(name, order, client(5.0, 5.0))[0].name == first
+        assert ordered(name, order)[0].name == "near, long unused", "without any client"
