@@ -30,7 +30,10 @@ def street(tmp_path: Path) -> DividedMap:
 
 
 @pytest.fixture
-def listen(daemon: DaemonFactory, cpp_program: Path) -> Iterator[Listen]:
+def listen(
+    daemon: DaemonFactory,  # it judges after these are closed
+    cpp_program: Path,
+) -> Iterator[Listen]:
     """Open event streams in Python and in C++, closed before the daemon is judged."""
     opened: list[Any] = []
 
@@ -39,7 +42,6 @@ def listen(daemon: DaemonFactory, cpp_program: Path) -> Iterator[Listen]:
         opened.append(CppEventStream(cpp_program, to.endpoint, since=60))
         return opened
 
-    assert daemon
     yield both
     for stream in opened:
         stream.close()
@@ -57,8 +59,9 @@ def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
 def until_ahead(shmmap: Shmmap, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Look at the status until it says of fetching ahead what fits."""
     waiting = Patience()
-    while waiting(not fits(told := shmmap.json("status")["ahead"])):
-        pass
+    told: dict[str, Any] = shmmap.json("status")["ahead"]
+    while waiting(not fits(told)):
+        told = shmmap.json("status")["ahead"]
     return told
 
 

@@ -214,8 +214,8 @@ class CellRequests:
         load = self._scheduler.loads.by_key.get(key)
         if load is None or load.prefetch:
             if wanted.session.motion.travelled_m > 0.0:
-                self._statistics.add("cells_late")
-                self._cache.events.late.note(wanted.session, self._cache.wire_id(key.cell_id), key.layer)
+                cell_id, late = self._cache.wire_id(key.cell_id), self._cache.events.late
+                self._statistics.add("cells_late", late.note(wanted.session, cell_id, key.layer))
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:

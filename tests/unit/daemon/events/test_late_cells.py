@@ -5,7 +5,13 @@ from __future__ import annotations
 
 import pytest
 
-from shmmap.daemon.events.late_cells import LATE_S, MOST_AT_ONCE, LateCells
+from shmmap.daemon.events.late_cells import (
+    LATE_S,
+    MOST_AT_ONCE,
+    MOST_CELLS,
+    MOST_CLIENTS,
+    LateCells,
+)
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.geometry import Circle
@@ -33,8 +39,8 @@ def told(log: EventLog) -> list[Late]:
 
 def test_at_most_once_a_second(log: EventLog) -> None:
     late, (one,) = LateCells(log), clients(1)
-    late.note(one, "a.pcd", "points")
-    late.note(one, "b.pcd", "ndt(leaf=2.0)")
+    assert late.note(one, "a.pcd", "points")
+    assert late.note(one, "b.pcd", "ndt(leaf=2.0)")
     assert told(log) == [], "the answer to a request is not held up"
     late.turn(10.0)
     assert told(log) == [Late(1, 7, 5, one.slot, one.peer.pid, "client 0", 2, "b.pcd", "ndt(leaf=2.0)")]
@@ -52,7 +58,7 @@ def test_many_clients_take_turns(log: EventLog) -> None:
     late, many = LateCells(log), clients(5 * MOST_AT_ONCE)
     for number in range(5):
         for session in many:
-            late.note(session, "a.pcd", "points")
+            late.note(session, f"{number}.pcd", "points")
         late.turn(10.0)
         assert len(told(log)) == (number + 1) * MOST_AT_ONCE
     assert {event.session for event in told(log)} == {session.slot for session in many}
@@ -62,6 +68,31 @@ def test_many_clients_take_turns(log: EventLog) -> None:
         late.turn(10.0 + 3 * LATE_S)
     assert len(late) == 0
     assert sum(event.cells for event in told(log)) == 5 * len(many)
+
+
+def test_who_asks_again_waits_on(log: EventLog) -> None:
+    late, (one, other) = LateCells(log), clients(2)
+    assert late.note(one, "a.pcd", "points")
+    assert not late.note(one, "a.pcd", "points")
+    assert late.note(one, "a.pcd", "ndt(leaf=2.0)")
+    assert late.note(other, "a.pcd", "points")
+    late.turn(10.0)
+    assert not late.note(one, "a.pcd", "points")
+    late.arrived("a.pcd", "points")
+    assert late.note(one, "a.pcd", "points"), "it has left memory since"
+    assert not late.note(one, "a.pcd", "ndt(leaf=2.0)")
+    late.turn(20.0)
+    assert [event.cells for event in told(log)] == [2, 1, 1]
+
+
+def test_what_is_remembered_of_cells_that_never_come_is_bounded(log: EventLog) -> None:
+    late, many = LateCells(log), clients(MOST_CLIENTS + 2)
+    for session in many:
+        late.note(session, "a.pcd", "points")
+    assert sum(map(len, late._absent.values())) <= MOST_CLIENTS
+    for number in range(MOST_CELLS + 5):
+        late.note(many[0], f"{number}.pcd", "points")
+    assert len(late._absent) == MOST_CELLS
 
 
 def ask(one: InnerDaemon, session: Session, request: int, x: float) -> None:

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
+from shmmap.daemon.loading.prefetch.prefetcher import MOST_WAYS
+from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Failure, Key
-from shmmap.daemon.telemetry import keeping_ahead
-from shmmap.daemon.telemetry.keeping_ahead import KeepingAhead
+from shmmap.daemon.telemetry.keeping_ahead import LOOKS_A_BEAT, KeepingAhead
 from shmmap.daemon.transport.sessions import Session
 from shmmap.geometry import Circle
 from shmmap.protocol.events import Loaded, decode_event
@@ -34,12 +34,17 @@ def at(
     return session
 
 
+def is_under_way(keeping: KeepingAhead) -> bool:
+    """Whether some clients are still to be looked at."""
+    return keeping._round is not None
+
+
 def gauges(one: InnerDaemon) -> dict[str, int]:
     """Look until a round is over; return what is told."""
     keeping = KeepingAhead(one.cache, one.scheduler, one.sessions)
     for _ in range(200):
         keeping.look(NOW_S)
-        if keeping._round is None:
+        if not is_under_way(keeping):
             return one.statistics.values
     raise AssertionError("a round never ends")
 
@@ -155,15 +160,20 @@ def test_times_without_the_origin(one: InnerDaemon) -> None:
 def test_a_beat_looks_at_a_few_steps_only(one: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(300):
         at(one, -30.0, 0.0)
-    looks: list[Any] = []
-    look = keeping_ahead.WayAhead.look
-    monkeypatch.setattr(keeping_ahead.WayAhead, "look", lambda *args: (looks.append(1), look(*args))[1])
+    looks: list[float] = []
+    look = WayAhead.look
+
+    def counted(way: WayAhead, catalogue: CatalogueView, look_ahead_s: float, step_m: float) -> None:
+        looks.append(step_m)
+        look(way, catalogue, look_ahead_s, step_m)
+
+    monkeypatch.setattr(WayAhead, "look", counted)
     keeping = KeepingAhead(one.cache, one.scheduler, one.sessions)
     keeping.look(NOW_S)
-    assert len(looks) == keeping_ahead.LOOKS_A_BEAT
-    while keeping._round is not None:
+    assert len(looks) == LOOKS_A_BEAT
+    while is_under_way(keeping):
         keeping.look(NOW_S)
-    assert one.statistics.values["moving_clients"] == keeping_ahead.MOST_WAYS - 1, "one stands"
+    assert one.statistics.values["moving_clients"] == MOST_WAYS - 1, "one stands"
     assert one.statistics.values["needed_per_1000s"] == 600
 
 
@@ -172,14 +182,14 @@ def test_another_state_of_the_map_begins_anew(one: InnerDaemon, small_map: Divid
     at(one, -30.0, 0.0)
     keeping = KeepingAhead(one.cache, one.scheduler, one.sessions)
     keeping.look(NOW_S)
-    assert keeping._round is not None
+    assert is_under_way(keeping)
     for name in ("-40_-40.pcd", "-40_-20.pcd", "-40_0.pcd", "-40_20.pcd"):
         small_map.remove_cell(name)
     small_map.write_metadata()
     one.reload()
     while one.cache.unentered:
         one.turn()
-    while keeping._round is not None:
+    while is_under_way(keeping):
         keeping.look(NOW_S)
     assert one.statistics.values["needed_per_1000s"] == 600
     assert one.statistics.values["ahead_ns"] == 10_000_000_000
