@@ -30,7 +30,10 @@ def street(tmp_path: Path) -> DividedMap:
 
 
 @pytest.fixture
-def listen(daemon: DaemonFactory, cpp_program: Path) -> Iterator[Listen]:
+def listen(
+    daemon: DaemonFactory,  # it judges after these are closed
+    cpp_program: Path,
+) -> Iterator[Listen]:
     """Open event streams in Python and in C++, closed before the daemon is judged."""
     opened: list[Any] = []
 

@@ -51,6 +51,7 @@ class CellEvents:
         ``cached`` says that it came out of the disk cache, ``ahead`` that nobody had asked for it yet.
         """
         again = self._tell_loaded(resident, resident.load_ns, replaces, ahead)
+        self.late.arrived(self.wire_id(resident.key.cell_id), resident.key.layer)
         points = resident.key.layer == LAYER
         source = "load_cached" if cached else "load_points" if points else "load_computed"
         self.statistics.add_duration(source, resident.load_ns)

@@ -208,8 +208,7 @@ class CellRequests:
         """Count what nobody fetched ahead: if the client was on its way, it is late."""
         load = self._scheduler.loads.by_key.get(key)
         if load is None or load.prefetch:
-            wanted.session.cold_cells += 1
-            wanted.session.cold_key = key
+            self._scheduler.prefetcher.cold.append((wanted.session, key))
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:

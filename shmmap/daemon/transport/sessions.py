@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_of
@@ -38,9 +38,8 @@ class Session:
     those that no other session holds.  ``says_where`` tells
     an ``intent`` (where the client is and is going to be) that it stated from one that was guessed from
     ``area``, the last one it asked for, in ``layers``.  ``motion`` is what is known of how it moves,
-    ``told`` what it does not know yet, and ``places`` where it will be.  ``cold_cells`` were asked
-    for since then and are not in memory, ``cold_key`` is one of them.  ``asker`` is whose turn its requests and
-    loads count for: the process's, else the session's own.
+    ``told`` what it does not know yet, and ``places`` where it will be.  ``asker`` is
+    whose turn its requests and loads count for: the process's, else the session's own.
     """
 
     slot: int
@@ -58,8 +57,6 @@ class Session:
     area: Area | None = None
     layers: tuple[str, ...] = ()
     told: Intent | None = None
-    cold_cells: int = 0
-    cold_key: Key | None = None
     requests: int = 0
     last_request_s: float = 0.0
     asker: int = 0

@@ -69,11 +69,6 @@ class Motion:
         self._move(intent.x, intent.y, intent.vx, intent.vy, now_s)
         self._follow(intent.route)
 
-    def seen(self, x: float, y: float, now_s: float) -> None:
-        """A client that says nothing of where it is asks for what is around here."""
-        self._move(x, y, 0.0, 0.0, now_s)
-        self._follow(())
-
     def _move(self, x: float, y: float, vx: float, vy: float, now_s: float) -> None:
         x, y = _within(x), _within(y)
         step_m, took_s = math.hypot(x - self.x, y - self.y), now_s - self.told_s

