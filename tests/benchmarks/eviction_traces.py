@@ -127,13 +127,13 @@ def prepared(name: str, part: int) -> Prepared:
     """Find out which cells a trace asks for when."""
     trace = TRACES[name](part)
     places = np.concatenate(trace.ways)
-    catalogue = dense_catalogue(Drive(name, np.arange(len(places)), places, places), 220.0)
+    catalogue = dense_catalogue(Drive(name, np.arange(float(len(places))), places, places), 220.0)
     steps = min(map(len, trace.ways))
     windows, uses = [], dict[int, list[int]]()
     inside: list[Indices] = [np.empty(0, np.intp)] * len(trace.ways)
     for step in range(steps):
         before = inside
-        inside = [catalogue.query(Circle(*way[step].tolist(), RADIUS_M))[0] for way in trace.ways]
+        inside = [catalogue.query(Circle(way[step, 0], way[step, 1], RADIUS_M))[0] for way in trace.ways]
         windows.append(tuple(inside))
         for old, now in zip(before, inside, strict=True):
             for cell in np.setdiff1d(now, old, assume_unique=True).tolist():
@@ -206,7 +206,7 @@ def hits(name: str, part: int, memory_cells: int, column: str) -> float:
     for step, windows in enumerate(work.windows):
         now_s = step * STEP_M / SPEED_MPS
         for motion, way, route in zip(motions, work.trace.ways, routes, strict=True):
-            motion.told(Intent(*way[step].tolist(), route=route), now_s)
+            motion.told(Intent(float(way[step, 0]), float(way[step, 1]), route=route), now_s)
         needed = set(np.concatenate(windows).tolist())
         absent = []
         for old, window in zip(inside, windows, strict=True):

@@ -122,7 +122,7 @@ def recorded_drive(file: Path) -> Drive:
     # the way told is smoother than what was driven
     smooth = np.column_stack([np.convolve(column, np.ones(21) / 21, mode="valid") for column in places.T])
     route = np.concatenate([places[:1], smooth, places[-1:]])
-    return Drive(file.stem, times, np.ascontiguousarray(places), _told(route))
+    return Drive(file.stem, times.astype(np.float64), np.ascontiguousarray(places), _told(route))
 
 
 def dense_catalogue(drive: Drive, around_m: float = 500.0) -> Catalogue:
@@ -155,7 +155,8 @@ def _beside(path: Floats, seed: int) -> Floats:
     ahead = np.gradient(path, axis=0)
     ahead /= np.maximum(np.hypot(ahead[:, 0], ahead[:, 1]), 1e-9)[:, np.newaxis]
     off_m = 0.25 * (np.sin(travelled / 23.0 + seed) + np.sin(travelled / 61.0 + 2.0 * seed))
-    return path + off_m[:, np.newaxis] * np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    found: Floats = path + off_m[:, np.newaxis] * np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    return found
 
 
 def _walk(random: np.random.Generator, side: int, steps: int) -> list[tuple[int, int]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives beside a slow origin as one SVG: where the vehicle had to wait, how long, and what was fetched when."""
+"""Drives beside a slow origin as one SVG: where the vehicle had to wait, how long, and what was fetched."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from tests.benchmarks.slow_origin_counts import Counts, Query
 from tests.benchmarks.slow_origin_model import Outages
-from tests.benchmarks.slow_origin_run import Counts, Query
 
 __all__ = ["drive_picture"]
 
@@ -20,13 +20,13 @@ _MAP_TOP: Final = 112
 _MAP_HEIGHT: Final = 250
 _CHART_HEIGHT: Final = 96
 _WARM, _LATE, _AHEAD, _USED, _BAND = "#2b8a3e", "#c92a2a", "#1f6fb4", "#adb5bd", "#ffe8cc"
-_STYLE: Final = (
-    'text { font-family: system-ui, "DejaVu Sans", sans-serif; font-size: 13px; fill: #1f2933; } '
-    ".title { font-size: 18px; font-weight: 600; } .head { font-size: 15px; font-weight: 600; } "
-    ".small { font-size: 11px; fill: #52606d; } "
-    f".warm {{ stroke: {_WARM}; }} .late {{ stroke: {_LATE}; }} "
-    ".axis { stroke: #ced4da; stroke-width: 1; }"
-)
+_INK, _AXIS = "#1f2933", "#ced4da"
+_STYLE: Final = """
+  text { font-family: system-ui, "DejaVu Sans", sans-serif; font-size: 13px; fill: #1f2933; }
+  .title { font-size: 18px; font-weight: 600; }
+  .head { font-size: 15px; font-weight: 600; }
+  .small { font-size: 11px; fill: #52606d; }
+"""
 _NAMES: Final = {
     "none": "nothing fetched ahead",
     "no route": "fetched ahead",
@@ -34,15 +34,15 @@ _NAMES: Final = {
 }
 
 
-def drive_picture(drives: dict[str, Counts], outages: Outages) -> str:
+def drive_picture(drives: dict[str, Counts], mean_s: float, outages: Outages) -> str:
     """Return one column for each drive: its way, how long each query waits, and cells over time.
 
     Parameters
     ----------
     drives
         By the name of their row, all along the same way.
-    outages
-        Of the origin; drawn as bands.
+    mean_s, outages
+        Of the origin; outages are drawn as bands.
     """
     queries = next(iter(drives.values())).queries
     end_s = queries[-1].asked_s
@@ -52,21 +52,21 @@ def drive_picture(drives: dict[str, Counts], outages: Outages) -> str:
     stall_top = _MAP_TOP + _MAP_HEIGHT + 34
     cells_top = stall_top + _CHART_HEIGHT + 44
     height = cells_top + _CHART_HEIGHT + 40
+    size = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
+    times = f"every {outages.period_s:.0f} s nothing comes for {outages.length_s:.0f} s (bands)"
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-        f'viewBox="0 0 {width} {height}"><style>{_STYLE}</style>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size}><style>{_STYLE}</style>',
         '<rect width="100%" height="100%" fill="white"/>',
-        f'<text class="title" x="{_LEFT}" y="30">A vehicle whose map comes from a slow place</text>',
-        f'<text x="{_LEFT}" y="52">each cell takes 0.4 s on average, eight at a time; every'
-        f" {outages.period_s:.0f} s nothing comes for {outages.length_s:.0f} s (bands)</text>",
+        _text(_LEFT, 30, "A vehicle whose map comes from a slow place", "title"),
+        _text(_LEFT, 52, f"each cell takes {mean_s:g} s on average, eight at a time; {times}"),
         _key(width - _GAP - 300.0, 24.0),
     ]
     for number, (row, counts) in enumerate(drives.items()):
         left = _LEFT + number * (_COLUMN + _GAP)
+        complete = f"{100 * counts.warm:.1f} % of queries complete at once"
         parts += [
-            f'<text class="head" x="{left}" y="84">{_NAMES.get(row, row)}</text>',
-            f'<text x="{left}" y="103">{100 * counts.warm:.1f} % of queries complete at once, {counts.late}'
-            f" cells late</text>",
+            _text(left, 84, _NAMES.get(row, row), "head"),
+            _text(left, 103, f"{complete}, {counts.late} cells late"),
             _way(counts.queries, left, counts.full_s),
             _bands(outages, end_s, left, stall_top),
             _bands(outages, end_s, left, cells_top),
@@ -79,6 +79,15 @@ def drive_picture(drives: dict[str, Counts], outages: Outages) -> str:
     return "\n".join([*parts, "</svg>", ""])
 
 
+def _text(x: float, y: float, text: str, kind: str = "") -> str:
+    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}">{text}</text>'
+
+
+def _stroke(x0: float, y0: float, x1: float, y1: float, colour: str, wide: float) -> str:
+    ends = f'x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"'
+    return f'<line {ends} stroke="{colour}" stroke-width="{wide:.1f}" stroke-linecap="round"/>'
+
+
 def _key(left: float, y: float) -> str:
     """What the colours mean."""
     entries = [(_WARM, "complete at once"), (_LATE, "had to wait"), (_AHEAD, "fetched"), (_USED, "asked for")]
@@ -86,10 +95,7 @@ def _key(left: float, y: float) -> str:
     for at, (colour, text) in enumerate(entries):
         x = left + 150.0 * (at % 2)
         top = y + 20.0 * (at // 2)
-        parts += [
-            f'<line x1="{x}" x2="{x + 18}" y1="{top - 4}" y2="{top - 4}" stroke="{colour}" stroke-width="4"/>',
-            f'<text x="{x + 24}" y="{top}">{text}</text>',
-        ]
+        parts += [_stroke(x, top - 4, x + 18, top - 4, colour, 4.0), _text(x + 24, top, text)]
     return "\n".join(parts)
 
 
@@ -101,21 +107,16 @@ def _way(queries: Sequence[Query], left: float, full_s: float) -> str:
     x = left + 4 + (at[:, 0] - low[0]) * scale
     y = _MAP_TOP + _MAP_HEIGHT - 18 - (at[:, 1] - low[1]) * scale
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
-    parts = [
-        f'<polyline class="warm" points="{points}" fill="none" stroke-width="2.5" stroke-linejoin="round"/>'
-    ]
+    parts = [f'<polyline points="{points}" fill="none" stroke="{_WARM}" stroke-width="2.5"/>']
     for number, query in enumerate(queries[1:], 1):
         if query.late and query.asked_s >= full_s:
             wide = 3.0 + min(query.stall_s, 9.0)
-            parts.append(
-                f'<line class="late" x1="{x[number - 1]:.1f}" y1="{y[number - 1]:.1f}" x2="{x[number]:.1f}"'
-                f' y2="{y[number]:.1f}" stroke-width="{wide:.1f}" stroke-linecap="round" stroke-opacity="0.55"/>'
-            )
+            parts.append(_stroke(x[number - 1], y[number - 1], x[number], y[number], _LATE, wide))
+    bottom, end = _MAP_TOP + _MAP_HEIGHT - 2, left + 4 + 500 * scale
     parts += [
-        f'<circle cx="{x[0]:.1f}" cy="{y[0]:.1f}" r="4" fill="#1f2933"/>',
-        f'<line class="axis" x1="{left + 4}" x2="{left + 4 + 500 * scale:.1f}" y1="{_MAP_TOP + _MAP_HEIGHT - 2}"'
-        f' y2="{_MAP_TOP + _MAP_HEIGHT - 2}" style="stroke: #1f2933"/>',
-        f'<text class="small" x="{left + 10 + 500 * scale:.1f}" y="{_MAP_TOP + _MAP_HEIGHT + 2}">500 m</text>',
+        f'<circle cx="{x[0]:.1f}" cy="{y[0]:.1f}" r="4" fill="{_INK}"/>',
+        _stroke(left + 4, bottom, end, bottom, _INK, 1.0),
+        _text(end + 6, bottom + 4, "500 m", "small"),
     ]
     return "\n".join(parts)
 
@@ -144,8 +145,8 @@ def _frame(title: str, left: float, top: float, most: float, end_s: float, *, fi
     ]
     return "\n".join(
         [
-            f'<line class="axis" x1="{left}" x2="{left + _COLUMN}" y1="{bottom}" y2="{bottom}"/>',
-            f'<text class="small" x="{left}" y="{top - 6}">{title}</text>',
+            _stroke(left, bottom, left + _COLUMN, bottom, _AXIS, 1.0),
+            _text(left, top - 6, title, "small"),
             *marks,
             *(scale if first else []),
         ]
@@ -155,13 +156,10 @@ def _frame(title: str, left: float, top: float, most: float, end_s: float, *, fi
 def _bars(queries: Sequence[Query], left: float, top: float, most: float, end_s: float) -> str:
     """How long each query waited."""
     bottom = top + _CHART_HEIGHT
-    return "\n".join(
-        f'<line class="late" x1="{left + query.asked_s / end_s * _COLUMN:.1f}"'
-        f' x2="{left + query.asked_s / end_s * _COLUMN:.1f}" y1="{bottom}"'
-        f' y2="{bottom - query.stall_s / most * _CHART_HEIGHT:.1f}" stroke-width="1"/>'
-        for query in queries
-        if query.stall_s > 0.0
-    )
+    waited = [query for query in queries if query.stall_s > 0.0]
+    at = [left + query.asked_s / end_s * _COLUMN for query in waited]
+    tops = [bottom - query.stall_s / most * _CHART_HEIGHT for query in waited]
+    return "\n".join(_stroke(x, bottom, x, y, _LATE, 1.0) for x, y in zip(at, tops, strict=True))
 
 
 def _line(

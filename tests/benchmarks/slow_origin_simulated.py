@@ -34,10 +34,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shmmap.origin.catalogue import Catalogue
+from tests.benchmarks.slow_origin_counts import Counts
 from tests.benchmarks.slow_origin_drives import Drive, city_drive, dense_catalogue, recorded_drive, town_drive
 from tests.benchmarks.slow_origin_model import OUTAGES, SlowOrigin
 from tests.benchmarks.slow_origin_picture import drive_picture
-from tests.benchmarks.slow_origin_run import ROWS, Counts, Setting, simulate
+from tests.benchmarks.slow_origin_run import ROWS, Setting, simulate
 
 MEANS_S = (0.05, 0.15, 0.4)
 MEMORY_CELLS = {10.0: 1000, 60.0: 2400}
@@ -110,7 +111,12 @@ def main() -> int:
     parser.add_argument("--poses", type=Path, metavar="FILE", help="a recorded drive: KITTI's or TUM's poses")
     parser.add_argument("--seeds", type=int, default=1, help="towns, cities and origins (default: 1)")
     parser.add_argument("--rows", default=",".join(ROWS), help="which rows (default: all)")
-    parser.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw the town's outages of 10 s")
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE.svg",
+        help="only draw three drives through the town, at 400 ms, with outages of 10 s",
+    )
     arguments = parser.parse_args()
     rows = arguments.rows.split(",")
     if set(rows) - set(ROWS):
@@ -121,10 +127,10 @@ def main() -> int:
         _held.drives.append(recorded_drive(arguments.poses))
     _held.catalogues.extend(map(dense_catalogue, _held.drives))
     if arguments.picture is not None:
-        drawn = {
-            row: counts_of(Case(0, "10 s / 120 s", 0.4, row, 0)) for row in ("none", "no route", "route")
-        }
-        arguments.picture.write_text(drive_picture(drawn, OUTAGES["10 s / 120 s"]), encoding="utf-8")
+        shown = [row for row in ("none", "no route", "route") if row in rows]
+        drawn = {row: counts_of(Case(0, PICTURE, MEANS_S[-1], row, 0)) for row in shown}
+        picture = drive_picture(drawn, MEANS_S[-1], OUTAGES[PICTURE])
+        arguments.picture.write_text(picture, encoding="utf-8")
         return 0
     cases = [
         Case(drive, outages, mean_s, row, drive)

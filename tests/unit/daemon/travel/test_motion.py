@@ -112,15 +112,13 @@ def test_along_its_route() -> None:
 
 def test_off_its_route_and_on_it_again() -> None:
     motion = Motion()
-    motion.told(Intent(0.0, 0.0, route=LOOP), 0.0)
-    assert motion.route is not None
-    motion.told(Intent(0.0, -60.0, route=LOOP), 1.0)
-    motion.told(Intent(0.0, -120.0, route=LOOP), 2.0)
-    assert motion.route is None
-    assert motion.along_m == 0.0
-    motion.told(Intent(60.0, -90.0, route=LOOP), 3.0)
-    assert motion.route is not None
-    assert motion.along_m == pytest.approx(60.0)
+    on_it, along = [], []
+    for second, (x, y) in enumerate([(0.0, 0.0), (0.0, -60.0), (0.0, -120.0), (60.0, -90.0)]):
+        motion.told(Intent(x, y, route=LOOP), float(second))
+        on_it.append(motion.route is not None)
+        along.append(motion.along_m)
+    assert on_it == [True, True, False, True]
+    assert along == pytest.approx([0.0, 0.0, 0.0, 60.0])
 
 
 def test_another_route_begins_anew() -> None:
