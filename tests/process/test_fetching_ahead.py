@@ -126,13 +126,12 @@ def test_a_drive_through_a_time_without_the_files(
         assert top["ahead"].keys() == told.keys()
         assert top["latency_s"]["load_points"]["count"] == top["latency_s"]["load"]["count"] > 8
         metrics = shmmap("metrics")
-        for line in (
-            "shmmap_origin_outages_total{",
-            "shmmap_ahead_seconds{",
-            "shmmap_load_points_seconds_count{",
-        ):
-            (value,) = [text.split()[-1] for text in metrics.splitlines() if text.startswith(line)]
-            assert float(value) > 0.0, line
+        shown_as = {
+            text.split("{")[0]: float(text.split()[-1]) for text in metrics.splitlines() if "{" in text
+        }
+        assert shown_as["shmmap_origin_outages_total"] >= 1.0
+        assert shown_as["shmmap_load_points_seconds_count"] > 8.0
+        assert "shmmap_ahead_seconds" in shown_as
 
 
 def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path) -> None:
