@@ -5,46 +5,27 @@ Kernels live in modules of their own that only builders import, so that nothing 
 unless it builds a layer.  Every signature takes read-only arrays (writable ones fit it too; the
 reverse would compile once more, for seconds, on the first array out of shared memory).
 
-The cache is ``NUMBA_CACHE_DIR`` where that is set, else ``$CACHE_DIRECTORY/kernels`` (a service),
-``$XDG_CACHE_HOME/shmmap/kernels`` or ``~/.cache/shmmap/kernels``; where it cannot be written, kernels are
-compiled in each process.
+The cache is in `shmmap.kernel_cache.kernel_directory`; where it cannot be written, kernels are compiled in
+each process.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import numba
 import numba.core.config
+
+from shmmap.kernel_cache import kernel_directory
 
 __all__ = ["compiled", "inlined", "read_only"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _cache_directory() -> Path | None:
-    """Directory of compiled kernels, made if missing; None where none can be written."""
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    service = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    try:
-        if named:
-            path = Path(named)
-        elif service:
-            path = Path(service) / "kernels"
-        else:
-            path = (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "kernels"
-        path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        return path if os.access(path, os.W_OK | os.X_OK) else None
-    except (OSError, RuntimeError):  # RuntimeError: no home directory
-        return None
-
-
 _config: Any = numba.core.config
-_DIRECTORY: Final = _cache_directory()
+_DIRECTORY: Final = kernel_directory()
 
 
 def read_only(dtype: Any, dimensions: int) -> Any:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.kernel_cache import compiled_mark
 from tests.support.built_once import built_once
 from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
@@ -34,6 +35,8 @@ def pytest_configure(config: pytest.Config) -> None:
             cache.mkdir("kernels") if cache is not None else Path(tempfile.mkdtemp(prefix="shmmap-kernels-"))
         )
         os.environ["NUMBA_CACHE_DIR"] = str(path)
+        if (mark := compiled_mark()) is not None:
+            mark.touch()  # no daemon of a test compiles what nobody asks it for
         if cache is None:
             config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
 

@@ -22,6 +22,7 @@ from typing import Final, NoReturn
 from shmmap import __version__
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading.first_compile import compile_in_child, is_compiled
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import receive_packet
@@ -39,14 +40,22 @@ class _Parent:
     channel: socket.socket
     settings: WorkerSettings
     _children: dict[int, tuple[int, socket.socket]] = field(default_factory=dict)
+    _compiling: int = -1
 
     def run(self) -> None:
         """Fork until the daemon closes the channel."""
         poller = select.poll()
         poller.register(self.channel, select.POLLIN)
+        if not is_compiled():
+            self._compiling = os.pidfd_open(compile_in_child(self.channel))
+            poller.register(self._compiling, select.POLLIN)
         buffer = bytearray(64)
         while True:
             for fd, _ in poller.poll():
+                if fd == self._compiling:
+                    poller.unregister(fd)
+                    self._end_compiling()
+                    continue
                 if fd in self._children:
                     poller.unregister(fd)
                     self._bury(fd)
@@ -92,6 +101,12 @@ class _Parent:
             traceback.print_exc()
         finally:
             os._exit(code)
+
+    def _end_compiling(self) -> None:
+        """The child that compiles has ended; if it failed, each loader compiles what it needs."""
+        os.waitid(os.P_PIDFD, self._compiling, os.WEXITED)
+        os.close(self._compiling)
+        self._compiling = -1
 
     def _bury(self, pidfd: int) -> None:
         """A loader has ended: say how."""
