@@ -105,6 +105,7 @@ class WayAhead:
 
     def first(self) -> tuple[float, int] | None:
         """What is needed next of what was found: in how many seconds, and its index; None if all is taken."""
+        self._notice_jump()
         if not self._found:
             return None
         ahead_m, index = self._found[0]
@@ -117,8 +118,7 @@ class WayAhead:
     def look(self, catalogue: CatalogueView, ahead: LookAhead, step_m: float) -> None:
         """Go a step further along the way."""
         motion = self.motion
-        if self._jumps != motion.jumps:
-            self.begin(self.began_s)
+        self._notice_jump()
         moved_m, self._travelled_m = motion.travelled_m - self._travelled_m, motion.travelled_m
         self.ahead_m = max(0.0, self.ahead_m - moved_m)
         end_m = self._end_m(ahead)
@@ -138,6 +138,11 @@ class WayAhead:
         metres, cells = self._entered
         self._entered = metres + self.ahead_m - here_m, cells + len(new)
         self._inside = inside
+
+    def _notice_jump(self) -> None:
+        """What was found before the client jumped is somewhere else."""
+        if self._jumps != self.motion.jumps:
+            self.begin(self.began_s)
 
     def _end_m(self, ahead: LookAhead) -> float:
         """How far ahead is looked."""
