@@ -119,7 +119,8 @@ class Prefetch:
         """The way of which least is known ahead; None if all were looked over."""
         least: WayAhead | None = None
         for way in self.ways.values():
-            if way.moves and now_s - way.began_s >= PASS_S and (way.over or way.first() is not None):
+            due = now_s - way.began_s >= PASS_S and (way.over or way.first() is not None)
+            if way.moves and (due or way.has_jumped):
                 way.begin(now_s)
             if not way.over and (least is None or way.ahead_m * way.pace_s < least.ahead_m * least.pace_s):
                 least = way

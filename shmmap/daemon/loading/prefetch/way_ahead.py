@@ -105,11 +105,15 @@ class WayAhead:
 
     def first(self) -> tuple[float, int] | None:
         """What is needed next of what was found: in how many seconds, and its index; None if all is taken."""
-        self._notice_jump()
-        if not self._found:
+        if not self._found or self.has_jumped:
             return None
         ahead_m, index = self._found[0]
         return max(ahead_m - self.motion.travelled_m, 0.0) * self.pace_s, index
+
+    @property
+    def has_jumped(self) -> bool:
+        """Whether the client is somewhere else than where the pass began."""
+        return self._jumps != self.motion.jumps
 
     def take(self) -> None:
         """The first one is seen to."""
@@ -118,7 +122,8 @@ class WayAhead:
     def look(self, catalogue: CatalogueView, ahead: LookAhead, step_m: float) -> None:
         """Go a step further along the way."""
         motion = self.motion
-        self._notice_jump()
+        if self.has_jumped:
+            self.begin(self.began_s)
         moved_m, self._travelled_m = motion.travelled_m - self._travelled_m, motion.travelled_m
         self.ahead_m = max(0.0, self.ahead_m - moved_m)
         end_m = self._end_m(ahead)
@@ -138,11 +143,6 @@ class WayAhead:
         metres, cells = self._entered
         self._entered = metres + self.ahead_m - here_m, cells + len(new)
         self._inside = inside
-
-    def _notice_jump(self) -> None:
-        """What was found before the client jumped is somewhere else."""
-        if self._jumps != self.motion.jumps:
-            self.begin(self.began_s)
 
     def _end_m(self, ahead: LookAhead) -> float:
         """How far ahead is looked."""
