@@ -8,7 +8,7 @@ Whether a segment was asked for, fetched ahead or computed makes no difference: 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from shmmap.daemon.records import Resident
 from shmmap.daemon.travel.places import Places, until_needed
 
 __all__ = ["POLICIES", "EvictionPolicy", "by_distance", "by_last_use", "by_time_until_needed", "score_of"]
+
+SOON_S: Final = 30.0
+"""Added to the time until something is needed, or no size would matter of what is needed soon."""
 
 EvictionPolicy: TypeAlias = Callable[[Sequence[Resident], Places, float], NDArray[np.float64]]
 """Scores segments, (N,), given where the clients are and will be, and the time: the highest goes first, among
@@ -51,7 +54,7 @@ def by_time_until_needed(candidates: Sequence[Resident], places: Places, now_s: 
     """
     if not len(places):
         return by_last_use(candidates, places, now_s)
-    return score_of(until_needed(_boxes(candidates), places, now_s), _sizes(candidates))
+    return score_of(until_needed(_boxes(candidates), places, now_s) + SOON_S, _sizes(candidates))
 
 
 def score_of(far: NDArray[np.float64] | float, nbytes: NDArray[np.float64] | float) -> NDArray[np.float64]:

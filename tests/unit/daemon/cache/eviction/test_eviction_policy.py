@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction.eviction_policy import (
     POLICIES,
+    SOON_S,
     by_distance,
     by_last_use,
     by_time_until_needed,
@@ -94,7 +95,7 @@ def test_needed_last(candidates: list[Resident], places: list[tuple[float, float
     boxes = np.array([resident.box for resident in candidates]).reshape(-1, 4)
     times = until_needed(boxes, clients, now_s)
     for resident, score, until_s in zip(candidates, scores.tolist(), times.tolist(), strict=True):
-        assert score == pytest.approx(until_s * math.sqrt(resident.nbytes))
+        assert score == pytest.approx((until_s + SOON_S) * math.sqrt(resident.nbytes))
 
 
 @given(residents(), points, points)
@@ -119,7 +120,7 @@ def test_examples(policy: str) -> None:
     here = client(5.0, 5.0)
     assert [r.name for r in ordered(policy, [near, far, middle], here)] == ["far", "middle", "near"]
     assert ordered(policy, [near, far, middle], here, client(505.0, 5.0))[0] is middle
-    large = made("large", 350, nbytes=400)
+    large = made("large", 450, nbytes=400)
     assert ordered(policy, [near, middle, far, large], here)[0] is large
     old, new = made("old", 150, last_use_s=1.0), made("new", 150, last_use_s=2.0)
     assert ordered(policy, [new, old], client(0.0, 0.0)) == [old, new]

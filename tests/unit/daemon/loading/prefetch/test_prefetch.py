@@ -238,6 +238,18 @@ def test_a_map_without_cells() -> None:
     assert daemon.wishes(1.0) == []
 
 
+def test_after_a_jump_nothing_of_the_way_before_is_wished_for() -> None:
+    daemon = Daemon()
+    motion = daemon.client("a")
+    assert len(daemon.wishes(1.0, 3)) == 3
+    for second in (1.5, 2.5):
+        motion.told(Intent(1000.0 + 10.0 * second, 0.0), second)
+    daemon.prefetch.ways["a"].asks(Circle(1025.0, 0.0, RADIUS_M), ("points",))
+    wishes = daemon.wishes(2.5)
+    assert wishes
+    assert all(daemon.catalogue.box(wish.cell)[0] > 1000.0 for wish in wishes)
+
+
 def test_who_leaves_wishes_for_nothing() -> None:
     daemon = Daemon()
     daemon.client("a")
@@ -332,4 +344,4 @@ def test_whatever_happens_a_wish_is_for_what_is_absent(
             way = daemon.prefetch.ways["ab"[number % 2]]
             way.asks(Circle(x, y, RADIUS_M), ("points",))
     wish = daemon.next(now_s + PASS_S)
-    assert wish is None or 0.0 <= wish.needed_in_s <= daemon.prefetch.look_ahead.way_s
+    assert wish is None or 0.0 <= wish.needed_in_s < math.inf
