@@ -40,6 +40,7 @@ from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.make_many_cells import CELL_METRES, make_many_cells
 from tests.support import connections
 from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.moving import says
 from tests.support.raw_client import RawClient
 
 CLIENTS = 300
@@ -121,7 +122,8 @@ def steps(count: int, policy: str) -> None:
         now_s += TICK_S
         driver = drivers[turn % CLIENTS]
         x, y = 20.0 * side * (turn % 17) / 17, 20.0 * side * (turn % 13) / 13
-        driver.intent = Intent(x, y, route=tuple((x + 90.0 * n, y + 50.0 * n) for n in range(VERTICES)))
+        says(driver, Intent(x, y, route=tuple((x + 90.0 * n, y + 50.0 * n) for n in range(VERTICES))), now_s)
+        sessions.follow_moves()
         begin = time.thread_time()
         evictor.free(ledger.shortage(SEGMENT_BYTES), now_s)
         middle, scored = time.thread_time(), ledger.order.scored

@@ -153,7 +153,7 @@ class Scheduler:
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
-            taken = self.pool.submit(job, now_s)
+            taken = self.pool.submit(job, now_s, prefetch=load.prefetch)
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
             return True

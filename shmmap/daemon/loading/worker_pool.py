@@ -67,6 +67,8 @@ class Worker:
         How many of its jobs are layers to be computed.
     segments
         Files without names that its jobs' segments go into, by job.
+    prefetched
+        Those of its jobs that nobody waited for when they were given out.
     """
 
     channel: socket.socket
@@ -76,12 +78,18 @@ class Worker:
     pidfd: int = -1
     queue: OrderedDict[int, Work] = field(default_factory=OrderedDict)
     segments: dict[int, int] = field(default_factory=dict)
+    prefetched: set[int] = field(default_factory=set)
     head_since_s: float = 0.0
 
     @property
     def fd(self) -> int:
         """Descriptor to poll."""
         return self.channel.fileno()
+
+    @property
+    def load(self) -> tuple[int, bool]:
+        """How busy it is; what somebody waits for had better not come behind what nobody does."""
+        return len(self.queue) + len(self.prefetched), bool(self.prefetched)
 
     @property
     def ready(self) -> bool:
@@ -154,7 +162,7 @@ class WorkerPool:
             and worker.layers <= LAYERS_AHEAD
             and not (worker.for_points if computed else worker.layers)
         ]
-        return min(able, key=lambda worker: (worker.layers, len(worker.queue)), default=None)
+        return min(able, key=lambda worker: (worker.layers, worker.load), default=None)
 
     @property
     def _may_start(self) -> bool:
@@ -186,8 +194,13 @@ class WorkerPool:
         self.watched.watch(worker.fd, lambda: self.on_message(worker), "loaders")
         return worker
 
-    def submit(self, job: Work, now_s: float) -> bool:
+    def submit(self, job: Work, now_s: float, *, prefetch: bool = False) -> bool:
         """Give a job to the least busy worker, starting one if all are busy; False if nobody took it.
+
+        Parameters
+        ----------
+        prefetch
+            Whether nobody waits for it.
 
         Raises
         ------
@@ -219,6 +232,8 @@ class WorkerPool:
         if not worker.queue:
             worker.head_since_s = now_s
         worker.queue[job.number] = job
+        if prefetch:
+            worker.prefetched.add(job.number)
         worker.layers += computed
         return True
 
@@ -284,6 +299,7 @@ class WorkerPool:
             How long it took, seconds.
         """
         job = worker.queue.pop(number, None)
+        worker.prefetched.discard(number)
         worker.layers -= job is not None and is_computed(job)
         began_s, worker.head_since_s = worker.head_since_s, now_s
         return worker.segments.pop(number, -1), now_s - began_s

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shmmap.daemon.travel.motion import MOST_SPEED_MPS, Motion
@@ -154,6 +154,7 @@ def test_who_tells_no_route_any_more_has_none() -> None:
     assert motion.vx == pytest.approx(10.0)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(hostile, hostile, hostile, hostile, routes, st.floats(0, 100)), max_size=12))
 def test_hostile_poses(
     steps: list[tuple[float, float, float, float, tuple[tuple[float, float], ...], float]],
