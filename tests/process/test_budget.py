@@ -184,7 +184,7 @@ def test_a_reload_finishes_with_room_for_one_more_cell_only(
     directory = private_tmpfs("64m")
     window = heavy_map.in_circle(0, 0, 25)
     largest = 90 << 10
-    rows_and_counters = 128 << 10
+    rows_and_counters = 144 << 10
     budget = len(window) * CELL_BYTES + largest + rows_and_counters
     one = daemon(heavy_map.root, "--budget", str(budget), "--session-quota", "1", shm_dir=directory)
     with MemoryWatch(directory, one.pid) as watch:
