@@ -88,7 +88,7 @@ def test_what_is_known_changes_while_a_request_waits(
     daemon, request = paged.daemon, m.Area(50, EVERYWHERE, wait=30.0)
     paged.know(*before)
     with monkeypatch.context() as patch:
-        patch.setattr(type(daemon.memory.scheduler.pool), "submit", lambda *_: False)
+        patch.setattr(type(daemon.memory.scheduler.pool), "submit", lambda *_, **__: False)
         daemon.send(request)
         daemon.turn_until(lambda: len(daemon.service._loop.cells))
         version, paged.origin.known = daemon.memory.cache.catalogue.map_version, after

@@ -131,11 +131,16 @@ def test_a_loader_is_kept_for_what_somebody_asks_for(prefetching: Callable[..., 
     hung: list[int] = []
 
     def hang() -> bool:
+        """Stop a loader that fetches ahead; it may just have said that it is done."""
         for worker in one.pool:
-            if worker.queue and worker.ready and not hung:
-                hung.append(worker.pid)
+            if worker.prefetched and worker.ready:
                 stop(worker.pid)
-        return bool(hung)
+                one.turn()
+                if worker.prefetched:
+                    hung.append(worker.pid)
+                    return True
+                os.kill(worker.pid, signal.SIGCONT)
+        return False
 
     if not one.loads.by_key:
         Drive(one, 100.0)
