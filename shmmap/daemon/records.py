@@ -84,7 +84,7 @@ class Load:
     that makes, when a worker was given the job.  ``computed`` says that it is a layer that is computed, which
     may take long.  ``payer`` is whose turn was used for it, ``charged_s`` the loader's time that it was taken
     to need, and ``spent_s`` the time that it did; ``losses`` counts loaders that were lost without its doing.
-    ``prefetch`` says that nobody has asked for it yet.
+    ``prefetch`` says that nobody has asked for it yet, ``unread`` that what it reads could not be read.
     """
 
     key: Key
@@ -106,6 +106,7 @@ class Load:
     losses: int = 0
     computed: bool = False
     prefetch: bool = False
+    unread: bool = False
 
 
 @dataclass(slots=True)

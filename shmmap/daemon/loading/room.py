@@ -52,11 +52,8 @@ class Room:
         """Make room for a load; why there is none, or nothing where it is on its way."""
         ledger = self.cache.ledger
         if load.prefetch:
-            return (
-                ""
-                if self.prefetcher.make_room(load, shortage, now_s)
-                else "it will be needed later than others"
-            )
+            has_room = self.prefetcher.make_room(load, shortage, now_s)
+            return "" if has_room else "it will be needed later than others"
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"

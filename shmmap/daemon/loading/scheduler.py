@@ -3,8 +3,7 @@
 
 Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is replaced,
 and the jobs behind the one it died of go back into the queue.  A segment of an earlier life of the daemon is
-checked by a worker before it is handed out, and the file of a cell that failed is looked at by one, as loads
-that cost no memory: a look may take as long as a file system hangs.
+checked by a worker before it is handed out, so is the file of a cell that failed: a look may take long.
 """
 
 from __future__ import annotations
@@ -238,6 +237,7 @@ class Scheduler:
             if isinstance(message, Checked):
                 self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
+                load.unread = message.unread
                 self._fail(load, message.code, message.message, message.stamp, now_s)
             elif fd >= 0:
                 step("daemon.received")
@@ -325,11 +325,11 @@ class Scheduler:
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return
-        if code in SPACE_CODES and load.prefetch:
-            self.prefetcher.full(now_s)
-            self._end(load)
-            return
         if code in SPACE_CODES:
+            if load.prefetch:
+                self.prefetcher.full(now_s)
+                self._end(load)
+                return
             self._statistics.add("refused_over_budget")
         else:
             self._statistics.add("loads_failed")
@@ -344,6 +344,7 @@ class Scheduler:
 
     def _end(self, load: Load, failure: Failure | None = None) -> None:
         """A load ended; whoever waits for it is told."""
-        self.prefetcher.ended.append((load, load.running, load.spent_s, failure is not None))
+        out = failure is not None and (load.unread or failure.code == "load_timeout")
+        self.prefetcher.ended.append((load, load.running, load.spent_s, out))
         self.loads.finish(load, failure)
         self.on_settled(load.key)

@@ -133,11 +133,11 @@ class _Worker:
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except Offline as error:
-            self._fail(job, error.code, error.message)
+            self._fail(job, error.code, error.message, unread=True)
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
-            self._fail(job, failure_code(error), f"{job.path}: {error.strerror or error}")
+            self._fail(job, failure_code(error), f"{job.path}: {error.strerror or error}", unread=True)
         except MemoryError:
             most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])
             why = f"making {job.layer} takes more than the {most} of memory that a loader may use"
@@ -190,11 +190,11 @@ class _Worker:
             wrong = str(error)
         self._send(worker_messages.Checked(job.number, wrong[:500], stamp))
 
-    def _fail(self, job: worker_messages.Job, code: str, message: str) -> None:
+    def _fail(self, job: worker_messages.Job, code: str, message: str, *, unread: bool = False) -> None:
         stamp = None
         with contextlib.suppress(OSError):
             stamp = SourceStamp.of(os.stat(job.path)).token
-        self._send(worker_messages.Failed(job.number, code, message[:4000], stamp))
+        self._send(worker_messages.Failed(job.number, code, message[:4000], stamp, unread))
 
 
 def _test_hook(path: str) -> None:

@@ -117,12 +117,13 @@ class Checked(msgspec.Struct, array_like=True, tag="checked"):
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
-    """No segment; ``stamp`` is the source's, if it could be read."""
+    """No segment; ``stamp`` is that of the source, if it could be looked at; ``unread``: it could not be read."""
 
     number: int
     code: str
     message: str
     stamp: Stamp | None = None
+    unread: bool = False
 
 
 class Ended(msgspec.Struct, array_like=True, tag="ended"):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cell is fetched next before anybody asks: of all clients' ways, what is needed first.
 
-Nothing here loads or waits: the scheduler asks for a wish when nobody's demand can use a loader
-(`Prefetch.next`), and tells how loads ended.  How far ahead is looked, in seconds of travel, is the longest
+Nothing here loads or waits: `Prefetcher` asks for a wish when no demand waits for a loader (`Prefetch.next`),
+and tells how loads ended.  How far ahead is looked, in seconds of travel, is the longest
 time without the origin that is to be ridden out, and what a load takes, slow ones included.  Where nobody
 knows the way, an outage is prepared for only after there was one: much of that is fetched in vain.
 """
@@ -21,8 +21,8 @@ __all__ = ["Prefetch", "Wish"]
 
 LOOKS_AT_ONCE: Final = 2
 """Steps along clients' ways that are looked at for one wish: a fifth of a millisecond."""
-LOADS: Final = 1.6
-"""Slow ones, one after the other, that a cell may have to wait for."""
+SLOW_LOADS: Final = 1.6
+"""So many, one after the other, a cell may have to wait for."""
 SLACK_S: Final = 3.0
 """Beside all that is measured: requests come a step of the window apart, and so do looks along the way."""
 SPARE: Final = 1.25
@@ -75,7 +75,7 @@ class Prefetch:
     @property
     def look_ahead(self) -> LookAhead:
         """How far ahead is looked: what comes into reach later is not wished for yet."""
-        load_s = LOADS * self.health.slow_s + SLACK_S
+        load_s = SLOW_LOADS * self.health.slow_s + SLACK_S
         way_s = load_s + SPARE * self._ride_out_s + PASS_S + AFTER_S
         straight_s = load_s + min(self._ride_out_s, self._away_s, GUESSED_S)
         return LookAhead(way_s, straight_s, load_s)

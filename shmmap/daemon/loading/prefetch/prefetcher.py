@@ -50,8 +50,8 @@ class Prefetcher:
     cold
         Cells that clients asked for and nobody had fetched ahead; filled by who answers them.
     ended
-        Loads that have ended, whether they ran, the loader's time and whether they failed; filled by who ends
-        them.
+        Loads that have ended, whether they ran, the loader's time, and whether what they read was out of
+        reach; filled by who ends them.
     """
 
     def __init__(
@@ -136,11 +136,13 @@ class Prefetcher:
             self._next_s = now_s
 
     def _is_absent(self, index: int, layer: str) -> bool:
+        """Whether a cell could be fetched ahead; one that is larger than the share never can."""
         key = Key(self._cache.catalogue.id(index), layer)
         if self._cache.find_warm(index, layer, self._now_s) is not None or key in self._loads.by_key:
             return False
         failure = self._loads.failures.get(key)
-        return failure is None or self._now_s >= failure.retry_at_s
+        may_fit = self._cache.estimate(index, layer) <= self.share * self._cache.ledger.budget_bytes
+        return may_fit and (failure is None or self._now_s >= failure.retry_at_s)
 
     # --- loads ------------------------------------------------------------------------------------
 
@@ -164,10 +166,13 @@ class Prefetcher:
         self._cache.statistics.add("prefetch_started", load not in self._running)
         self._running[load] = load.estimate
 
-    def _learn(self, load: Load, ran: bool, took_s: float, failed: bool) -> None:
-        """A load has ended: what that tells of where it comes from."""
+    def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
+        """A load has ended: what that tells of where it comes from.
+
+        A file that is broken was read all the same.
+        """
         self._running.pop(load, None)
-        if ran and load.sources and self.prefetch.health.ended(took_s, failed=failed):
+        if ran and load.sources and self.prefetch.health.ended(took_s, failed=out):
             self._loads.forget_failures()
 
     def shortage(self, now_s: float) -> int:

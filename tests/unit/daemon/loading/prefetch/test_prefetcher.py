@@ -260,3 +260,34 @@ def test_an_origin_that_comes_back_is_used_at_once(
     one.run_until(lambda: idle(one))
     assert drive.ask(-340.0, wait=0.0)
     assert len({r.key.cell_id for r in one.ledger.residents()}) > 3 * 8
+
+
+def test_broken_files_are_no_matter_of_where_they_come_from(
+    prefetching: Callable[..., InnerDaemon], street: DividedMap
+) -> None:
+    """One after the other on the way: each is tried once for now, and what lies behind them is fetched."""
+    broken = [f"{x}_{y}.pcd" for x in (-300, -280) for y in (-20, 0, 20)]
+    for name in broken:
+        Path(street.id(name)).write_bytes(b"no points")
+    one = prefetching()
+    one.stop_clock()
+    Drive(one)
+    one.run_until(lambda: idle(one))
+    assert not one.scheduler.prefetcher.prefetch.health.is_out
+    assert {Path(key.cell_id).name for key in one.loads.failures} == set(broken)
+    assert count(one, "loads_failed") == len(broken)
+    there = {Path(resident.key.cell_id).name for resident in one.ledger.residents()}
+    assert {"-260_0.pcd", "-240_0.pcd"} <= there
+
+
+def test_a_cell_that_can_never_fit_keeps_no_other_one_out(
+    prefetching: Callable[..., InnerDaemon], street: DividedMap
+) -> None:
+    large = make_map(street.root.parent / "large", columns=1, rows=1, points=20_000)
+    Path(street.id("-300_0.pcd")).write_bytes(next(large.pcd_dir.glob("*.pcd")).read_bytes())
+    one = prefetching(prefetch_share=(100 << 10) / (64 << 20))
+    Drive(one)
+    one.run_until(lambda: idle(one))
+    there = {Path(resident.key.cell_id).name for resident in one.ledger.residents()}
+    assert "-300_0.pcd" not in there
+    assert {"-300_-20.pcd", "-280_0.pcd"} <= there
