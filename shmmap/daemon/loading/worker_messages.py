@@ -117,7 +117,7 @@ class Checked(msgspec.Struct, array_like=True, tag="checked"):
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
-    """No segment; ``stamp`` is the source's, if it could be had; ``unread`` says that it could not be read."""
+    """No segment; ``stamp`` is the source's, if it could be had; ``unread``: it could not be read."""
 
     number: int
     code: str
