@@ -23,6 +23,7 @@ __all__ = [
     "dense_catalogue",
     "recorded_drive",
     "rounded",
+    "square_drive",
     "town_drive",
     "travelled_m",
 ]
@@ -96,6 +97,14 @@ def city_drive(seed: int = 0, length_m: float = 10_000.0) -> Drive:
     times = _times(path, red, random)
     # a stop is a time without a move: both ends of it are in the table
     return Drive("city", times[0], _beside(path, seed)[times[1].astype(np.intp)], _told(path))
+
+
+def square_drive(side_m: float = 2400.0, speed_mps: float = 12.0, length_s: float = 600.0) -> Drive:
+    """Round a square: straight on for minutes, as on a ring road."""
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)], dtype=np.float64) * side_m + (300.3, 300.9)
+    path = rounded(corners, 12.0)
+    path = path[travelled_m(path) <= length_s * speed_mps]
+    return Drive("square", travelled_m(path) / speed_mps, _beside(path, 0), _told(path))
 
 
 def city_path(seed: int, length_m: float) -> Floats:

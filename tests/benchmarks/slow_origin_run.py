@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.loading.loads import FIRST_RETRY_S, LAST_RETRY_S
+from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import places_of, until_needed
 from shmmap.geometry import Circle
@@ -185,7 +186,7 @@ class _Simulation:
                 self.make_room(0.0)
                 self.begin(cell)
         self.wake_s = math.inf
-        while not self.demands and len(self.running) < self.setting.loaders - 1:
+        while not self.demands and len(self.running) < self.setting.loaders:
             if self.now_s < self.full_until_s:
                 self.wake_s = self.full_until_s
                 return
@@ -200,6 +201,8 @@ class _Simulation:
                 self.wake_s = max(self.foresight.next_s(self.now_s), self.now_s + 0.01)
                 self.note_full()
                 return
+            if len(self.running) == self.setting.loaders - 1 and wish.needed_in_s > URGENT_S:
+                return  # until a load ends
             if not self.make_room(wish.needed_in_s):
                 self.counts.no_room += 1
                 self.full_until_s = self.now_s + FULL_S

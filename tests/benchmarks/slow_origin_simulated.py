@@ -35,7 +35,14 @@ from typing import NamedTuple
 
 from shmmap.origin.catalogue import Catalogue
 from tests.benchmarks.slow_origin_counts import Counts
-from tests.benchmarks.slow_origin_drives import Drive, city_drive, dense_catalogue, recorded_drive, town_drive
+from tests.benchmarks.slow_origin_drives import (
+    Drive,
+    city_drive,
+    dense_catalogue,
+    recorded_drive,
+    square_drive,
+    town_drive,
+)
 from tests.benchmarks.slow_origin_model import OUTAGES, SlowOrigin
 from tests.benchmarks.slow_origin_picture import drive_picture
 from tests.benchmarks.slow_origin_run import ROWS, Setting, simulate
@@ -123,6 +130,7 @@ def main() -> int:
         parser.error(f"rows are {', '.join(ROWS)}")
     for seed in range(arguments.seeds):
         _held.drives.extend([town_drive(seed), city_drive(seed)])
+    _held.drives.append(square_drive())
     if arguments.poses is not None:
         _held.drives.append(recorded_drive(arguments.poses))
     _held.catalogues.extend(map(dense_catalogue, _held.drives))

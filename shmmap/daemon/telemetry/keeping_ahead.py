@@ -39,8 +39,8 @@ PASSING_CODES: Final = SPACE_CODES | {"offline", "load_timeout"}
 class _Round:
     """What was found of the clients looked at so far.
 
-    ``needed`` is in loads a second, ``least_s`` the least time for which all is in memory, ``counted`` the
-    cells and layers that somebody needs.
+    ``needed`` is in loads a second, ``least_s`` the least time for which all is in memory, ``look_ahead_s``
+    the longest that is looked at, ``counted`` the cells and layers that somebody needs.
     """
 
     left: deque[Session]
@@ -50,6 +50,7 @@ class _Round:
     fastest_mps: float = 0.0
     needed: float = 0.0
     least_s: float = float("inf")
+    look_ahead_s: float = 0.0
     counted: set[tuple[int, str]] = field(default_factory=set)
 
 
@@ -98,9 +99,6 @@ class KeepingAhead:
         health, limit = prefetcher.prefetch.health, self._scheduler.pool.limit
         statistics.set("most_workers", limit)
         statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
-        look_ahead = prefetcher.prefetch.look_ahead
-        routed = statistics.values["routed_clients"] > 0
-        statistics.set("look_ahead_ns", int((look_ahead.way_s if routed else look_ahead.straight_s) * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         loaders = max(limit - 1, 1)  # one is kept for what somebody waits for
@@ -154,8 +152,7 @@ class KeepingAhead:
                 if looking.ahead_s is None and self._is_missing(index, layer):
                     looking.ahead_s = needed_in_s
         if way.over:
-            routed = way.motion.route is not None
-            self._looked(current, looking, look_ahead.way_s if routed else look_ahead.straight_s)
+            self._looked(current, looking, way.looks_s(look_ahead))
 
     def _looked(self, current: _Round, looking: _Looking, look_ahead_s: float) -> None:
         """A client's way was looked over to its end."""
@@ -164,6 +161,7 @@ class KeepingAhead:
         if looking.found:
             share = looking.new / looking.found
             current.needed += share * way.needed_per_m * len(way.layers) / way.pace_s
+        current.look_ahead_s = max(current.look_ahead_s, look_ahead_s)
         current.least_s = min(current.least_s, look_ahead_s if ahead_s is None else ahead_s)
         self._looking = None
 
@@ -188,4 +186,5 @@ class KeepingAhead:
         statistics.set("routed_clients", current.routed)
         statistics.set("fastest_mm_per_s", int(1e3 * current.fastest_mps))
         statistics.set("needed_per_1000s", int(1e3 * current.needed))
+        statistics.set("look_ahead_ns", int(current.look_ahead_s * 1e9))
         statistics.set("ahead_ns", int(current.least_s * 1e9) if current.clients else 0)

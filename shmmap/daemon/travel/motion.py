@@ -18,6 +18,9 @@ LEARN_S: Final = 0.5
 """Time between two poses, at least, from which a velocity is learnt."""
 SILENT_S: Final = 10.0
 """Who says nothing for longer may have stood: who is farther away than one comes in this time has jumped."""
+TURN_RAD: Final = 0.35
+"""Who has turned by more since then has left the straight."""
+TURNS_MPS: Final = 1.0
 FASTEST_S: Final = 60.0
 """For about so long it is remembered how fast a client was: it will go on after a red light."""
 
@@ -40,6 +43,8 @@ class Motion:
         The way it says it will take, if it is on it, and how far along it is.
     travelled_m
         How far it has come since its last jump.
+    straight_m
+        How far it has come without a turn.
     jumps
         How often it was somewhere else all of a sudden.
     """
@@ -53,7 +58,9 @@ class Motion:
     route: Route | None = None
     along_m: float = 0.0
     travelled_m: float = 0.0
+    straight_m: float = 0.0
     jumps: int = 0
+    _straight_rad: float = 0.0
     _vertices_hash: int = 0
     _told_route: Route | None = None
     _come_m: float = 0.0
@@ -74,17 +81,19 @@ class Motion:
         step_m, took_s = math.hypot(x - self.x, y - self.y), now_s - self.told_s
         if took_s == math.inf or step_m > MOST_SPEED_MPS * min(max(took_s, 1.0), SILENT_S):
             self.jumps += 1
-            self.vx = self.vy = self.fastest_mps = self.travelled_m = 0.0
+            self.vx = self.vy = self.fastest_mps = self.travelled_m = self.straight_m = 0.0
             self._learnt = (x, y, now_s)
             took_s = 0.0
         else:
             self.travelled_m += step_m
+            self.straight_m += step_m
         self.x, self.y, self.told_s = x, y, now_s
         if vx or vy:
             over = max(1.0, math.hypot(vx, vy) / MOST_SPEED_MPS)
             self.vx, self.vy = vx / over, vy / over
         else:
             self._learn(now_s)
+        self._turn()
         self.fastest_mps = max(self.speed_mps, self.fastest_mps * math.exp(-took_s / FASTEST_S))
 
     def _learn(self, now_s: float) -> None:
@@ -95,6 +104,14 @@ class Motion:
             return
         self._learnt = (self.x, self.y, now_s)
         self.vx, self.vy = (self.x - x) / took_s, (self.y - y) / took_s
+
+    def _turn(self) -> None:
+        """See whether it is still straight on; poses of who hardly moves tell nothing of that."""
+        if self.speed_mps < TURNS_MPS:
+            return
+        heading_rad = math.atan2(self.vy, self.vx)
+        if abs(math.remainder(heading_rad - self._straight_rad, math.tau)) > TURN_RAD:
+            self._straight_rad, self.straight_m = heading_rad, 0.0
 
     def _follow(self, vertices: tuple[tuple[float, float], ...]) -> None:
         """Find the client on the way that it says it will take."""

@@ -26,28 +26,20 @@ class OriginHealth:
     ----------
     failed_in_a_row
         Loads that failed since the last one that succeeded.
+    slow_s, mean_s
+        Time that few of the last loads exceeded (5 %), and their mean time; 0 before the first.
     """
 
     failed_in_a_row: int = 0
+    slow_s: float = 0.0
+    mean_s: float = 0.0
     _took_s: deque[float] = field(default_factory=lambda: deque(maxlen=LOADS))
-    _slow_s: float = 0.0
-    _mean_s: float = 0.0
     _tried_s: float = -math.inf
 
     @property
     def is_out(self) -> bool:
         """Whether nothing can be loaded just now."""
         return self.failed_in_a_row >= IN_A_ROW
-
-    @property
-    def slow_s(self) -> float:
-        """Time that few of the last loads exceeded (5 %)."""
-        return self._slow_s
-
-    @property
-    def mean_s(self) -> float:
-        """Mean time of the last loads; 0 before the first."""
-        return self._mean_s
 
     def next_try_s(self) -> float:
         """Until when nothing is tried: minus infinity unless nothing can be loaded."""
@@ -65,6 +57,6 @@ class OriginHealth:
         again, self.failed_in_a_row = self.is_out, 0
         self._took_s.append(took_s)
         ordered = sorted(self._took_s)
-        self._slow_s = ordered[(len(ordered) * 19) // 20]
-        self._mean_s = sum(ordered) / len(ordered)
+        self.slow_s = ordered[(len(ordered) * 19) // 20]
+        self.mean_s = sum(ordered) / len(ordered)
         return again

@@ -4,7 +4,8 @@
 Nothing here loads or waits: `Prefetcher` asks for a wish when no demand waits for a loader (`Prefetch.next`),
 and tells how loads ended.  How far ahead is looked, in seconds of travel, is the longest
 time without the origin that is to be ridden out, and what a load takes, slow ones included.  Where nobody
-knows the way, an outage is prepared for only after there was one: much of that is fetched in vain.
+knows the way, an outage is prepared for only after there was one, or on a long straight: much of that is
+fetched in vain.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from shmmap.daemon.loading.prefetch.origin_health import OriginHealth
 from shmmap.daemon.loading.prefetch.way_ahead import PASS_S, LookAhead, WayAhead
 from shmmap.daemon.map.catalogue_view import CatalogueView
 
-__all__ = ["Prefetch", "Wish"]
+__all__ = ["URGENT_S", "Prefetch", "Wish"]
 
 LOOKS_AT_ONCE: Final = 2
 """Steps along clients' ways that are looked at for one wish: a fifth of a millisecond."""
@@ -31,6 +32,8 @@ AFTER_S: Final = 2.0
 """Until loads are known to succeed again after they did not, and the first ones have come."""
 GUESSED_S: Final = 10.0
 """Nobody goes straight on for longer than this."""
+URGENT_S: Final = 2.0
+"""What is needed sooner is a demand in all but name: it takes the loader, too, that is kept for those."""
 SHORTEST_STEP_M: Final = 5.0
 
 

@@ -3,9 +3,9 @@
 
 A wish becomes a load like any other when nothing else is queued: so there is never more than one, none is out
 of date, and what somebody asks for comes first.  One loader is kept free, so that a demand need not wait for
-a wish.  Memory: a wish takes the place of what will be needed later than itself, never of what will
-be needed sooner or is in use, and what was fetched ahead and not asked for yet takes its share of the
-budget at most.
+a wish, unless the wish is nearly one itself.  Memory: a wish takes the place of what will be needed later
+than itself, never of what will be needed sooner or is in use, and what was fetched ahead and not asked for
+yet takes its share of the budget at most.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.loading.prefetch.prefetch import Prefetch
+from shmmap.daemon.loading.prefetch.prefetch import URGENT_S, Prefetch
 from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
@@ -118,14 +118,18 @@ class Prefetcher:
             self._wish(now_s)
 
     def _may_begin(self) -> bool:
-        """Whether a loader has nothing to do but wait for demands."""
-        return not len(self._loads) and self._pool.idle > (1 if self._pool.limit > 1 else 0)
+        """Whether a loader has nothing to do."""
+        return not len(self._loads) and self._pool.idle > 0
 
     def _wish(self, now_s: float) -> None:
         cache, prefetch = self._cache, self.prefetch
         wish = prefetch.next(cache.catalogue, now_s)
         if wish is None:
             self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
+            return
+        if wish.needed_in_s > URGENT_S and self._pool.idle == 1 < self._pool.limit:
+            # the last one waits for demands, until a load ends or a client comes nearer
+            self._next_s = now_s + wish.needed_in_s - URGENT_S
             return
         key, nbytes = Key(cache.catalogue.id(wish.cell), wish.layer), cache.estimate(wish.cell, wish.layer)
         taken = cache.ledger.prefetched_bytes + sum(self._running.values())

@@ -3,9 +3,10 @@
 
 The area that a client asks for is moved along its way, a step at a time: cells that come into it at a step
 are needed when the client is there.  The way is the route that the client told; without one, and beyond its
-end, straight on and, a little later, to both sides of that, because nobody knows where it turns.  What it
-will ask for along a kilometre is not kept: the way is looked over again and again (a *pass*), and what is not
-in memory is wished for.  So a wish is never out of date, whatever moves, changes or gives way meanwhile.
+end, straight on and, a little later, to both sides of that, because nobody knows where it turns; the longer
+it has come straight on, the farther.  What it will ask for along a kilometre is not kept: the way is looked
+over again and again (a *pass*), and what is not in memory is wished for.  So a wish is never out of date,
+whatever moves, changes or gives way meanwhile.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ SPREAD_RAD: Final = 0.5
 """So far to both sides of straight on a client without a route is taken to turn."""
 LATER_S: Final = 1.0
 """So much later than what lies straight on is fetched what lies to the sides."""
+STRAIGHT_M: Final = 500.0
+"""Few streets of a town are so long: for each metre that one has come straight on beyond it, another one ahead
+is looked at."""
 BESIDE_M: Final = 2.0
 """So far to either side of the way told a client may be: what is told is the middle of a lane."""
 
@@ -144,11 +148,17 @@ class WayAhead:
         self._entered = metres + self.ahead_m - here_m, cells + len(new)
         self._inside = inside
 
+    def looks_s(self, ahead: LookAhead) -> float:
+        """How many seconds ahead is looked."""
+        if self.motion.route is not None:
+            return ahead.way_s
+        return max(ahead.straight_s, min((self.motion.straight_m - STRAIGHT_M) * self.pace_s, ahead.way_s))
+
     def _end_m(self, ahead: LookAhead) -> float:
         """How far ahead is looked."""
         speed = 1.0 / self.pace_s
         if self.motion.route is None:
-            return min(speed * ahead.straight_s, MOST_AHEAD_M)
+            return min(speed * self.looks_s(ahead), MOST_AHEAD_M)
         known_m = min(speed * ahead.way_s, self._left_m)
         return min(max(known_m, speed * ahead.sides_s), MOST_AHEAD_M)
 

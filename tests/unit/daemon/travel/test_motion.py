@@ -53,6 +53,24 @@ def test_a_velocity_that_is_told_counts() -> None:
     assert motion.speed_mps == pytest.approx(MOST_SPEED_MPS)
 
 
+def test_how_far_it_has_come_straight_on() -> None:
+    """Bends count as straight until they add up to a corner; who stands turns nowhere."""
+    motion = Motion()
+    motion.told(Intent(0.0, 0.0), 0.0)
+    driven(motion, 0.0, 10.0, 10.0)
+    driven(motion, 10.0, 20.0, 10.0, 2.0)
+    straight_m = motion.straight_m
+    assert straight_m == pytest.approx(motion.travelled_m)
+    driven(motion, 20.0, 40.0, 0.0, -0.5)  # crawls to the side
+    assert motion.straight_m == pytest.approx(straight_m + 10.0)
+    driven(motion, 40.0, 41.0, 10.0, 5.0)
+    assert motion.straight_m == 0.0
+    driven(motion, 41.0, 44.0, 10.0, 5.0)
+    assert motion.straight_m == pytest.approx(3 * math.hypot(10.0, 5.0))
+    motion.told(Intent(5000.0, 0.0), 45.0)
+    assert motion.straight_m == 0.0
+
+
 def test_a_jump_makes_everything_new() -> None:
     motion = Motion()
     motion.told(Intent(0.0, 0.0), 0.0)

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
 from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, MOST_WAYS
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
@@ -149,6 +151,30 @@ def test_a_loader_is_kept_for_what_somebody_asks_for(prefetching: Callable[..., 
     one.ask(other, Selected(50, ("-400_0.pcd", "380_0.pcd"), wait=30.0))
     assert names(one.cells_of(50)) == ["-400_0.pcd", "380_0.pcd"]
     os.kill(hung[0], signal.SIGCONT)
+    one.run_until(lambda: idle(one))
+
+
+@pytest.mark.parametrize("soon", [True, False])
+def test_what_is_nearly_a_demand_takes_the_last_loader_too(
+    prefetching: Callable[..., InnerDaemon], *, soon: bool
+) -> None:
+    one = prefetching()
+    one.everything()
+    while len(one.pool) < one.pool.limit:
+        one.pool.start_one()
+    with one.loaders_standing_still():
+        drive = Drive(one)
+        for resident in list(one.ledger.residents()):
+            if resident.box[0] == -300.0 if soon else resident.box[0] > -290.0:
+                one.reclaimer.retire(resident, one.now_s(), "request")
+        one.reclaimer.sweep(one.now_s())
+        one.run_until(lambda: len(one.loads.by_key) == (2 if soon else 1))
+        for _ in range(10):
+            drive.ask(-350.0, wait=0.0)
+            one.turn()
+        needed_in_s = [load.priority - PREFETCH for load in one.loads.by_key.values()]
+        assert len(needed_in_s) == (2 if soon else 1)
+        assert (max(needed_in_s) <= URGENT_S) == soon
     one.run_until(lambda: idle(one))
 
 

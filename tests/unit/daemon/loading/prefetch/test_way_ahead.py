@@ -118,6 +118,21 @@ def test_without_a_route_straight_on_and_to_the_sides() -> None:
     assert middles[:, 0].min() > -10.0, "not behind"
 
 
+def test_who_has_long_come_straight_on_is_looked_for_farther_ahead() -> None:
+    """After 500 m as far again as it came since, but no farther than along a way told; until it turns."""
+    motion = Motion()
+    told = []
+    for second in range(0, 100, 5):
+        motion.told(Intent(10.0 * second, 0.0), float(second))
+        told.append(way_of(motion).looks_s(AHEAD))
+    assert told[:13] == [AHEAD.straight_s] * 12 + [pytest.approx(10.0)]
+    assert told[14:] == [AHEAD.way_s] * 6
+    far_m = max(town().boxes[[cell for _, cell in looked(way_of(motion))]][:, 0]) - motion.x
+    assert 200.0 <= far_m <= 200.0 + RADIUS_M
+    motion.told(Intent(950.0, 50.0), 100.0)
+    assert way_of(motion).looks_s(AHEAD) == AHEAD.straight_s
+
+
 def test_beyond_a_routes_end_only_as_far_as_to_the_sides() -> None:
     motion = driving(10.0, (-10.0, 0.0), (20.0, 0.0))
     found = {cell for _, cell in looked(way_of(motion))}
