@@ -4,11 +4,11 @@
     python -m tests.benchmarks.slow_origin [--seconds 600] [--mean 0.4] [--outage 10] [--every 120]
 
 A daemon with eight loaders serves a map of cells of 20 m.  Each file takes a log-normal time to read (sigma
-0.8; the same each time), and at regular times none can be read for some seconds.  A vehicle drives at 12 m/s
-round a square of 2.4 km and asks for a circle of 200 m every 20 m; it starts when its first circle is in
-memory.  Beside it a client asks for single cells far away from it, which are cold, and for warm ones.
-Three daemons, one after the other: one that fetches nothing ahead, one that is told the vehicle's poses, one
-that is told its route, too.
+0.8; the same each time), and at regular times, counted from the start of the drive, none can be read for
+some seconds.  A vehicle drives at 12 m/s round a square of 2.4 km and asks for a circle of 200 m every 20 m;
+it starts when its first circle is in memory.  Beside it a client asks for single cells far away from it,
+which are cold, and for warm ones.  Three daemons, one after the other: one that fetches nothing ahead, one
+that is told the vehicle's poses, one that is told its route, too.
 
 Late is a cell that is not in the first answer to the request that needs it; the first 30 s do not count.
 Limits: with the route none is late, without it 97 % of requests find all in memory; what is asked for beside
@@ -70,11 +70,12 @@ def at(along_m: float) -> tuple[float, float, float, float]:
     return x + along_m * hx, y + along_m * hy, hx, hy
 
 
-def vehicle(client: shmmap.Client, kind: str, speed: float, seconds: float, run: Run) -> None:
-    """Drive, and ask for what is around every 20 m."""
+def vehicle(client: shmmap.Client, kind: str, speed: float, seconds: float, begin: Path, run: Run) -> None:
+    """Drive, and ask for what is around every 20 m; ``begin`` is to say when it sets off."""
     client.area(shmmap.Circle(*CORNERS[0], RADIUS_M), wait=300.0)
     client.release()
     begin_s = time.monotonic()
+    begin.write_text(str(begin_s))
     for step in range(int(seconds * speed / STEP_M)):
         time.sleep(max(0.0, begin_s + step * STEP_M / speed - time.monotonic()))
         x, y, _, _ = at(step * STEP_M)
@@ -105,9 +106,14 @@ def beside(client: shmmap.Client, over: threading.Event, run: Run) -> None:
 
 def drive(root: Path, kind: str, args: argparse.Namespace) -> Run:
     """One daemon, its vehicle, and a client beside it."""
-    first_s = time.monotonic() + args.every
-    outages = [[first_s + n * args.every, first_s + n * args.every + args.outage] for n in range(1000)]
-    plan = {"mean_s": args.mean, "outages": outages if args.outage else [], "throttle_bytes_s": args.throttle}
+    begin = root.parent / f"{kind} begins"
+    plan = {
+        "mean_s": args.mean,
+        "throttle_bytes_s": args.throttle,
+        "outage_s": args.outage,
+        "every_s": args.every,
+        "begin": str(begin),
+    }
     share = "0" if kind == "nothing ahead" else "0.5"
     options = ["--workers", str(LOADERS), "--budget", "256M", "--ride-out", str(args.ride_out)]
     one = DaemonProcess(
@@ -121,7 +127,7 @@ def drive(root: Path, kind: str, args: argparse.Namespace) -> Run:
         other = stack.enter_context(shmmap.connect(one.endpoint))
         thread = threading.Thread(target=beside, args=(other, over, run))
         thread.start()
-        vehicle(driver, kind, args.speed, args.seconds, run)
+        vehicle(driver, kind, args.speed, args.seconds, begin, run)
         over.set()
         thread.join()
         run.counters = dict(read_statistics(one.instance, one.shm_dir).counters)
