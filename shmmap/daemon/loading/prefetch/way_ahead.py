@@ -37,8 +37,8 @@ SPREAD_RAD: Final = 0.5
 LATER_S: Final = 1.0
 """So much later than what lies straight on is fetched what lies to the sides."""
 STRAIGHT_M: Final = 500.0
-"""Few streets of a town are so long: for each metre that one has come straight on beyond it, another one ahead
-is looked at."""
+"""Few streets of a town are so long: for each metre that one has come straight on beyond it, another one
+ahead is looked at."""
 BESIDE_M: Final = 2.0
 """So far to either side of the way told a client may be: what is told is the middle of a lane."""
 
