@@ -19,7 +19,16 @@ from typing import Final
 
 from shmmap.failpoints import step
 
-__all__ = ["LOADER_SLOT", "MAX_SLOT", "has_slot", "holders", "in_use", "lock_slot", "prepare_process"]
+__all__ = [
+    "LOADER_SLOT",
+    "MAX_SLOT",
+    "has_slot",
+    "holders",
+    "in_use",
+    "keep_if_unused",
+    "lock_slot",
+    "prepare_process",
+]
 
 MAX_SLOT: Final = (1 << 62) - 1
 MOST_RANGES: Final = 32
@@ -57,13 +66,20 @@ def in_use(fd: int) -> bool:
     That counts as in use, whoever it is; an operator's pins are another thing.  The caller must own the
     file (or be root) and hold no other descriptor or mapping of it.
     """
-    try:
-        fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
-    except BlockingIOError:
+    if not keep_if_unused(fd):
         return True
     step("daemon.probe")
     fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     return False
+
+
+def keep_if_unused(fd: int) -> bool:
+    """As `in_use`, the other way round; who opens the file from now on waits until ``fd`` is closed."""
+    try:
+        fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def holders(fd: int, *, limit: int = 1024) -> list[int]:

@@ -29,7 +29,7 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.mapping import map_chunk, unmap_chunk, view_at
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, SegmentCorrupt
-from shmmap.segment.pins import in_use
+from shmmap.segment.pins import in_use, keep_if_unused
 
 __all__ = ["ChunkFile", "ChunkMemory", "GivenUp", "live_prefix", "memory_bytes"]
 
@@ -215,9 +215,22 @@ class ChunkMemory:
         Whoever has it mapped sees by its ``state`` that it does not change any more.
         """
         chunk.view.state["state"] = OUT_OF_SERVICE
-        name = chunk.name + _GONE
-        os.rename(chunk.name.lstrip("/"), name.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
-        return GivenUp(name, chunk.unmap())
+        return self._put_away(chunk.name, chunk.unmap())
+
+    def free(self, chunk: ChunkFile) -> GivenUp | None:
+        """Take a chunk out of service, and its memory at once if nobody has it; else see `give_up`."""
+        chunk.view.state["state"] = OUT_OF_SERVICE
+        fd = chunk.unmap()
+        if not keep_if_unused(fd):
+            return self._put_away(chunk.name, fd)
+        self.remove(chunk.name)
+        os.close(fd)
+        return None
+
+    def _put_away(self, name: str, fd: int) -> GivenUp:
+        gone = name + _GONE
+        os.rename(name.lstrip("/"), gone.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
+        return GivenUp(gone, fd)
 
     def given_up(self) -> Iterator[tuple[ChunkKey, GivenUp]]:
         """What an earlier writer gave up, and readers may still map."""

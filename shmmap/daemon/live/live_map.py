@@ -168,10 +168,12 @@ class LiveMap:
         for chunk, scan in residency.ready()[:CHUNKS_A_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
         while (lease := residency.next_eviction(now_s)) is not None:  # there is room for others now
-            given_up = self.kept[lease.number] = self.memory.give_up(self.chunks.pop(lease.key))
+            given_up = self.memory.free(self.chunks.pop(lease.key))
             self.on_gone(lease.key)
-            if not given_up.is_mapped:
-                self.released(lease)
+            if given_up is None:
+                residency.leases.end(lease)
+            else:
+                self.kept[lease.number] = given_up
         jobs = []
         while (cold := residency.next_load(now_s)) is not None:
             self._generation += 1

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import takewhile
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
@@ -56,5 +57,6 @@ class Changes:
 
     def left(self, since: int) -> list[ChunkKey]:
         """What left memory after ``since`` and did not come back, each once."""
-        keys = {key: None for number, key in self._gone if number > since}
+        newest_first = list(takewhile(lambda one: one[0] > since, reversed(self._gone)))
+        keys = dict.fromkeys(key for _, key in reversed(newest_first))
         return [key for key in keys if key not in self._changed]

@@ -104,6 +104,24 @@ def test_a_reader_sees_it_grow_and_keeps_what_is_given_up(memory: ChunkMemory, d
         assert not list(directory.iterdir())
 
 
+@pytest.mark.parametrize("mapped", [True, False])
+def test_what_nobody_maps_is_freed_at_once(memory: ChunkMemory, directory: Path, *, mapped: bool) -> None:
+    chunk = memory.create(new_header(IDENTITY))
+    with (directory / NAME[1:]).open("rb") as file:
+        seen = ChunkView(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
+        file.close()
+        if not mapped:
+            seen = ChunkView(bytes(seen.data))
+        kept = memory.free(chunk)
+        assert (kept is not None) == mapped
+        if kept is not None:
+            assert int(seen.state["state"]) == OUT_OF_SERVICE
+            assert list(memory.names()) == []
+            assert kept.is_mapped
+            memory.forget(kept)
+    assert not list(directory.iterdir())
+
+
 def test_who_may_read_it(directory: Path) -> None:
     memory = ChunkMemory(str(directory), PREFIX, mode=0o640, gid=os.getgid())
     memory.create(new_header(IDENTITY)).close()
