@@ -33,7 +33,7 @@ def _slow_down(plan: dict[str, Any]) -> None:
             with contextlib.suppress(FileNotFoundError, ValueError):
                 begun_s = float(Path(plan["begin"]).read_text())
         periods, since_s = divmod(time.monotonic() - begun_s, plan["every_s"])
-        return periods >= 1 and since_s < plan["outage_s"]
+        return bool(periods >= 1 and since_s < plan["outage_s"])
 
     def wait_for_origin(path: str) -> None:
         mean_s, bytes_s = plan["mean_s"], plan["throttle_bytes_s"]
