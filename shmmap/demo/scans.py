@@ -2,8 +2,8 @@
 """The scans that the demonstration localizes, made in a process of their own.
 
 ``python -m shmmap.demo.scans OUT SEED BLOCKS_X BLOCKS_Y LENGTH`` writes ``scans/*.npz``, ``truth.txt`` and
-``odometry.txt`` (both in the TUM format) to the directory OUT.  In the end it makes an NDT layer of one
-point, so that the daemon's loaders find the kernels compiled.
+``odometry.txt`` (both in the TUM format) to the directory OUT.  In the end it compiles
+the kernels of layers, which the first daemon would do beside what is measured.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.layers.build import build_layer
-from shmmap.layers.spec import parse_layer
+from shmmap.layers.compiling import compile_kernels
 from shmmap.simulation.lidar import Lidar
 from shmmap.simulation.lidar_drive import LidarDrive
 from shmmap.simulation.town import Town
@@ -42,8 +41,7 @@ def main(argv: list[str]) -> int:
     (out / "scans").mkdir()
     for number, scan in enumerate(drive.scans()):
         np.savez(out / "scans" / f"scan_{number:04}.npz", xyz=scan.xyz)
-    corner: NDArray[np.float32] = np.zeros((1, 3), np.float32)
-    build_layer(parse_layer("ndt(leaf=2.0)"), {"xyz": corner}, box=(0.0, 0.0, 20.0, 20.0))
+    compile_kernels()
     return 0
 
 

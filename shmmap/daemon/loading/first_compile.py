@@ -8,7 +8,6 @@ there is not enough memory for it, whoever needs a kernel compiles it, as withou
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import traceback
@@ -50,17 +49,10 @@ def _compile(parent: int) -> NoReturn:
         die_with(parent)
         os.setsid()
         os.nice(_LEAST)
-        mark = compiled_mark()
-        if mark is not None:
-            with (
-                mark.with_suffix(".lock").open("w") as lock,
-                contextlib.suppress(BlockingIOError, MemoryError),
-            ):
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # else another daemon is at it
-                from shmmap.layers import height_kernels, lattice_kernels, ndt_kernels
+        from shmmap.layers.compiling import compile_kernels
 
-                del height_kernels, lattice_kernels, ndt_kernels
-                mark.touch()
+        with contextlib.suppress(MemoryError):
+            compile_kernels(wait=False)  # else another daemon is at it
         code = 0
     except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
         traceback.print_exc()
