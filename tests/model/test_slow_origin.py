@@ -39,11 +39,12 @@ def test_an_outage_that_is_longer_than_that_is_not() -> None:
     assert driven("route", Outages(40.0, 120.0, 120.0)).late > 100
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_without_a_route_few_wait(seed: int) -> None:
-    counts = driven("no route", OUTAGES["none"], seed)
-    assert counts.warm >= 0.95
-    assert counts.over_fetch <= 1.5
+def test_without_a_route_few_wait() -> None:
+    """Of a short drive with slow loads at the wrong moment more wait than of many drives."""
+    drives = [driven("no route", OUTAGES["none"], seed) for seed in range(8)]
+    assert all(counts.warm >= 0.9 for counts in drives)
+    assert np.mean([counts.warm for counts in drives]) >= 0.96
+    assert max(counts.over_fetch for counts in drives) <= 1.25
 
 
 def test_with_a_trajectory_none_waits() -> None:

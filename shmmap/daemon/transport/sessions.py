@@ -25,7 +25,7 @@ from shmmap.segment.pins import MAX_SLOT
 
 __all__ = ["Session", "Sessions"]
 
-MOVES_AT_ONCE: Final = 16
+MOVES_AT_ONCE: Final = 4
 """Sessions whose paths are looked at at a time: less than a millisecond."""
 
 

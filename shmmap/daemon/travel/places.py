@@ -30,6 +30,8 @@ seconds per metre beyond its reach, and the unit vector of its heading, 0 if unk
 NOWHERE: Final = np.empty((0, 8))
 MOST_PLACES: Final = 256
 """Scoring takes time for each: with more of them, of those near each other the first counts."""
+MOST_LOOKED_AT: Final = 2048
+"""To find which count takes time, too: half a millisecond.  Of more places, some are left out."""
 MOST_OF_A_CLIENT: Final = 128
 """Places along a route; the longer it is, the farther apart are those that come late."""
 NEAREST_M: Final = 10.0
@@ -38,6 +40,8 @@ SLOWEST_MPS: Final = 3.0
 """A client that stands still may drive off."""
 STAY_M: Final = 10.0
 """What is just beyond a client's reach stays, whatever its route says: it may turn round or leave it."""
+AT_ONCE: Final = 4096
+"""Pairs of a cell and a place that are looked at together: their tables stay in the processor's cache."""
 FIRST_SIDE_M: Final = 16.0
 """Places in one square of this side count as one at first, where there are too many."""
 
@@ -84,18 +88,20 @@ def merged_places(some: Iterable[Places]) -> Places:
     tables = list(some)
     if not tables:
         return NOWHERE
-    thin = max(1, len(tables) * MOST_OF_A_CLIENT // (64 * MOST_PLACES))
-    if thin > 1:  # very many: of each its first place, its last and some between them
-        tables = [table if len(table) < 3 else table[:: min(thin, len(table) - 1)] for table in tables]
+    thin = sum(map(len, tables)) // MOST_LOOKED_AT + 1
+    if thin > 1:  # of each its first place, its last and some between them
+        tables = [part for table in tables for part in (table[:-1:thin], table[-1:])]
     found = np.concatenate(tables)
+    if len(found) > MOST_PLACES:
+        found = found[np.argsort(found[:, 2], kind="stable")]
     side = FIRST_SIDE_M
     while len(found) > MOST_PLACES:
-        found = found[np.argsort(found[:, 2], kind="stable")]
         squares = np.floor(np.clip(found[:, :2] / side, -(2.0**30), 2.0**30)).astype(np.int64)
         keys = squares[:, 0] << 32 | squares[:, 1] & 0xFFFFFFFF
         keys = keys << 1 ^ np.isinf(found[:, 4])  # from a place that is open anything may be reached
         _, first = np.unique(keys, return_index=True)
-        found, side = found[np.sort(first)], 2.0 * side
+        found = found[np.sort(first)]
+        side *= 2.0 if len(found) < 4 * MOST_PLACES else 4.0
     return found
 
 
@@ -109,12 +115,28 @@ def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> ND
     places
         At least one of them open, or a cell may never be needed: infinity.
     """
+    found = np.full(len(boxes), np.inf)
+    heads = (places[:, 6] != 0.0) | (places[:, 7] != 0.0)
+    for some, somewhere in ((places[heads], True), (places[~heads], False)):
+        together = max(1, AT_ONCE // max(1, len(some)))
+        for begin in range(0, len(boxes) if len(some) else 0, together):
+            part = slice(begin, begin + together)
+            np.minimum(found[part], _until(boxes[part], some, now_s, somewhere=somewhere), out=found[part])
+    return found
+
+
+def _until(
+    boxes: NDArray[np.float64], places: Places, now_s: float, *, somewhere: bool
+) -> NDArray[np.float64]:
+    """In how many seconds each cell will be needed; ``somewhere``: clients are known to head somewhere."""
     x, y, at_s, reach, limit, pace, hx, hy = places.T[:, :, np.newaxis]
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
     gap = np.maximum(np.sqrt(dx * dx + dy * dy) - reach, 0.0)
-    cx, cy = 0.5 * (boxes[:, 0] + boxes[:, 2]) - x, 0.5 * (boxes[:, 1] + boxes[:, 3]) - y
-    cosine = (cx * hx + cy * hy) / np.maximum(np.sqrt(cx * cx + cy * cy), 1e-9)
-    times = np.maximum(at_s - now_s, 0.0) + gap * pace * (1.5 - 0.5 * cosine)
+    slower: NDArray[np.float64] | float = 1.5
+    if somewhere:
+        cx, cy = 0.5 * (boxes[:, 0] + boxes[:, 2]) - x, 0.5 * (boxes[:, 1] + boxes[:, 3]) - y
+        slower = 1.5 - 0.5 * (cx * hx + cy * hy) / np.maximum(np.sqrt(cx * cx + cy * cy), 1e-9)
+    times = np.maximum(at_s - now_s, 0.0) + gap * (pace * slower)
     least: NDArray[np.float64] = np.where(gap <= limit, times, np.inf).min(axis=0)
     return least

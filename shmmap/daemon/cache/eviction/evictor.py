@@ -76,7 +76,7 @@ class Evictor:
             return True
         self._refresh_until_s = now_s + PRESSURE_S
         order, looks = ledger.order, 0
-        score = self._scored(now_s)
+        score = self._scored(now_s, 4.0 * PLACES_S)  # as a rule `turn` has them up to date
         first = order.front(score, now_s)
         if rather_than is not None:
             least, *scores = score.of([rather_than, *first])
@@ -141,7 +141,10 @@ class Evictor:
     def turn(self, now_s: float) -> None:
         """Score some segments that came, or bring some scores up to date, in turn."""
         self._refreshed_s = now_s
-        ledger, score = self.reclaimer.ledger, self._scored(now_s)
+        ledger, before = self.reclaimer.ledger, self._score
+        score = self._scored(now_s, PLACES_S)
+        if score is not before:
+            return  # enough for this turn
         self._new_ones = not self._new_ones
         if self._new_ones:
             ledger.order.score_new(score)
@@ -151,10 +154,10 @@ class Evictor:
             self._round_s = now_s
             self._round, self._round_version = ledger.segments.walk(), score.version
 
-    def _scored(self, now_s: float) -> Score:
-        """How segments are scored, by where clients are (if they move, were a moment ago)."""
+    def _scored(self, now_s: float, age_s: float) -> Score:
+        """How segments are scored, by where clients are (if they move, were so long ago at most)."""
         sessions = self.reclaimer.sessions
-        if sessions.places_version != self._score.version and now_s - self._placed_s >= PLACES_S:
+        if sessions.places_version != self._score.version and now_s - self._placed_s >= age_s:
             self._placed_s = now_s
             self._score = self._score_at(sessions.places_version, now_s)
         return self._score

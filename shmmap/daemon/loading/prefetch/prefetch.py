@@ -20,6 +20,8 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 
 __all__ = ["URGENT_S", "Prefetch", "Wish"]
 
+COMPARED_AT_ONCE: Final = 64
+"""Ways, and cells on them, that are compared at a time: for a wish of more clients it takes some turns."""
 LOOKS_AT_ONCE: Final = 2
 """Steps along clients' ways that are looked at for one wish: a fifth of a millisecond."""
 SLOW_LOADS: Final = 1.6
@@ -74,6 +76,10 @@ class Prefetch:
         self.more = False
         self._out_since_s = math.inf
         self._away_s = 0.0
+        self._left: list[WayAhead] = []  # not compared yet for the next wish
+        self._behind: WayAhead | None = None  # of those compared: known least far
+        self._chosen: WayAhead | None = None  # ... and what is needed first, and whose it is
+        self._best: Wish | None = None
 
     @property
     def look_ahead(self) -> LookAhead:
@@ -88,6 +94,7 @@ class Prefetch:
         self.more = False
         is_back = self._is_back(now_s)
         if is_back or catalogue is not self._catalogue:
+            self._left = []
             # indices mean other cells now, or what was passed over because it had failed may be tried
             self._catalogue = catalogue
             for way in self.ways.values():
@@ -96,16 +103,44 @@ class Prefetch:
             return None
         step_m = max(SHORTEST_STEP_M, 0.5 * min(catalogue.mean_size))
         for _ in range(LOOKS_AT_ONCE):
-            behind = self._least_far(now_s)
-            wish = self._first(behind)
-            if wish is not None:
-                self.health.tried(now_s)
-                return wish
-            if behind is None:
+            if not self._compare_some(now_s):
+                self.more = True
                 return None
-            behind.look(catalogue, self.look_ahead, step_m)
+            behind, chosen, wish = self._behind, self._chosen, self._best
+            if wish is not None and (behind is None or behind is chosen or not _is_before(behind, wish)):
+                if self._is_absent(wish.cell, wish.layer):
+                    self.health.tried(now_s)
+                    return wish
+            elif behind is None:
+                return None
+            else:
+                behind.look(catalogue, self.look_ahead, step_m)
         self.more = True
         return None
+
+    def _compare_some(self, now_s: float) -> bool:
+        """Look at some ways: which is known least far, which has the first wish; True after the last."""
+        if not self._left:
+            self._left = list(self.ways.values())
+            self._behind = self._chosen = self._best = None
+        for _ in range(COMPARED_AT_ONCE):
+            if not self._left:
+                return True
+            way = self._left[-1]
+            self._begin_if_due(way, now_s)
+            if (first := way.first()) is not None:
+                needed_in_s, index = first
+                absent = [layer for layer in way.layers if self._is_absent(index, layer)]
+                if not absent:
+                    way.take()
+                    continue
+                if self._best is None or needed_in_s < self._best.needed_in_s:
+                    self._chosen, self._best = way, Wish(index, absent[0], needed_in_s)
+            least = self._behind
+            if not way.over and (least is None or way.ahead_m * way.pace_s < least.ahead_m * least.pace_s):
+                self._behind = way
+            self._left.pop()
+        return not self._left
 
     def _is_back(self, now_s: float) -> bool:
         """Whether loads succeed again; and for how long they did not."""
@@ -118,34 +153,11 @@ class Prefetch:
         self._out_since_s = math.inf
         return True
 
-    def _least_far(self, now_s: float) -> WayAhead | None:
-        """The way of which least is known ahead; None if all were looked over."""
-        least: WayAhead | None = None
-        for way in self.ways.values():
-            due = now_s - way.began_s >= PASS_S and (way.over or way.first() is not None)
-            if way.moves and (due or way.has_jumped):
-                way.begin(now_s)
-            if not way.over and (least is None or way.ahead_m * way.pace_s < least.ahead_m * least.pace_s):
-                least = way
-        return least
-
-    def _first(self, behind: WayAhead | None) -> Wish | None:
-        """The first wish, if no way that is still looked over can have an earlier one."""
-        best: Wish | None = None
-        chosen: WayAhead | None = None
-        for way in self.ways.values():
-            while (first := way.first()) is not None:
-                absent = [layer for layer in way.layers if self._is_absent(first[1], layer)]
-                if absent:
-                    if best is None or first[0] < best.needed_in_s:
-                        best, chosen = Wish(first[1], absent[0], first[0]), way
-                    break
-                way.take()
-        if chosen is None or best is None:
-            return None
-        if behind is not None and behind is not chosen and behind.ahead_m * behind.pace_s < best.needed_in_s:
-            return None
-        return best
+    def _begin_if_due(self, way: WayAhead, now_s: float) -> None:
+        """Have a way looked over again, if it is time."""
+        due = now_s - way.began_s >= PASS_S and (way.over or way.first() is not None)
+        if way.moves and (due or way.has_jumped):
+            way.begin(now_s)
 
     def next_s(self, now_s: float) -> float:
         """When to ask again though nothing happens."""
@@ -154,3 +166,8 @@ class Prefetch:
         if self.health.is_out:
             return self.health.next_try_s()
         return min(way.began_s + PASS_S if way.over else now_s for way in self.ways.values() if way.moves)
+
+
+def _is_before(way: WayAhead, wish: Wish) -> bool:
+    """Whether a way that is still looked over may have a wish before this one."""
+    return way.ahead_m * way.pace_s < wish.needed_in_s

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW, PROBE_S
-from shmmap.daemon.loading.prefetch.prefetch import LOOKS_AT_ONCE, Prefetch, Wish
+from shmmap.daemon.loading.prefetch.prefetch import COMPARED_AT_ONCE, LOOKS_AT_ONCE, Prefetch, Wish
 from shmmap.daemon.loading.prefetch.way_ahead import PASS_S, WayAhead
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
@@ -111,6 +111,25 @@ def test_of_two_clients_what_either_needs_first() -> None:
         one.client("only", y)
         alone += [wish.cell for wish in one.wishes(1.0)]
     assert {wish.cell for wish in found} == set(alone)
+
+
+def test_of_many_clients_some_are_compared_at_a_time() -> None:
+    """The order is that of all of them, though a call looks at few."""
+    daemon = Daemon()
+    count = 3 * COMPARED_AT_ONCE
+    for number in range(count):
+        daemon.client(str(number), y=float(number % 40) * 10.0 - 200.0)
+    calls = 1
+    while (first := daemon.prefetch.next(daemon.catalogue, 1.0)) is None:
+        assert daemon.prefetch.more
+        calls += 1
+    assert calls > count // COMPARED_AT_ONCE
+    daemon.loading.add((first.cell, first.layer))
+    found = daemon.wishes(1.0)
+    times = [wish.needed_in_s for wish in found]
+    assert times == sorted(times)
+    assert first.needed_in_s <= times[0]
+    assert len({wish.cell for wish in found}) == len(found) > 200
 
 
 def test_clients_that_need_the_same() -> None:
