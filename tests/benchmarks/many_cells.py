@@ -47,8 +47,9 @@ import numpy as np
 import shmmap
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.catalogue import run_measure
-from tests.benchmarks.hostile.actors import Actor, Orders
+from tests.benchmarks.hostile.actors import Actor
 from tests.benchmarks.hostile.beside import OVER_ECHO_MS, Beside
+from tests.benchmarks.hostile.bystanders import works
 from tests.benchmarks.hostile.files import reloads
 from tests.benchmarks.hostile.report import Report
 from tests.benchmarks.hostile.stage import Stage, lift
@@ -155,16 +156,6 @@ def measure_requests(one: DaemonProcess, side: int, row: dict[str, float], *, wh
             row["whole list"] = median_s(lambda: len(listing.metadata()), 1)
 
 
-def works(orders: Orders) -> float:
-    """Do the same work every 5 ms; returns the most processor time that it took, seconds."""
-    longest_s = 0.0
-    while orders.go_on(0.005):
-        begin_s = time.thread_time()
-        sum(range(20_000))
-        longest_s = max(longest_s, time.thread_time() - begin_s)
-    return longest_s
-
-
 def measure_reload(
     one: DaemonProcess, side: int, changed: list[Path], told: Report, row: dict[str, float]
 ) -> None:
@@ -185,7 +176,7 @@ def measure_reload(
             took_s, failure = operator.said(FIRST_START_S)
         told.must("the reload was answered", not failure, failure)
         row["reload"] = took_s
-        row["same work"] = worker.end() * 1e3
+        row["same work"] = worker.end()[1]
         row["turn in it"] = beside.turns.quantile_and_longest_ms(1.0)[1]
     events = read_statistics(one.instance, one.shm_dir)
     told.must("there was one", events.counters["reloads"] == 1)

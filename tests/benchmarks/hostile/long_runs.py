@@ -12,6 +12,7 @@ from typing import Final
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.hostile.actors import Actor, Orders
 from tests.benchmarks.hostile.beside import Beside
+from tests.benchmarks.hostile.bystanders import works
 from tests.benchmarks.hostile.files import reloads, touch_the_last
 from tests.benchmarks.hostile.report import Report
 from tests.benchmarks.hostile.requests import SIDE, asks_for_normals, waits_with_many_requests
@@ -121,6 +122,7 @@ def churn(told: Report, stage: Stage) -> None:
         ]
         for driver in drivers:
             driver.said()
+        worker = stack.enter_context(Actor(works, is_bystander=True))
         before = counters_of(one)
         time.sleep(stage.minutes * 30.0)
         touch_the_last(path, side)
@@ -136,6 +138,8 @@ def churn(told: Report, stage: Stage) -> None:
         p999, longest = beside.turns.quantile_and_longest_ms(0.999)
         told.limit("99.9 % of the loop's turns take", p999, TURN_P999_MS, "ms")
         told.limit("the longest takes", longest, LONGEST_TURN_MS, "ms")
+        same_p999, same_longest = worker.end()
+        told.tell(f"the same 0.4 ms of work beside it: p99.9 {same_p999:.2f}  longest {same_longest:.1f} ms")
 
 
 def counters_of(one: DaemonProcess) -> dict[str, int]:
