@@ -30,8 +30,8 @@ seconds per metre beyond its reach, and the unit vector of its heading, 0 if unk
 NOWHERE: Final = np.empty((0, 8))
 MOST_PLACES: Final = 256
 """Scoring takes time for each: with more of them, of those near each other the first counts."""
-MOST_LOOKED_AT: Final = 2048
-"""To find which count takes time, too: half a millisecond.  Of more places, some are left out."""
+MOST_LOOKED_AT: Final = 1024
+"""To find which count takes time, too: a third of a millisecond.  Of more places, some are left out."""
 MOST_OF_A_CLIENT: Final = 128
 """Places along a route; the longer it is, the farther apart are those that come late."""
 NEAREST_M: Final = 10.0
