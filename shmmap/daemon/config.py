@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
-from shmmap.daemon.config_file import Setting, read_settings_file
+from shmmap.daemon.config_file import KINDS, Setting, read_settings_file
 from shmmap.daemon.config_live import LiveSettings, live_settings
 from shmmap.errors import BadRequest, ConfigError
 from shmmap.protocol.endpoint import (
@@ -24,7 +24,7 @@ from shmmap.protocol.endpoint import (
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import check_instance
 
-__all__ = ["FILE_NAMES", "DaemonConfig", "load_config", "parse_bytes", "trace_settings"]
+__all__ = ["FILE_NAMES", "DaemonConfig", "load_config", "option_of", "parse_bytes", "trace_settings"]
 
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 LARGEST_BYTES: Final = 1 << 62
@@ -48,6 +48,7 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     ),
 }
 """Which values a setting may have, and the hint for who gives another."""
+COMMAND_LINE: Final = "command line"
 _NOT_SETTINGS: Final = "SHMMAP_TEST_"
 FILE_NAMES: Final = {
     "budget_bytes": "budget", "cache_bytes": "cache_size", "live_budget_bytes": "live_budget",
@@ -176,10 +177,18 @@ def parse_bytes(text: str) -> int:
     return int(nbytes)
 
 
+def option_of(name: str) -> str:
+    """Return what the command line calls a setting."""
+    if name == "map_path":
+        return "MAP"
+    return "--" + FILE_NAMES.get(name, name).removesuffix("_s").replace("_", "-")
+
+
 def _convert(name: str, value: Any, origin: str) -> Any:
     """Check one setting's type and range."""
     kind = type(getattr(DaemonConfig(), name))
-    called = FILE_NAMES.get(name, name)
+    called = option_of(name) if origin == COMMAND_LINE else FILE_NAMES.get(name, name)
+    is_possible, hint = _RANGES.get(name, (lambda _value: True, ""))
     try:
         if name in ("budget_bytes", "cache_bytes", "live_budget_bytes"):
             value = parse_bytes(value) if isinstance(value, str) else value
@@ -201,9 +210,8 @@ def _convert(name: str, value: Any, origin: str) -> Any:
         ) from None
     except (KeyError, ValueError, OverflowError):
         raise ConfigError(
-            f"{origin}: {called} must be of type {kind.__name__}, not {value!r}", key=name, origin=origin
+            f"{origin}: {called} must be {KINDS[kind]}, not {value!r}", key=name, origin=origin, hint=hint
         ) from None
-    is_possible, hint = _RANGES.get(name, (lambda _value: True, ""))
     if not is_possible(value):
         raise ConfigError(f"{origin}: {called} cannot be {value!r}", key=name, origin=origin, hint=hint)
     return value
@@ -256,7 +264,7 @@ def trace_settings(
         and not name.startswith(_NOT_SETTINGS)
         and not (name == "SHMMAP_ENDPOINT" and elsewhere)
     ]
-    given += [(name, value, "command line") for name, value in flags.items() if value is not None]
+    given += [(name, value, COMMAND_LINE) for name, value in flags.items() if value is not None]
     settings = {field.name: Setting(field.default, "default") for field in fields(DaemonConfig)}
     attributes = {called: name for name, called in FILE_NAMES.items()}
     live: dict[str, list[tuple[Any, str]]] = {"tables": [], "flags": []}
@@ -267,7 +275,7 @@ def trace_settings(
             ].append((value, origin))
             continue
         name = attributes.get(word, word)
-        if name not in settings or (word in FILE_NAMES and origin != "command line"):
+        if name not in settings or (word in FILE_NAMES and origin != COMMAND_LINE):
             raise _unknown(word, origin)
         settings[name] = Setting(_convert(name, value, origin), origin)
     settings["live"] = _live(live["tables"], live["flags"])

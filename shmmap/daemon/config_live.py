@@ -13,6 +13,7 @@ import msgspec
 
 from shmmap.chunks.layout import MOST_FRAME_BYTES
 from shmmap.chunks.occupancy import Occupancy
+from shmmap.daemon.config_file import KINDS
 from shmmap.errors import ConfigError
 
 __all__ = ["SERVICE_STATE", "LiveSettings", "live_directory", "live_settings"]
@@ -149,7 +150,7 @@ def _checked(key: str, value: Any, default: Any, where: str, origin: str) -> Any
         value = float(max(-_LARGEST, min(value, _LARGEST)))
     if not isinstance(value, kind) or isinstance(value, bool):
         raise ConfigError(
-            f"{where} must be of type {kind.__name__}, not {value!r}", key=key, origin=origin,
+            f"{where} must be {KINDS[kind]}, not {value!r}", key=key, origin=origin,
             hint=f"its default is {default!r}" if default != "" else "write it in quotes",
         )  # fmt: skip
     if key == "frame_id" and not 0 < len(value.encode()) <= MOST_FRAME_BYTES:

@@ -88,7 +88,7 @@ PARTS = {
 ROOMS = [
     {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
     {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel"},
-    {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_file", "config_live", "records"},
+    {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"}, {"config_file", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 MOST_MODULES = 12

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.config import FILE_NAMES, DaemonConfig, load_config, parse_bytes
+from shmmap.cli.parser import build_parser
+from shmmap.daemon.config import DaemonConfig, load_config, option_of, parse_bytes
 from shmmap.errors import ConfigError
 
 
@@ -118,8 +121,17 @@ def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None
     assert failure.value.origin == "command line"
     assert failure.value.key == name
     assert failure.value.message.startswith("command line: ")
-    assert FILE_NAMES.get(name, name) in failure.value.message
+    assert option_of(name) in failure.value.message
     assert failure.value.exit_code == 78
+
+
+def test_the_command_line_has_the_options_that_errors_name() -> None:
+    (verbs,) = (one for one in build_parser()._actions if isinstance(one, argparse._SubParsersAction))
+    names = {field.name for field in fields(DaemonConfig)} - {"live"}
+    actions = [action for action in verbs.choices["serve"]._actions if action.dest in names]
+    assert len(actions) >= 15
+    for action in actions:
+        assert option_of(action.dest) in (*action.option_strings, action.metavar)
 
 
 def test_a_value_out_of_range_is_told_what_may_be() -> None:
