@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -18,6 +19,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.patience import Patience
 from tests.support.pcd_files import read_pcd
 
 HEX = re.compile(r"[0-9a-f]{16}")
@@ -121,7 +123,9 @@ def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_ma
         assert "hint: " in done.stderr
     finally:
         os.kill(pid, signal.SIGCONT)
-    assert shmmap.json("health")["state"] in ("healthy", "hung")
+    waiting = Patience()
+    while waiting(json.loads(shmmap.run("health", "--json").stdout)["state"] != "healthy"):
+        pass
     assert "0_0.pcd" in shmmap("ls")
 
 

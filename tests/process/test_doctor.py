@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -82,23 +81,23 @@ def test_cells_that_cannot_be_loaded_are_named(daemon: DaemonFactory, divided_ma
     assert doctor(one)[1]["cells"]["fact"] == "no load has failed"
     with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
         assert client.selected([str(path)], wait=20.0).failed
-        found = _until(one, lambda cells: cells["state"] == "warn")
+        found = _until(one, "cells", "warn")
         assert found["fact"].startswith("1 cell cannot be loaded: 0_0.pcd (points): ")
         assert "shmmap inspect" in found["advice"]
 
         path.write_bytes(whole)
         client.reload()
         assert client.selected([str(path)], wait=20.0).complete
-    found = _until(one, lambda cells: cells["state"] == "ok")
+    found = _until(one, "cells", "ok")
     assert found["fact"].endswith("no cell is known to fail now")
 
 
-def _until(one: DaemonProcess, settled: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """What is found about cells, once the statistics tell it."""
+def _until(one: DaemonProcess, about: str, state: str) -> dict[str, Any]:
+    """What is found about something, once the statistics tell it."""
     waiting = Patience()
-    found: dict[str, Any] = doctor(one)[1]["cells"]
-    while waiting(not settled(found)):
-        found = doctor(one)[1]["cells"]
+    found: dict[str, Any] = doctor(one)[1][about]
+    while waiting(found["state"] != state):
+        found = doctor(one)[1][about]
     return found
 
 
@@ -107,8 +106,7 @@ def test_entries_without_a_file_are_a_problem_of_the_map(
 ) -> None:
     Path(divided_map.id("0_0.pcd")).unlink()
     one = daemon(divided_map.root)
-    found = doctor(one)[1]["map"]
-    assert found["state"] == "warn"
+    found = _until(one, "map", "warn")
     assert "reading it found 1 problem" in found["fact"]
 
 

@@ -42,6 +42,14 @@ def after(shmmap: Shmmap, told: Callable[[dict[str, int]], bool]) -> dict[str, i
         return reader.snapshot(tables=False).counters
 
 
+def until_shown(shmmap: Shmmap, count: int) -> None:
+    """Wait until the table of what is in memory has so many rows: it follows what happens a little later."""
+    waiting = Patience()
+    with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
+        while waiting(len(reader.snapshot().cells) < count):
+            os.sched_yield()
+
+
 @pytest.fixture
 def shmmap(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> Shmmap:
     """Return the command line of a daemon with room for everything."""
@@ -177,6 +185,7 @@ def test_a_client_cannot_write_to_the_terminal_of_who_looks(shmmap: Shmmap, divi
 
 def test_metrics_and_files(shmmap: Shmmap, divided_map: DividedMap, tmp_path: Path) -> None:
     shmmap("query", "--circle", "0,0,25")
+    until_shown(shmmap, len(divided_map.in_circle(0, 0, 25)))
     metrics = shmmap("metrics")
     assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 1' in metrics
     picture, page = tmp_path / "map.svg", tmp_path / "map.html"
@@ -196,6 +205,7 @@ def test_a_picture_of_too_many_cells(
 ) -> None:
     """Those on disk are left out, and not even asked for; the map's extent and those in memory are there."""
     shmmap("query", "--circle", "0,0,5")
+    until_shown(shmmap, 4)
     for name, value in shmmap.environment.items():
         if name.startswith("SHMMAP_"):
             monkeypatch.setenv(name, value)

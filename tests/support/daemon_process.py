@@ -74,6 +74,12 @@ class DaemonProcess(daemon_process.DaemonProcess):
         """Ids of the loaders, without their parent's."""
         return [pid for pid in self.children() if _parent_of(pid) != self.pid]
 
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal; after SIGSTOP it stands still."""
+        super().send(number)
+        if number == signal.SIGSTOP:
+            stop(self.pid)
+
     def loaders_parent(self) -> int:
         """Id of the process that loaders are forked from."""
         (found,) = set(self.children()) - set(self.loaders())
