@@ -23,6 +23,8 @@ Early: TypeAlias = tuple[ForkedProcess, socket.socket]
 
 END_PATIENCE_S: Final = 0.1
 """How long the loop waits for a killed parent to end; one that hangs in the kernel may take for ever."""
+CLOSE_PATIENCE_S: Final = 5.0
+"""The same when the daemon ends: it waits for its child, on a machine that is busy, too."""
 
 RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
 
@@ -135,7 +137,11 @@ class PreparedParent:
                 with contextlib.suppress(OSError):
                     self.start()
 
-    def end(self, why: str = "") -> None:
+    def close(self) -> None:
+        """End it, and with it every loader, when the daemon ends."""
+        self.end(patience_s=CLOSE_PATIENCE_S)
+
+    def end(self, why: str = "", *, patience_s: float = END_PATIENCE_S) -> None:
         """End it, and with it every loader; ``why`` tells people, else how it ended does."""
         if self._channel is None or self._process is None:
             return
@@ -144,7 +150,7 @@ class PreparedParent:
         self._channel = None
         self._process.kill()
         try:
-            how = how_ended(self._process.wait(END_PATIENCE_S))
+            how = how_ended(self._process.wait(patience_s))
         except subprocess.TimeoutExpired:
             how = "killed, and has not ended yet"
         if not self._ready:

@@ -345,6 +345,6 @@ class WorkerPool:
         """End every worker, and their parent."""
         for worker in self:
             self.remove(worker)
-        self.parent.end()
+        self.parent.close()
         for pidfd in list(self._ending):
             self._bury(pidfd)

@@ -243,11 +243,7 @@ class InnerDaemon:
         """End everything but the segments, as before a restart."""
         for session in list(self.sessions):
             self.sessions.close(session)
-        parent = self.pool.parent._process
         self.pool.close()
-        if parent is not None:
-            with contextlib.suppress(ProcessLookupError):  # as a rule it has ended by now, and was waited for
-                parent.wait(60.0)
         self.cache.close(keep=True)
         self.statistics.close()
         self.watched.close()

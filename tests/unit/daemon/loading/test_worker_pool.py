@@ -32,7 +32,7 @@ class NoParent:
     def fork(self, end: socket.socket) -> None:
         self.ends.append(os.dup(end.fileno()))
 
-    def end(self) -> None:
+    def close(self) -> None:
         for fd in self.ends:
             os.close(fd)
 
