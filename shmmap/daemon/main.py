@@ -48,6 +48,7 @@ from shmmap.daemon.prerequisites import (
     access_of_segments,
     choose_pins,
     give_back_large_tables,
+    import_ahead,
     make_runtime_dir,
     raise_descriptor_limit,
 )
@@ -97,6 +98,7 @@ def run(config: DaemonConfig) -> int:
     early = fork_early()
     prepare_process()
     give_back_large_tables()
+    import_ahead()
     raise_descriptor_limit()
     sys.setswitchinterval(SWITCH_S)
     activated = take_activated_socket()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ctypes
+import importlib
 import os
 import resource
 from pathlib import Path
@@ -21,6 +22,7 @@ __all__ = [
     "access_of_segments",
     "choose_pins",
     "give_back_large_tables",
+    "import_ahead",
     "make_runtime_dir",
     "raise_descriptor_limit",
 ]
@@ -43,6 +45,11 @@ def give_back_large_tables() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+
+
+def import_ahead() -> None:
+    """Import what numpy would import when `np.unique` is first called: 12 ms, in the serving loop."""
+    importlib.import_module("numpy.ma")
 
 
 def access_of_segments(config: DaemonConfig) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from shmmap.geometry import Area, Box
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.segment.version import layer_version
+from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 
@@ -84,7 +85,7 @@ class LayerVersions:
 
     def __init__(self, catalogue: Callable[[], Cells]) -> None:
         self._catalogue = catalogue
-        self._known: dict[str, dict[int, int]] = {}  # by layer with a halo, by cell
+        self._known: dict[str, ShardedDict[int, int]] = {}  # by layer with a halo, by cell
         self._count = 0
 
     def version(self, index: int, layer: str) -> int:
@@ -107,8 +108,8 @@ class LayerVersions:
         """Cells and layers whose `version` would take long now: neighbours have to be found."""
         for layer in layers:
             if _kind(layer).halo_m:
-                known = self._known.get(layer, {})
-                yield from ((index, layer) for index in indices if index not in known)
+                known = self._known.get(layer)
+                yield from ((index, layer) for index in indices if known is None or index not in known)
 
     def neighbours(self, index: int, layer: str) -> list[int]:
         """Catalogue indices of the cells that a layer of this one looks into, ascending.
@@ -175,7 +176,9 @@ class LayerVersions:
             self._count -= 1
             if not known:
                 del self._known[oldest]
-        self._known.setdefault(layer, {})[index] = version
+        if layer not in self._known:
+            self._known[layer] = ShardedDict()
+        self._known[layer][index] = version
         self._count += 1
 
     def cell_changed(self, index: int) -> None:
@@ -187,7 +190,7 @@ class LayerVersions:
             if not known:
                 del self._known[layer]
 
-    def forget(self) -> list[dict[int, int]]:
+    def forget(self) -> list[ShardedDict[int, int]]:
         """Indices mean other cells from now on; returns what was known, which takes time to be freed."""
         known, self._known, self._count = list(self._known.values()), {}, 0
         return known

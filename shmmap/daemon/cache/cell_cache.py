@@ -34,6 +34,7 @@ from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.segment.publish_block import PublishBlock
+from shmmap.sharded_dict import ShardedDict
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellCache"]
@@ -234,7 +235,7 @@ class CellCache:
         self.heights.learn(index, resident.z_min, resident.z_max)
         return True
 
-    def serve(self, new: CatalogueView, changed: NDArray[np.intp] | None) -> list[dict[int, Any]]:
+    def serve(self, new: CatalogueView, changed: NDArray[np.intp] | None) -> list[ShardedDict[int, Any]]:
         """Serve another state of the map.
 
         Nothing is warm in it before `find_warm` or `MapSwitch.turn` has found it in the ledger.
@@ -249,7 +250,7 @@ class CellCache:
         list
             Tables that are not used any more; to free many entries at once takes long.
         """
-        left: list[dict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
+        left: list[ShardedDict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
         self.catalogue = new
         self.warm = self.warm.successor()
         if changed is None:

@@ -16,6 +16,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Resident
 from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.segment.version import Stamp
+from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["MapSwitch"]
 
@@ -39,7 +40,7 @@ class MapSwitch:
         self._history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=STATES_REMEMBERED)
         self._remembered = 0
         self._unseen: Iterator[Resident] | None = None
-        self._leftovers: list[dict[int, Any]] = []
+        self._leftovers: list[ShardedDict[int, Any]] = []
 
     def changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
         """Ids that changed or appeared, and that vanished, since a map version; None: not known."""

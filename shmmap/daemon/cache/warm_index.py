@@ -15,6 +15,7 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.geometry import ZRange
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
+from shmmap.sharded_dict import ShardedDict
 from shmmap.sparse_table import sparse_zeros
 
 __all__ = ["Heights", "WarmIndex"]
@@ -77,14 +78,16 @@ class WarmIndex:
         Per layer, catalogue index to resident segment.
     tables : dict
         Per layer that has one, (cells,) uint64: the version, 0 where the cell is not in memory.
-    of_version : dict
+    of_version : ShardedDict
         Versions handed out, current and earlier ones, to cell and layer.
+    retired : OrderedDict
+        Those of them that are out of service.
     """
 
-    layers: dict[str, dict[int, Resident]] = field(default_factory=dict)
+    layers: dict[str, ShardedDict[int, Resident]] = field(default_factory=dict)
     tables: dict[str, NDArray[np.uint64]] = field(default_factory=dict)
-    of_version: dict[int, Key] = field(default_factory=dict)
-    _retired: OrderedDict[int, None] = field(default_factory=OrderedDict)
+    of_version: ShardedDict[int, Key] = field(default_factory=ShardedDict)
+    retired: OrderedDict[int, None] = field(default_factory=OrderedDict)
     _count: int = 0
 
     def __len__(self) -> int:
@@ -124,7 +127,9 @@ class WarmIndex:
     def enter(self, resident: Resident, index: int, cells: int) -> None:
         """A segment has the current version of its cell, one of so many ``cells`` of the map."""
         layer = resident.key.layer
-        found = self.layers.setdefault(layer, {})
+        found = self.layers.get(layer)
+        if found is None:
+            found = self.layers[layer] = ShardedDict()
         self._count += index not in found
         found[index] = resident
         table = self.tables.get(layer)
@@ -150,13 +155,13 @@ class WarmIndex:
     def note_version(self, resident: Resident) -> None:
         """What a segment's version is of."""
         self.of_version[resident.version] = resident.key
-        self._retired.pop(resident.version, None)
+        self.retired.pop(resident.version, None)
 
     def note_retired(self, resident: Resident) -> None:
         """A segment is out of service; what its version is of is forgotten some day."""
-        self._retired[resident.version] = None
-        if len(self._retired) > RETIRED_REMEMBERED:
-            oldest, _ = self._retired.popitem(last=False)
+        self.retired[resident.version] = None
+        if len(self.retired) > RETIRED_REMEMBERED:
+            oldest, _ = self.retired.popitem(last=False)
             self.of_version.pop(oldest, None)
 
     def leave(self, index: int, layer: str) -> None:
@@ -174,4 +179,4 @@ class WarmIndex:
 
     def successor(self) -> WarmIndex:
         """Return an empty one, for indices that mean other cells; versions are of the same as before."""
-        return WarmIndex(of_version=self.of_version, _retired=self._retired)
+        return WarmIndex(of_version=self.of_version, retired=self.retired)

@@ -62,23 +62,25 @@ def warm_difference(
         held.update(cast("list[int]", given))
     if 0 in current:
         return None  # 0 stands for "not in memory"
-    warm, of_version, index_of = cache.warm.layers[layer], cache.warm.of_version, cache.catalogue.find
-    missing = [index_of(of_version[version].cell_id) or 0 for version in current - held]
-    missing.sort()
+    warm = cache.warm.layers[layer]
+    cells = zip(found.tolist(), versions, strict=True)
+    lacks = [warm[cell] for cell, version in cells if version not in held]
     removed: tuple[str, ...] = ()
     removed_packed = b""
     gone = held - current
     if gone:
-        # an old version of a cell inside the area is replaced, not removed
-        known = ((version, key) for version in gone if (key := of_version.get(version)) is not None)
+        # an old version of a cell inside the area is replaced, not removed; another layer of one stays
+        of_version, index_of = cache.warm.of_version, cache.catalogue.find
+        suspects = gone if len(cache.warm.layers) > 1 else gone & cache.warm.retired.keys()
+        known = ((version, key) for version in suspects if (key := of_version.get(version)) is not None)
         of_cells = ((version, index_of(key.cell_id)) for version, key in known)
-        replaced = [v for v, index in of_cells if index in warm and warm[index].version in current]
-        gone.difference_update(replaced)
+        inside = ((version, warm.get(index)) for version, index in of_cells if index is not None)
+        gone.difference_update([v for v, now in inside if now is not None and now.version in current])
         if named:
             removed = _removed_names(cache, named, gone, current, layer)
         if message.packed:
             removed_packed = pack_versions(gone if not named else gone.intersection(packed))
-    return WarmDifference([warm[index] for index in missing], removed, removed_packed)
+    return WarmDifference(lacks, removed, removed_packed)
 
 
 def _removed_names(

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple
 
 from shmmap.daemon.records import Resident
+from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["BATCH", "FRONT", "EvictionOrder", "Score", "SetAside"]
 
@@ -102,7 +103,7 @@ class SetAside:
     """Segments that cannot go now, and until when; infinity for those that somebody will speak of."""
 
     def __init__(self) -> None:
-        self._until_s: dict[Resident, float | None] = {}
+        self._until_s: ShardedDict[Resident, float | None] = ShardedDict()
         self._heap: list[tuple[float, int, Resident]] = []
         self._number = 0
 
@@ -144,9 +145,9 @@ class SetAside:
                 found.append(resident)
         return found
 
-    def take_all(self) -> dict[Resident, float | None]:
+    def take_all(self) -> ShardedDict[Resident, float | None]:
         """Take back all."""
-        found, self._until_s = self._until_s, {}
+        found, self._until_s = self._until_s, ShardedDict()
         return found
 
 
@@ -159,7 +160,7 @@ class EvictionOrder:
         Set aside: just handed out, their readers may be opening them.
     aside
         Set aside: somebody needs or maps them.
-    new : dict
+    new : ShardedDict
         Not scored yet; whatever comes into service is put here.
     scored : int
         How many scores were computed so far.
@@ -169,8 +170,8 @@ class EvictionOrder:
         self.graced = SetAside()
         self.aside = SetAside()
         self.scored = 0
-        self.new: dict[Resident, float | None] = {}
-        self._entries: dict[Resident, _Entry] = {}
+        self.new: ShardedDict[Resident, float | None] = ShardedDict()
+        self._entries: ShardedDict[Resident, _Entry] = ShardedDict()
         self._sorted = _Sorted()
         self._number = 0
 

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The serving loop imports nothing: `np.unique`, say, has numpy import for 12 ms when first called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import shmmap
+from shmmap import MapWindow
+from shmmap.errors import ShmmapError
+from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Shmmap
+from tests.support.daemon_process import ROOT
+from tests.support.divided_map import make_map
+from tests.support.patience import Patience
+
+PATIENCE_S = 60.0
+WATCH_IMPORTS = """
+import os, sys
+fd = os.open(os.environ["IMPORTS_SEEN"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+def seen(event, arguments):
+    if event == "import":
+        os.write(fd, f"{os.getpid()} {arguments[0]}\\n".encode())
+sys.addaudithook(seen)
+"""
+
+
+def test_nothing_is_imported_while_it_serves(daemon: DaemonFactory, tmp_path: Path) -> None:
+    (tmp_path / "watch").mkdir()
+    (tmp_path / "watch" / "sitecustomize.py").write_text(WATCH_IMPORTS)
+    seen = tmp_path / "imports"
+    made = make_map(tmp_path / "map", columns=12, rows=4, points=60)
+    environment = {"PYTHONPATH": f"{tmp_path / 'watch'}:{ROOT}", "IMPORTS_SEEN": str(seen)}
+    one = daemon(made.root, "--budget", "1M", environment=environment)
+    before = len(seen.read_text().splitlines())
+    assert before > 100
+
+    operator = Shmmap(one, tmp_path)
+    with MapWindow(one.endpoint, 30.0, name="driver") as window, shmmap.connect(one.endpoint) as client:
+        route, waiting = [(-120.0, 0.0), (120.0, 0.0)], Patience()
+        x = -100.0
+        while waiting(operator.json("status")["counters"]["prefetch_used"] == 0 or x < 100.0):
+            window.move_to(x, 0, vx=10.0, route=route, wait=PATIENCE_S)
+            x = x + 10.0 if x < 100.0 else -100.0
+        window.move_to(0, 0, vx=10.0, vy=1.0)
+        assert client.around(0, 0, radius=500, wait=PATIENCE_S).cells
+        assert client.selected(["0_0.pcd", "none"], layers="voxel(leaf=1.0)", wait=PATIENCE_S).failed
+        with pytest.raises(ShmmapError):
+            client.around(0, 0, radius=10, layers="no such layer")
+        made.change("0_0.pcd", seed=7)
+        for verb in ("ls", "map", "doctor", "reload", "evict --all", "metrics"):
+            operator(*verb.split())
+    imported = [line.split() for line in seen.read_text().splitlines()[before:]]
+    assert [name for pid, name in imported if int(pid) == one.pid] == []
