@@ -33,8 +33,9 @@ __all__ = ["Chore", "ServingLoop"]
 CLIENTS: Final = "clients"
 SERVE_S: Final = 0.002
 """How long requests are served before the loop looks at everything else."""
-ENOUGH_NS: Final = 100_000
-"""Processor time after which a turn begins no other kind of work."""
+ENOUGH_NS: Final = 50_000
+"""Processor time after which a turn begins no other work."""
+LOADS_A_TURN: Final = 16
 LONG_TURN_NS: Final = 10_000_000
 """Processor time of a turn that is worth an event."""
 TOLD_S: Final = 1.0
@@ -133,9 +134,14 @@ class ServingLoop:
         self._look_after_the_rest(time.monotonic())
         self._breathe()
         self._guarded("memory", self.scheduler.free, time.monotonic())
-        self._breathe()
-        self._guarded("memory", self.scheduler.pump, time.monotonic())
-        self._guarded("memory", self.cache.tell_all)
+        for _ in range(LOADS_A_TURN):
+            self._breathe()
+            self._guarded("memory", self.scheduler.pump, time.monotonic())
+            while self.cache.untold:
+                self._breathe()
+                self._guarded("memory", self.cache.tell_next)
+            if not self.scheduler.unfinished:
+                break
 
     def _breathe(self) -> None:
         """If this turn has taken its time, begin another one: hear who has come, serve one of them, go on."""

@@ -218,8 +218,8 @@ class StatisticsWriter:
         self._write_identity()
         if self._changes_due:
             self._changes_due = not self._write(self._changes, self._layout.changes_offset)
-        if self._changed or self._removed or self._missing or self._table_sequence % 2:
-            self._write_rows(max_rows)
+        if max_rows:
+            self.write_rows(max_rows)
         sequence = self._sequence + 1
         state = State(
             sequence,
@@ -235,7 +235,10 @@ class StatisticsWriter:
         if self._write(pack_state(state, self._packer), block):
             self._sequence = sequence
 
-    def _write_rows(self, max_rows: int) -> None:
+    def write_rows(self, max_rows: int) -> None:
+        """Write at most so many changed rows, between two beats."""
+        if not (self._changed or self._removed or self._missing or self._table_sequence % 2):
+            return
         if not self._mark_table(self._table_sequence + 1 | 1):  # odd already where no even one could follow
             return
         for _ in range(min(max_rows, len(self._removed))):

@@ -267,9 +267,21 @@ class CellCache:
 
     def tell_all(self) -> None:
         """Tell what happened since the last time, in that order."""
-        while self._untold:
-            how, what = self._untold.popleft()
-            how(*what)
+        while self.tell_next():
+            pass
+
+    def tell_next(self) -> bool:
+        """Tell the first thing that happened and was not told yet; False if there is none."""
+        if not self._untold:
+            return False
+        how, what = self._untold.popleft()
+        how(*what)
+        return True
+
+    @property
+    def untold(self) -> bool:
+        """Whether something is to be told."""
+        return bool(self._untold)
 
     def _memory(self) -> tuple[int, int, int, int]:
         """Budget, used, pinned and retired bytes."""

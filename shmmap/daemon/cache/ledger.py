@@ -185,6 +185,7 @@ class Ledger:
         self.prefetched_bytes += resident.nbytes * resident.prefetched
         self.segments.add(resident)
         self.order.new[resident] = None
+        self.order.changes += 1
         if old is not None:
             self._leave_service(old)
         return old

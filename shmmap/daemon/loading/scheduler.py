@@ -9,7 +9,6 @@ checked by a worker before it is handed out, so is the file of a cell that faile
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Final
@@ -33,8 +32,7 @@ from shmmap.segment.version import Stamp
 __all__ = ["Scheduler"]
 
 LOOKS_A_PUMP: Final = 16
-HAND_OUT_S: Final = 0.0001
-"""Loads that one `pump` hands out or finds to be of no use any more, and time of the processor for that."""
+"""Loads that one `pump` finds to be of cells that left the map."""
 
 
 class Scheduler:
@@ -55,6 +53,8 @@ class Scheduler:
         Wishes for what nobody has asked for yet; asks the cache for room; replaces workers.
     on_settled
         Called with a key when its load ended, in whichever way.
+    unfinished : bool
+        Whether there may be more for `pump` to do at once.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Scheduler:
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
-        self._job_numbers, self._unfinished = 0, False
+        self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
@@ -125,30 +125,28 @@ class Scheduler:
         self._cache.look_for_some(now_s)
 
     def pump(self, now_s: float) -> None:
-        """Hand queued loads to workers as far as memory and workers allow."""
+        """Hand a queued load to a worker if memory and workers allow; see `unfinished`."""
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
         self._drop_some()
-        end_s = time.thread_time() + HAND_OUT_S
-        for _ in range(LOOKS_A_PUMP):
-            self._unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
-            if not self._unfinished or time.thread_time() > end_s:
-                break
+        self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
 
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         if (load := self.loads.next_queued(points=points, layers=layers)) is None:
             return False
-        if (job := self._job(load, self._job_numbers + 1)) is None:
-            self._end(load)
-            return True
-        shortage = self._cache.ledger.shortage(load.estimate)
-        if load.estimate and shortage > 0:
+        estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
+        if estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, now_s)
             if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
             return bool(refusal)
+        if (job := self._job(load, self._job_numbers + 1)) is None:
+            self._end(load)
+            return True
+        if load.estimate > estimate:
+            return True  # it has become a load that needs room
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
@@ -193,7 +191,7 @@ class Scheduler:
 
     def next_event_s(self) -> float:
         """When there is something to do although nothing arrives; infinity for never."""
-        if self._doubtful or self._unfinished:
+        if self._doubtful or self.unfinished:
             return 0.0
         cache = self._cache
         return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())

@@ -128,12 +128,16 @@ class PinWatch:
             self._names.pop(watch, None)
             os.close(fd)
 
-    def tell_once(self, name: str) -> None:
-        """Hear when somebody next lets go of a segment in service."""
-        if self._inotify is not None:
-            with contextlib.suppress(OSError):
-                watch = self._inotify.add(self._directory.path + name, CLOSED, once=True)
-                self._names[watch], self._once[name] = name, watch
+    def tell_once(self, name: str) -> bool:
+        """Hear when somebody next lets go of a segment in service; False if that cannot be."""
+        if self._inotify is None:
+            return False
+        try:
+            watch = self._inotify.add(self._directory.path + name, CLOSED, once=True)
+        except OSError:
+            return False
+        self._names[watch], self._once[name] = name, watch
+        return True
 
     def closed(self) -> set[str] | None:
         """Names that somebody let go of since the last call; None: any of them, too many to tell."""

@@ -23,7 +23,7 @@ from shmmap.logfmt import escaped
 from shmmap.protocol.messages import Holder, Intent
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["Session", "Sessions"]
+__all__ = ["MOVES_AT_ONCE", "Session", "Sessions"]
 
 MOVES_AT_ONCE: Final = 4
 """Sessions whose paths are looked at at a time: less than a millisecond."""

@@ -93,6 +93,7 @@ def test_turns_are_measured(inner: Inner, small_map: DividedMap) -> None:
     nothing: Any = SimpleNamespace(
         free=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None,
         end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
+        unfinished=False, untold=False,
     )  # fmt: skip
     nothing.lost = nothing
     loop = ServingLoop(
@@ -144,6 +145,7 @@ def test_clients_are_served_before_anything_else_is_heard(inner: Inner, small_ma
     nothing: Any = SimpleNamespace(
         free=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None, handle=handle,
         end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
+        unfinished=False, untold=False,
     )  # fmt: skip
     nothing.lost = nothing
     loop = ServingLoop(

@@ -26,8 +26,8 @@ FRONT: Final = 16
 """Segments offered at a time."""
 TRIES: Final = 4
 """How often the front is scored anew for one question, if its scores were outdated."""
-BATCH: Final = 64
-"""Segments scored, or taken back, at a time: half a millisecond, if all their places in the order change."""
+BATCH: Final = 16
+"""Segments scored, or taken back, at a time: 0.1 ms, if all their places in the order change."""
 TOLERANCE: Final = 0.1
 """A score that has changed by a smaller part stays as it is while it is not at the front."""
 _BLOCK: Final = 512
@@ -162,6 +162,8 @@ class EvictionOrder:
         Set aside: somebody needs or maps them.
     new : ShardedDict
         Not scored yet; whatever comes into service is put here.
+    changes : int
+        How often something came or was taken back: there may be more that can go now.
     scored : int
         How many scores were computed so far.
     """
@@ -169,7 +171,7 @@ class EvictionOrder:
     def __init__(self) -> None:
         self.graced = SetAside()
         self.aside = SetAside()
-        self.scored = 0
+        self.scored = self.changes = 0
         self.new: ShardedDict[Resident, float | None] = ShardedDict()
         self._entries: ShardedDict[Resident, _Entry] = ShardedDict()
         self._sorted = _Sorted()
@@ -190,10 +192,11 @@ class EvictionOrder:
 
     def again(self, resident: Resident) -> bool:
         """Somebody who used it says that it does not; whether it had been set aside for that."""
-        entry = self._entries.get(resident)
+        entry, resident.aside_s = self._entries.get(resident), 0.0
         if self.aside.take(resident) or (entry is not None and entry.loose is bool(resident.sessions)):
             self.leave(resident)
             self.new[resident] = None
+            self.changes += 1
             return entry is None
         return False
 
@@ -203,6 +206,7 @@ class EvictionOrder:
         if len(few) > len(many):
             few, many = many, few
         many.update(few)  # however many there are, few of them are touched
+        self.changes += 1
         self.new = many
 
     def set_aside(self, resident: Resident, where: SetAside, until_s: float) -> None:
@@ -210,12 +214,11 @@ class EvictionOrder:
         self.leave(resident)
         where.put(resident, until_s)
 
-    def front(self, score: Score, now_s: float) -> list[Resident]:
-        """Those that should go first, in that order, at most `FRONT`; empty when all are set aside."""
-        for resident in (*self.graced.due(now_s), *self.aside.due(now_s)):
-            self.new[resident] = None
-        if len(self._entries) < FRONT:  # else they wait: many at once cost little more than one
-            self.score_new(score)
+    def front(self, score: Score) -> list[Resident]:
+        """Those that should go first, in that order, at most `FRONT`; empty when all are set aside.
+
+        As far as they have been scored, see `fill`.
+        """
         seen: dict[Resident, None] = {}
         for _ in range(TRIES):
             front = self._sorted.greatest(FRONT)
@@ -231,6 +234,15 @@ class EvictionOrder:
     def settled(self) -> bool:
         """Whether all have been scored."""
         return not self.new
+
+    def fill(self, score: Score, now_s: float) -> bool:
+        """Score some of those that came or may go again if there are few in order; whether there were any."""
+        for resident in (*self.graced.due(now_s), *self.aside.due(now_s)):
+            self.new[resident] = None
+        if len(self._entries) >= FRONT or not self.new:
+            return False  # they wait: many at once cost little more than one
+        self.score_new(score)
+        return True
 
     def score_new(self, score: Score) -> None:
         """Score those that came, a bounded number."""

@@ -14,19 +14,28 @@ from typing import Final
 
 from shmmap.daemon.cache.eviction.eviction_order import BATCH, Score
 from shmmap.daemon.cache.eviction.eviction_policy import EvictionPolicy
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, SHARE_S, Reclaimer
+from shmmap.daemon.cache.reclaimer import (
+    HAND_OUT_GRACE_S,
+    LOOKS_AT_ONCE,
+    SHARE_S,
+    WATCHED_INTERVAL_S,
+    Reclaimer,
+)
 from shmmap.daemon.records import Resident
 
 __all__ = ["Evictor"]
 
 PIN_MEMO_S: Final = 0.2
-"""How long, at least, a segment found pinned is not considered again."""
+"""How long, at least, a segment found pinned is not considered again; longer and longer if the kernel will
+tell when somebody lets go of it."""
 PRESSURE_S: Final = 10.0
 """Scores are kept up to date for so long after somebody needed room."""
-REFRESH_S: Final = 0.01
+REFRESH_S: Final = 0.004
 """How often a few scores are brought up to date."""
 ROUND_S: Final = 2.0
 """How often, at most, those of all segments, a few at a time."""
+WORK_AT_ONCE: Final = 4
+"""Segments looked at by one `free`, 15 us each; to retire one is as much work."""
 PLACES_S: Final = 0.25
 """How often the places of clients that move are taken over."""
 
@@ -47,6 +56,7 @@ class Evictor:
     policy: EvictionPolicy
     evicted_count: int = 0
     wake_s: float = math.inf
+    _waits: tuple[int, float, float] = (-1, -math.inf, -math.inf)  # all is as at so many changes, until then
     _score: Score = field(init=False)
     _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
     _round_version: int = 0
@@ -75,9 +85,15 @@ class Evictor:
         if missing <= 0:
             return True
         self._refresh_until_s = now_s + PRESSURE_S
-        order, looks = ledger.order, 0
+        order, work = ledger.order, 0
+        if rather_than is None and order.changes == self._waits[0] and now_s < self._waits[1]:
+            self.wake_s = self._waits[2]
+            return True
         score = self._scored(now_s, 4.0 * PLACES_S)  # as a rule `turn` has them up to date
-        first = order.front(score, now_s)
+        if order.fill(score, now_s):
+            self.wake_s = now_s
+            return True
+        first = order.front(score)
         if rather_than is not None:
             least, *scores = score.of([rather_than, *first])
             first = [resident for resident, its in zip(first, scores, strict=True) if its > least]
@@ -87,12 +103,12 @@ class Evictor:
                 order.set_aside(resident, order.aside, math.inf)
             elif graced_s > now_s:
                 order.set_aside(resident, order.graced, graced_s)
-            elif looks == LOOKS_AT_ONCE:
+            elif work >= WORK_AT_ONCE:
                 break
+            elif self._found_in_use(resident, now_s):
+                work += 1
             else:
-                looks += 1
-                if self._found_in_use(resident, now_s):
-                    continue
+                work = WORK_AT_ONCE
                 missing -= resident.nbytes
                 self.reclaimer.retire(resident, now_s, "room")
                 self.evicted_count += 1
@@ -117,6 +133,8 @@ class Evictor:
             if ledger.is_needed(resident.key):
                 order.set_aside(resident, order.aside, math.inf)
             elif not self._found_in_use(resident, now_s):
+                aside = order.aside.first()
+                self._waits = order.changes, min(until_s, aside[0] if aside is not None else until_s), until_s
                 self.wake_s = until_s
                 return True
         self.wake_s = now_s
@@ -127,8 +145,9 @@ class Evictor:
         if not self.reclaimer.is_pinned(resident):
             return False
         order = self.reclaimer.ledger.order
-        order.set_aside(resident, order.aside, now_s + max(PIN_MEMO_S, SHARE_S * len(order.aside)))
-        self.reclaimer.pins.tell_once(resident.name)
+        longer_s = 2.0 * resident.aside_s if self.reclaimer.pins.tell_once(resident.name) else 0.0
+        resident.aside_s = min(max(PIN_MEMO_S, longer_s), WATCHED_INTERVAL_S)
+        order.set_aside(resident, order.aside, now_s + max(resident.aside_s, SHARE_S * len(order.aside)))
         return True
 
     # --- keeping the order up to date -----------------------------------------------------------

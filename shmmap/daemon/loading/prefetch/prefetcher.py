@@ -20,7 +20,7 @@ from shmmap.daemon.loading.prefetch.prefetch import URGENT_S, Prefetch
 from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
-from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.transport.sessions import MOVES_AT_ONCE, Session
 
 __all__ = ["Prefetcher"]
 
@@ -31,6 +31,8 @@ MOST_COLD: Final = 1 << 14
 """Cells that were not in memory, of all clients, between two turns; of more the first are forgotten."""
 MOST_ENDED: Final = 1024
 """Loads that ended between two turns; of more the first are forgotten."""
+FOLLOW_S: Final = 0.005
+"""So long moves of a few clients may wait: who asks many times in a row is looked at once."""
 FULL_S: Final = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 
@@ -65,7 +67,7 @@ class Prefetcher:
         self.prefetch = Prefetch(self._is_absent, ride_out_s)
         self._now_s = 0.0
         self._next_s = -math.inf
-        self._full_until_s = -math.inf
+        self._full_until_s = self._followed_s = -math.inf
         self._running: dict[Load, int] = {}
 
     # --- clients ----------------------------------------------------------------------------------
@@ -98,13 +100,15 @@ class Prefetcher:
     @property
     def next_s(self) -> float:
         """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
-        if self._sessions.moved or self.cold or self.ended:
+        if self.cold or self.ended or len(self._sessions.moved) > MOVES_AT_ONCE:
             return -math.inf
-        return self._next_s if self.prefetch.ways else math.inf
+        next_s = self._next_s if self.prefetch.ways else math.inf
+        return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved else next_s
 
     def turn(self, now_s: float) -> None:
         """Follow some clients that moved, and wish for what is needed first of what nobody asks for."""
         self._now_s = now_s
+        self._followed_s = now_s
         for session in self._sessions.follow_moves():
             self._follow(session)
         self._note_late()

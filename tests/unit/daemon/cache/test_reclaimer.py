@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
-from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.eviction.evictor import WORK_AT_ONCE, Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
@@ -68,6 +68,16 @@ class Memory:
     def wait_for_the_thread(self) -> int:
         assert select.select([self.reclaimer.closer.fd], [], [], 10.0)[0]
         return self.reclaimer.collect()
+
+    def until_it_waits(self, shortage: int, now_s: float = 100.0) -> list[int]:
+        """Make room until that is done or there is nothing to do; how many looks were taken each time."""
+        looks = []
+        while True:
+            self.looked()
+            self.evictor.free(shortage, now_s)
+            looks.append(self.looked())
+            if self.evictor.wake_s != now_s:
+                return looks
 
     def looked(self) -> int:
         looks, self.looks = self.looks, 0
@@ -193,34 +203,37 @@ def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
 def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
     """Past whatever is mapped, needed or was just handed out, which is not looked at again and again."""
     memory.ledger.budget_bytes = 0
-    used = memory.publish(2 * LOOKS_AT_ONCE)
+    used = memory.publish(2 * WORK_AT_ONCE)
     mapped = [memory.map(resident) for resident in used]
     needed, free = memory.publish(3), memory.publish(3)
     for number, resident in enumerate((*used, *needed, *free)):
         resident.last_use_s = number / 1e3
     for resident in needed:
         memory.ledger.need(resident.key)
-    for _ in range(2):
-        assert memory.evictor.free(SMALL, NOW_S)
-        assert memory.looked() == LOOKS_AT_ONCE
-        assert memory.evictor.wake_s == NOW_S, "it goes on at once"
-    for expected in free:
-        assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
-        assert list(memory.ledger.retired) == [one.name for one in free[: free.index(expected) + 1]]
-    memory.looked()
-    assert not memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+    missing = len(free) * SMALL
+    looks = memory.until_it_waits(missing)
+    assert sum(looks) == len(used) + 2 * len(free)  # once more when it has another name
+    assert max(looks) == WORK_AT_ONCE
+    assert list(memory.ledger.retired) == [one.name for one in free]
+    assert not memory.evictor.free(missing + SMALL, NOW_S)
     assert memory.looked() == 0, "nothing has changed"
     memory.ledger.need_no_more(needed[0].key)
     mapped[0].close()
     memory.reclaimer.let_go(used[:1], NOW_S)
-    assert memory.evictor.free(memory.ledger.coming_bytes + 2 * SMALL, NOW_S)
+    memory.until_it_waits(memory.ledger.coming_bytes + 2 * SMALL)
     assert {needed[0].name, used[0].name} <= set(memory.ledger.retired)
     needed[1].last_use_s = NOW_S
     memory.ledger.need_no_more(needed[1].key)
-    for _ in range(2):
-        assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+    memory.until_it_waits(memory.ledger.coming_bytes + SMALL)
     assert memory.evictor.wake_s == NOW_S + HAND_OUT_GRACE_S
     assert needed[1].name not in memory.ledger.retired
+    memory.looked()
+    assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+    assert memory.evictor.wake_s == NOW_S + HAND_OUT_GRACE_S
+    assert memory.looked() == 0, "it waits"
+    memory.ledger.need_no_more(needed[2].key)
+    memory.until_it_waits(memory.ledger.coming_bytes + SMALL)
+    assert needed[2].name in memory.ledger.retired, "something has changed"
     for one in mapped:
         one.close()
 
@@ -240,3 +253,34 @@ def test_the_walk_over_all_takes_changes_in_its_stride(memory: Memory) -> None:
         segments.remove(resident)
     for resident in [*memory.ledger.residents()]:
         segments.add(resident)  # as it was
+
+
+def test_what_the_kernel_will_tell_of_is_looked_at_less_and_less(memory: Memory) -> None:
+    """Where it tells nothing, always after the same time."""
+    (one,) = memory.publish(1)
+    mapped, now_s = memory.map(one), NOW_S
+
+    def waits() -> list[float]:
+        """How long it is left alone each time."""
+        nonlocal now_s
+        found = []
+        for _ in range(8):
+            assert sum(memory.until_it_waits(SMALL, now_s)) == 1
+            assert not memory.evictor.free(SMALL, now_s)
+            first = memory.ledger.order.aside.first()
+            assert first is not None
+            found.append(round(first[0] - now_s, 3))
+            now_s = first[0]
+        return found
+
+    longer = [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
+    assert waits() == longer
+    other = memory.map(one)
+    other.close()
+    assert memory.reclaimer.hear(now_s)
+    assert waits() == longer, "the kernel said that somebody let go"
+    memory.pins.tell_once = lambda name: False  # type: ignore[method-assign]  # noqa: ARG005
+    assert waits() == [0.2] * 8
+    mapped.close()
+    memory.until_it_waits(SMALL, now_s)
+    assert one.name in memory.ledger.retired
