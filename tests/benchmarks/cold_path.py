@@ -70,7 +70,7 @@ _CONSUMER = """
 import os, sys
 from pathlib import Path
 import numpy as np
-import shmmap
+from shmmap import connect  # the client's modules, as those that private copies take, before it begins
 from shmmap.layers.contract import BUILT_ANYWHERE
 from shmmap.layers.sources import read_source
 paths = sorted(str(path) for path in Path(sys.argv[1]).glob("**/*.pcd") if path.is_file())
@@ -81,7 +81,7 @@ for line in sys.stdin:
         kept = [read_source(path, BUILT_ANYWHERE, None).points.columns for path in paths]
         clouds = [columns["xyz"] for columns in kept]
     else:
-        client = shmmap.connect(what)
+        client = connect(what)
         kept = client.around(0, 0, radius=500, wait=60.0).raise_for_failures()
         clouds = [cell.xyz for cell in kept]
     total = sum(float(cloud.sum(dtype=np.float64)) for cloud in clouds)

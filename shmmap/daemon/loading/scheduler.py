@@ -134,6 +134,8 @@ class Scheduler:
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
+        if not points and not layers:
+            return False
         if (load := self.loads.next_queued(points=points, layers=layers)) is None:
             return False
         estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)

@@ -157,8 +157,8 @@ class _Worker:
             spec,
             CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
             fd,
-            cache=self.cache,
-            keep=job.layer != LAYER,  # the source itself is as quick to read, and on this disk already
+            cache=self.cache if job.layer != LAYER else None,  # the source is as quick to read
+            keep=True,
             source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )

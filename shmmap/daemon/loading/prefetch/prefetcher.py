@@ -32,7 +32,8 @@ MOST_COLD: Final = 1 << 14
 MOST_ENDED: Final = 1024
 """Loads that ended between two turns; of more the first are forgotten."""
 FOLLOW_S: Final = 0.005
-"""So long moves of a few clients may wait: who asks many times in a row is looked at once."""
+"""So long moves of a few clients may wait, and ended loads while nobody is on a way: of many that follow one
+another all are looked at once."""
 FULL_S: Final = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 
@@ -100,10 +101,11 @@ class Prefetcher:
     @property
     def next_s(self) -> float:
         """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
-        if self.cold or self.ended or len(self._sessions.moved) > MOVES_AT_ONCE:
+        many = len(self._sessions.moved) > MOVES_AT_ONCE
+        if self.cold or many or (self.ended and self.prefetch.ways):
             return -math.inf
         next_s = self._next_s if self.prefetch.ways else math.inf
-        return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved else next_s
+        return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved or self.ended else next_s
 
     def turn(self, now_s: float) -> None:
         """Follow some clients that moved, and wish for what is needed first of what nobody asks for."""
