@@ -158,7 +158,6 @@ class _Worker:
             CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
             fd,
             cache=self.cache if job.layer != LAYER else None,  # the source is as quick to read
-            keep=True,
             source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )

@@ -8,6 +8,7 @@ gauges show what was found, and the next *round* begins.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import islice
@@ -27,7 +28,9 @@ from shmmap.daemon.transport.sessions import Session, Sessions
 __all__ = ["KeepingAhead"]
 
 LOOKS_A_BEAT: Final = 3
-"""Steps along clients' ways at one beat: half a millisecond."""
+LOOKS_S: Final = 0.0003
+"""Most steps along clients' ways at one beat, and time of the processor after which none is begun: around an
+area of very many cells one takes a millisecond."""
 STEP_M: Final = 10.0
 MOST_COUNTED: Final = 1 << 16
 """Cells that are known to be counted in a round; beyond that they may count twice."""
@@ -78,7 +81,10 @@ class KeepingAhead:
         self._look_at_origin(now_s)
         if self._cache.unentered:  # after a reload it takes a moment until what is in memory is found
             return
-        for _ in range(LOOKS_A_BEAT):
+        end_s = time.thread_time() + LOOKS_S
+        for number in range(LOOKS_A_BEAT):
+            if number and time.thread_time() > end_s:
+                return
             current = self._round
             if current is None or current.catalogue is not self._cache.catalogue:
                 first = deque(islice(self._sessions, MOST_WAYS))

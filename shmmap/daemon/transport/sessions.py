@@ -26,7 +26,7 @@ from shmmap.segment.pins import MAX_SLOT
 __all__ = ["MOVES_AT_ONCE", "Session", "Sessions"]
 
 MOVES_AT_ONCE: Final = 4
-"""Sessions whose paths are looked at at a time: less than a millisecond."""
+"""Sessions whose paths are looked at at a time."""
 
 
 @dataclass(eq=False, slots=True)

@@ -11,6 +11,7 @@ from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
 from shmmap.daemon.loading.prefetch.prefetcher import MOST_WAYS
 from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
 from shmmap.daemon.records import Failure, Key
+from shmmap.daemon.telemetry import keeping_ahead
 from shmmap.daemon.telemetry.keeping_ahead import LOOKS_A_BEAT, KeepingAhead
 from shmmap.daemon.transport.sessions import Session
 from shmmap.geometry import Circle
@@ -173,8 +174,12 @@ def test_a_beat_looks_at_a_few_steps_only(one: InnerDaemon, monkeypatch: pytest.
 
     monkeypatch.setattr(WayAhead, "look", counted)
     keeping = KeepingAhead(one.cache, one.scheduler, one.sessions)
+    monkeypatch.setattr(keeping_ahead, "LOOKS_S", -1.0)
     keeping.look(NOW_S)
-    assert len(looks) == LOOKS_A_BEAT
+    assert len(looks) == 1, "it has taken its time"
+    monkeypatch.setattr(keeping_ahead, "LOOKS_S", 60.0)
+    keeping.look(NOW_S)
+    assert len(looks) == 1 + LOOKS_A_BEAT
     while keeping._round is not None:
         keeping.look(NOW_S)
     assert one.statistics.values["moving_clients"] == MOST_WAYS - 1, "one stands"
