@@ -54,6 +54,7 @@ def make_layer(
     fd: int,
     *,
     cache: LayerCache | None = None,
+    keep: bool = False,
     source: Callable[[], CellSource | None] | None = None,
     reserve: Callable[[int], None] | None = None,
 ) -> Made:
@@ -63,8 +64,8 @@ def make_layer(
     ----------
     fd
         Empty file, open for reading and writing; after an error its contents mean nothing.
-    cache
-        Where to look first, and to store what was built.
+    cache, keep
+        Where to look first, and whether to store what was built.
     source
         Returns the cell's points where they are at hand, else None; asked only for computed layers.
     reserve
@@ -98,7 +99,7 @@ def make_layer(
         derived = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
         version = job.version(spec, derived.header.source, derived.neighbours)
         made = Made(derived.header, version, derived.neighbours, derived.warnings)
-    if cache is not None and key is not None:
+    if keep and cache is not None and key is not None:
         _keep(cache, CacheKey(spec, job, made.header.source, made.neighbours), made.header, fd)
     return made
 

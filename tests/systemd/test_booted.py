@@ -158,11 +158,13 @@ def test_a_reload_shows_what_changed(fresh: BootedSystemd, the_map: DividedMap) 
         points = the_map.points("0_0.pcd")
         the_map.write_cell("0_0.pcd", (0, 0), {name: values[:7] for name, values in points.items()})
         fresh.run("systemctl", "reload", "shmmapd")
-        assert fresh.properties("shmmapd")["ActiveState"] == "active"
         # systemd 252 may count the reload as done just before it hears that it began
         waiting = Patience()
         while waiting((after := alice.ask()) == before):
             pass
+        while waiting((state := fresh.properties("shmmapd")["ActiveState"]) == "reloading"):
+            pass
+        assert state == "active"
         assert {name for name in before if before[name] != after[name]} == {"0_0.pcd"}
         assert fresh.properties("shmmapd")["NRestarts"] == "0"
 

@@ -157,7 +157,8 @@ class _Worker:
             spec,
             CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
             fd,
-            cache=self.cache if job.layer != LAYER else None,  # the source is as quick to read
+            cache=self.cache,
+            keep=job.layer != LAYER,  # `shmmap prepare` alone stores the source: it is as quick to read
             source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )

@@ -49,7 +49,7 @@ class Bench:
         """One layer as a loader makes it, and its bytes."""
         fd = os.memfd_create("segment")
         try:
-            made = make_layer(parse_layer(layer), job or self.job, fd, cache=self.cache)
+            made = make_layer(parse_layer(layer), job or self.job, fd, cache=self.cache, keep=True)
             return made, os.pread(fd, os.fstat(fd).st_size, 0)
         finally:
             os.close(fd)
