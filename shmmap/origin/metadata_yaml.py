@@ -23,8 +23,10 @@ _LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 # The parser's time grows with the square of the depth; metadata needs two levels.
 _MAX_DEPTH = 64
+# ... libyaml 0.2.6 refuses a depth of 1000, and may do so before it has reported a first event.
+_TOO_DEEP_FOR_LIBYAML = "exceeded maximum nesting depth"
 
-# ... and with the square of their number; metadata needs none.
+# It grows with the square of the number of tag directives, too; metadata needs none.
 _TAG_DIRECTIVE = re.compile(rb"^%TAG", re.MULTILINE)
 
 
@@ -121,6 +123,8 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
         mark = error.problem_mark or error.context_mark
         if mark is None:
             raise MapDataError(f"no YAML: {error.problem}", path=path, cause="bad_yaml") from error
+        if error.problem == _TOO_DEEP_FOR_LIBYAML:
+            raise refuse("nested too deeply", mark, "bad_yaml") from error
         raise refuse(f"no YAML: {error.problem}", mark, "bad_yaml") from error
     except yaml.YAMLError as error:
         raise MapDataError(f"no YAML: {error}", path=path, cause="bad_yaml") from error

@@ -22,6 +22,7 @@ import shmmap
 from tests.cpp.conftest import DaemonFactory
 from tests.support.cpp_client import FLAGS, SOURCE, CppClient, CppProgram, compiled
 from tests.support.divided_map import DividedMap
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.patience import Patience
 
 LAYERS = (
@@ -77,6 +78,7 @@ def equal_bytes(program: Path, endpoint: str, layers: tuple[str, ...]) -> int:
 def test_every_column_has_the_same_bytes(
     daemon: DaemonFactory, cpp_program: Path, divided_map: DividedMap
 ) -> None:
+    open3d_or_skip()
     assert equal_bytes(cpp_program, daemon(divided_map.root).endpoint, LAYERS) == 36 * 500
 
 

@@ -17,6 +17,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.offered_kinds import install
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.raw_client import DaemonError, RawCells, RawClient, RawHandle, circle, pack_versions
 from tests.support.segment_reader import read_segment
 
@@ -212,6 +213,7 @@ def test_a_kind_of_another_package_with_a_halo(
 
 
 def test_normals_have_no_seam(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    open3d_or_skip()
     client = connect(daemon(divided_map.root))
     name, radius = "0_0.pcd", 4.0
     reply = client.cells_reply(

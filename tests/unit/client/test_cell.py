@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt, StaleHandle
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.process_costs import mappings_under
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def test_dlpack_is_the_same_memory_read_only_or_refused(segments: Segments) -> N
 
 
 def test_open3d_over_the_same_memory(segments: Segments) -> None:
-    o3d = pytest.importorskip("open3d", reason="Open3D is not installed")
+    o3d = open3d_or_skip()
     cell = segments.cell("/map/a.pcd", {**COLUMNS, "intensity": COLUMNS["intensity"].astype(np.float32)})
     cloud = cell.to_open3d()
     assert isinstance(cloud, o3d.t.geometry.PointCloud)

@@ -18,6 +18,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats import cloud
 from shmmap.origin.map_directory import open_map
 from tests.support.clouds import cloud_file, divide_quickly, expected_rows, map_rows, rows_of, xyzircaedt
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.pcd_files import read_pcd
 
 
@@ -76,7 +77,7 @@ def test_autoware_s_loader_reads_it(tmp_path: Path) -> None:
 
 def test_other_readers_read_the_cells(tmp_path: Path) -> None:
     pypcd4 = pytest.importorskip("pypcd4")
-    o3d = pytest.importorskip("open3d")
+    o3d = open3d_or_skip()
     columns = xyzircaedt(1500)
     divide_quickly([cloud_file(tmp_path / "in.pcd", columns)], tmp_path / "map")
     by_time = {row[-1]: row for row in rows_of(columns)}

@@ -19,6 +19,7 @@ from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.las_reader import LasReader
 from tests.support.clouds import map_rows, xyzircaedt
 from tests.support.las_files import write_las
+from tests.support.open3d_package import open3d_or_skip
 
 
 def run(path: Path, out: Path, **options: Any) -> DividedMap:
@@ -82,6 +83,7 @@ def test_names_of_dimensions_that_pcd_does_not_have(tmp_path: Path) -> None:
 
 
 def test_names_of_ply_properties(tmp_path: Path) -> None:
+    open3d_or_skip()
     properties = ["x", "y", "z", "intensity", "xyz", "_"]
     lines = [
         "ply",
@@ -137,7 +139,7 @@ def test_a_las_header_that_lies_about_bounds(tmp_path: Path) -> None:
 
 
 def test_ply_and_xyz_through_open3d(tmp_path: Path) -> None:
-    o3d = pytest.importorskip("open3d")
+    o3d = open3d_or_skip()
     columns = xyzircaedt(800)
     xyz = np.column_stack([columns[axis] for axis in "xyz"])
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(xyz))

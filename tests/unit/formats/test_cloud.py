@@ -18,6 +18,7 @@ from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats import open3d_reader
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_cloud, read_pcd
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.pcd_bytes import Field, column, pcd
 
 PLY = (
@@ -102,7 +103,7 @@ def test_reading_a_pcd_loads_no_open3d() -> None:
     ],
 )
 def test_formats_of_open3d(tmp_path: Path, name: str, data: bytes, columns: list[str]) -> None:
-    pytest.importorskip("open3d", reason="open3d is not installed", exc_type=ImportError)
+    open3d_or_skip()
     path = tmp_path / name
     path.write_bytes(data)
     cloud = read_cloud(path)
@@ -164,7 +165,7 @@ def test_what_is_no_file_is_refused_for_that(tmp_path: Path, name: str) -> None:
 
 
 def test_lines_that_open3d_skips_are_noticed(tmp_path: Path) -> None:
-    pytest.importorskip("open3d", reason="open3d is not installed", exc_type=ImportError)
+    open3d_or_skip()
     path = tmp_path / "a.xyz"
     path.write_bytes(b"1 2 3\n4 5\n6 7 8\n")
     with pytest.raises(MapDataError) as caught:

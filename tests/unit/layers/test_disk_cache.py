@@ -23,6 +23,7 @@ from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.layout import SourceStamp
 from tests.support.divided_map import random_points
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.pcd_files import write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
@@ -200,6 +201,7 @@ def test_an_id_that_needs_a_longer_header_is_built(one: Bench) -> None:
 def test_a_neighbour_that_changes_while_it_is_read_is_built_with_later(
     one: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    open3d_or_skip()
     layer = "normals(radius=5.0)"
     near = one.directory / "near.pcd"
     write_pcd(near, random_points(np.random.default_rng(1), (20, 0), 200))

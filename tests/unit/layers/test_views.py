@@ -14,6 +14,7 @@ from shmmap.layers.build import build_layer
 from shmmap.layers.ground import ground_height
 from shmmap.testing.layer_clouds import CORNERS, corner, surface
 from tests.support.layer_oracles import columns_of, fitted_height, inliers_of, normal_of
+from tests.support.open3d_package import open3d_or_skip
 
 TABLES = [name for name in CORNERS if name != "far_apart"]
 
@@ -79,6 +80,7 @@ def test_crop(name: str) -> None:
 
 @pytest.mark.parametrize("name", CORNERS)
 def test_denoise(name: str) -> None:
+    open3d_or_skip()
     xyz = corner(name, 300)
     halo = corner(name, 300)[::3] + np.array([0.3, 0.2, 0.1], xyz.dtype)
     halo = finite_of(halo)
@@ -95,6 +97,7 @@ def test_denoise(name: str) -> None:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_normals(name: str) -> None:
+    open3d_or_skip()
     xyz = corner(name, 300)
     kept = finite_of(xyz)
     halo = finite_of(corner(name, 300))[::4] + np.array([0.25, 0.5, 0.05], xyz.dtype)

@@ -19,6 +19,7 @@ from shmmap.dividing.frame import Translation
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.open3d_reader import read_with_open3d
 from tests.support.live_drive import RESOLUTION
+from tests.support.open3d_package import open3d_or_skip
 from tests.support.pcd_files import read_pcd
 from tests.support.slow_occupancy import Voxel
 from tests.support.stored_live_map import contents, stored_drive
@@ -142,6 +143,7 @@ def test_far_from_the_origin(
 
 
 def test_others_read_the_ply_file(directory: Path) -> None:
+    open3d_or_skip()
     stored_drive(directory, 2)
     made = exported(directory, "ply")
     assert made is not None
