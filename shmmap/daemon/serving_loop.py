@@ -144,11 +144,10 @@ class ServingLoop:
                 break
 
     def _breathe(self) -> None:
-        """If this turn has taken its time, begin another one: hear who has come, serve one of them, go on."""
+        """If this turn has taken its time, begin another one: hear who has come, serve some, go on."""
         if time.thread_time_ns() - self._turn_began_ns > ENOUGH_NS:
             self._hear(self._poll(0))
-            if (turn := self.inbox.take()) is not None:
-                self._serve_one(turn, time.monotonic())
+            self._serve(ENOUGH_NS * 1e-9)
 
     def _guarded(self, kind: str, call: Callable[..., object], *arguments: object) -> None:
         """Call what must not end the daemon if it fails, unless that happens again and again."""
@@ -175,10 +174,10 @@ class ServingLoop:
         if callback is not None:  # another one's may have ended it
             self._guarded(self.watched.kinds[fd], callback)
 
-    def _serve(self) -> None:
+    def _serve(self, seconds: float = SERVE_S) -> None:
         """Serve those whose turn it is, for a bounded time; between any two of them hear who has come."""
         start_s = time.monotonic()
-        end_s = start_s + SERVE_S
+        end_s = start_s + seconds
         while start_s < end_s and (turn := self.inbox.take()) is not None:
             start_s = self._serve_one(turn, start_s)
             if len(self.inbox):

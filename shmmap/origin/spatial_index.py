@@ -44,6 +44,9 @@ _FEW_ROWS = 128
 # a unit in the last place, 2**-24 of its magnitude; twice that on the box and on the query side.
 _ROUNDING = 2.0**-22
 
+# The square of a shorter distance is 0: to an area test it is none.
+_NO_DISTANCE = 1e-150
+
 # What the rounding of float64 may move the border of a row by, of the magnitude of the grid; generous.
 _ROW_ROUNDING = 2.0**-45
 
@@ -235,7 +238,7 @@ class SpatialIndex:
         if not grids:
             return np.flatnonzero(touches(area, self.boxes))
         min_x, min_y, max_x, max_y = area.bounds
-        slack = _ROUNDING * max(abs(min_x), abs(min_y), abs(max_x), abs(max_y))
+        slack = max(_NO_DISTANCE, _ROUNDING * max(abs(min_x), abs(min_y), abs(max_x), abs(max_y)))
         found, count = [], 0
         for grid in grids:
             begins, ends = grid.runs(area.bounds, slack, area if isinstance(area, Circle) else None)

@@ -35,6 +35,8 @@ MOST_FAILURES: Final = 1 << 14
 LOAD_S: Final = 1e-4
 """What a load is taken to need besides the time for its bytes: many tiny cells are work, too."""
 BYTE_S: Final = 1e-9
+LOOKED_BEHIND: Final = 8
+"""Of each kind so many loads of an asker are looked at to know what room is needed soon."""
 MOST_REMEMBERED: Final = 1024
 """Askers whose clocks are remembered; those forgotten when idle lose a debt of loads that have ended."""
 
@@ -55,9 +57,16 @@ class _Asker:
 
 
 class LoadQueue:
-    """Loads that wait for a worker or for room; one is here from `push` to `discard`."""
+    """Loads that wait for a worker or for room; one is here from `push` to `discard`.
+
+    Attributes
+    ----------
+    changes : int
+        How often a load came, went or was moved forward: another one may be next.
+    """
 
     def __init__(self) -> None:
+        self.changes = 0
         self._loads: dict[int, Load] = {}
         self._askers: dict[Hashable, _Asker] = {}
         self._clock_s = 0.0
@@ -73,17 +82,20 @@ class LoadQueue:
 
     def push(self, load: Load, priority: float, asker: Hashable) -> None:
         """Somebody wants this; asked for again, it is never moved back."""
+        self.changes += load.number not in self._loads
         self._loads[load.number] = load
         mine = self._askers.get(asker)
         if mine is None:
             mine = self._askers[asker] = _Asker(self._clock_s)
         known = mine.best.get(load.number)
         if known is None or priority < known:
+            self.changes += 1
             mine.best[load.number] = priority
             heapq.heappush(mine.heaps[load.computed], (priority, load.number, load))
 
     def discard(self, load: Load) -> None:
         """It does not wait any more."""
+        self.changes += 1
         self._loads.pop(load.number, None)
 
     def started(self, load: Load) -> None:
@@ -120,6 +132,18 @@ class LoadQueue:
         if found is not None:
             self._clock_s = max(self._clock_s, self._askers[self._chosen].clock_s)
         return found
+
+    def bytes_behind(self) -> int:
+        """Estimates, together, of some loads that come after the one that `next` has just found."""
+        chosen = self._askers.get(self._chosen)
+        if chosen is None:
+            return 0
+        return sum(
+            load.estimate
+            for heap in chosen.heaps
+            for _priority, number, load in heap[1:LOOKED_BEHIND]
+            if number in self._loads
+        )
 
     def _is_square(self, mine: _Asker) -> bool:
         """Whether an asker that waits for nothing can be forgotten: nobody else does, or it owes no time."""
@@ -169,6 +193,11 @@ class Loads:
         """How many loads wait for a worker or for room."""
         return len(self._queue)
 
+    @property
+    def changes(self) -> int:
+        """How often it may have changed which load comes next."""
+        return self._queue.changes
+
     def queued_of(self, asker: Hashable) -> int:
         """How many of those somebody asked for."""
         return self._queue.count(asker)
@@ -215,6 +244,10 @@ class Loads:
                 return load
             self._queue.discard(load)  # given up meanwhile
         return None
+
+    def bytes_behind(self) -> int:
+        """Bytes of some loads that come after what `next_queued` has just returned."""
+        return self._queue.bytes_behind()
 
     def start(self, load: Load, now_s: float) -> bool:
         """Reserve the load's bytes and count it as running; False if they do not fit."""

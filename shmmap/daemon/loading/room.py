@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Loads
@@ -15,6 +16,9 @@ from shmmap.daemon.records import Load, Resident
 from shmmap.quantities import format_bytes
 
 __all__ = ["Room"]
+
+AHEAD_SHARE: Final = 32
+"""For loads that come after the next one room is made in this part of the budget at most."""
 
 
 @dataclass(eq=False, slots=True)
@@ -48,8 +52,12 @@ class Room:
         self.cache.reclaimer.let_go(residents, now_s)
         self.loads.forget_refusals()
 
-    def refusal(self, load: Load, shortage: int, now_s: float) -> str:
-        """Make room for a load; why there is none, or nothing where it is on its way."""
+    def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> str:
+        """Make room for a load; why there is none, or nothing where it is on its way.
+
+        What gives way is free a moment later.  At the same time more does, for the loads of ``behind`` bytes
+        that come next: else each of them would have to wait for a moment of its own.
+        """
         ledger = self.cache.ledger
         if load.prefetch:
             has_room = self.prefetcher.make_room(load, shortage, now_s)
@@ -57,7 +65,9 @@ class Room:
         if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
-        if self.cache.evictor.free(shortage, now_s) or self._may_be_given_back():
+        more = min(behind, ledger.budget_bytes // AHEAD_SHARE)
+        free = self.cache.evictor.free
+        if free(shortage + more, now_s) or free(shortage, now_s) or self._may_be_given_back():
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 

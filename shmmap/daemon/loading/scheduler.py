@@ -77,6 +77,7 @@ class Scheduler:
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
         self._job_numbers, self.unfinished = 0, False
+        self._no_room_at: tuple[int, ...] | None = None
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
@@ -133,6 +134,8 @@ class Scheduler:
 
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
+        if self._no_room_at == self._state_of_memory() and now_s < self._cache.evictor.wake_s:
+            return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         if not points and not layers:
             return False
@@ -140,9 +143,11 @@ class Scheduler:
             return False
         estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
         if estimate and shortage > 0:
-            refusal = self.room.refusal(load, shortage, now_s)
+            refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
             if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
+            else:
+                self._no_room_at = self._state_of_memory()
             return bool(refusal)
         if (job := self._job(load, self._job_numbers + 1)) is None:
             self._end(load)
@@ -164,6 +169,11 @@ class Scheduler:
         else:
             self.loads.requeue(load)
         return taken
+
+    def _state_of_memory(self) -> tuple[int, ...]:
+        """What a load that waits for room waits for a change of, until the evictor wakes."""
+        ledger, loads = self._cache.ledger, self.loads
+        return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, loads.changes, len(self._jobs)
 
     def _job(self, load: Load, number: int) -> Job | Check | None:
         """What a worker has to do for a load; None if its cell left the map, or nobody wants it any more."""

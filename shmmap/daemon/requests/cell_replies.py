@@ -23,6 +23,8 @@ MOST_HOLDERS: Final = 16
 """Named beside each cell that does not fit: those who have most."""
 UNNAMED: Final = (Holder(0, 0, -1, "", 0, 0),)
 """Stands for them until they are found out."""
+HELD_A_STEP: Final = 256
+"""Of cells handed out, how many are noted in one turn, 0.1 us each: all that lie around a vehicle."""
 PROMISED: Final = 1e9
 """Priority of a load that only a "pending" speaks of: behind the distances of all that is asked for."""
 
@@ -135,7 +137,7 @@ class CellReplies:
         self.cache.statistics.add("bytes_used", first_used)
         self.cache.used.update(answer.residents)
         self.cache.statistics.add("handles_sent", len(answer.handles))
-        for number, residents in enumerate(parts(answer.residents)):
+        for number, residents in enumerate(parts(answer.residents, HELD_A_STEP)):
             if number:
                 yield
                 if session.connection.session is not session:

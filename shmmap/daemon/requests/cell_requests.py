@@ -21,7 +21,13 @@ from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.cell_replies import Answer, CellReplies
 from shmmap.daemon.requests.differential import lacking, warm_difference
-from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, WaitingList, parts
+from shmmap.daemon.requests.pending_request import (
+    LOADS_A_STEP,
+    MapChanged,
+    PendingRequest,
+    WaitingList,
+    parts,
+)
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, NoSession
@@ -192,9 +198,9 @@ class CellRequests:
     def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
         """Ask for loads; ``note`` which ones, to be told when they end."""
         cache, now_s = self._cache, self._now_s()
-        for number, part in enumerate(parts(cold)):
-            if number:
-                yield from wanted.pause(cache)
+        for part in parts(cold, LOADS_A_STEP):
+            if len(cold) > LOADS_A_STEP:
+                yield from wanted.pause(cache)  # before the first one, too: they were looked for until now
             boxes = cache.catalogue.boxes[np.array([index for index, _ in part], dtype=np.intp)]
             for (index, layer), distance in zip(part, wanted.distances_m(boxes).tolist(), strict=True):
                 key = Key(cache.catalogue.id(index), layer)

@@ -141,6 +141,7 @@ class Sampler:
                 cache.survey.step()
             yield
             self._look_around(now_s)
+            yield
             cache.statistics.show_clients(self._rows.of(self.sessions))
             yield
             for _ in range(USED_ROWS_A_BEAT // ROWS_AT_ONCE):

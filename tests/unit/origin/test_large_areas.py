@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -57,6 +57,7 @@ squares = st.builds(AutowareSquare, number, number, reach)
 boxes = st.builds(lambda x, y, width, height: Box(x, y, x + width, y + height), number, number, reach, reach)
 
 
+@example(Circle(0.0, -1.1125369292536007e-308, 0.0), 0.0)  # the square of the distance is 0
 @given(circles | squares | boxes, st.sampled_from([0.0, -600.0, 89_000.0, 1e7, -1e9]))
 @settings(max_examples=300, deadline=None)
 def test_the_same_cells_as_one_by_one(area: Area, corner: float) -> None:

@@ -22,10 +22,10 @@ from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["BATCH", "FRONT", "EvictionOrder", "Score", "SetAside"]
 
-FRONT: Final = 16
-"""Segments offered at a time."""
+FRONT: Final = 8
+"""Segments offered at a time; when fewer are in order, so many are scored."""
 TRIES: Final = 4
-"""How often the front is scored anew for one question, if its scores were outdated."""
+"""How often the front is scored anew before it is taken as it is, if its scores were outdated."""
 BATCH: Final = 16
 """Segments scored, or taken back, at a time: 0.1 ms, if all their places in the order change."""
 TOLERANCE: Final = 0.1
@@ -176,6 +176,8 @@ class EvictionOrder:
         self._entries: ShardedDict[Resident, _Entry] = ShardedDict()
         self._sorted = _Sorted()
         self._number = 0
+        self._tries = 0
+        self._tried: dict[Resident, None] = {}
 
     def __len__(self) -> int:
         return len(self.new) + len(self._entries) + len(self.graced) + len(self.aside)
@@ -214,21 +216,26 @@ class EvictionOrder:
         self.leave(resident)
         where.put(resident, until_s)
 
-    def front(self, score: Score) -> list[Resident]:
+    def front(self, score: Score) -> list[Resident] | None:
         """Those that should go first, in that order, at most `FRONT`; empty when all are set aside.
 
-        As far as they have been scored, see `fill`.
+        As far as they have been scored, see `fill`.  None if scores at the front were outdated: they were
+        brought up to date, and it is worth asking again.
         """
-        seen: dict[Resident, None] = {}
-        for _ in range(TRIES):
-            front = self._sorted.greatest(FRONT)
-            outdated = [entry.resident for entry in front if entry.is_outdated(score.version)]
-            if not outdated:
-                return [entry.resident for entry in front]
+        front = self._sorted.greatest(FRONT)
+        outdated = [entry.resident for entry in front if entry.is_outdated(score.version)]
+        if outdated:
             self._place(outdated, score)
-            seen.update(dict.fromkeys(outdated))
-        # whatever else there is, these go before most others
-        return [entry.resident for entry in sorted(map(self._entries.__getitem__, seen), reverse=True)]
+            self._tries += 1
+            self._tried.update(dict.fromkeys(outdated))
+            if self._tries < TRIES:
+                return None
+            # whatever else there is, these go before most others
+            tried = [entry for one in self._tried if (entry := self._entries.get(one)) is not None]
+            front = sorted(tried, reverse=True)
+        self._tries = 0
+        self._tried.clear()
+        return [entry.resident for entry in front]
 
     @property
     def settled(self) -> bool:
@@ -241,13 +248,13 @@ class EvictionOrder:
             self.new[resident] = None
         if len(self._entries) >= FRONT or not self.new:
             return False  # they wait: many at once cost little more than one
-        self.score_new(score)
+        self.score_new(score, FRONT)
         return True
 
-    def score_new(self, score: Score) -> None:
+    def score_new(self, score: Score, most: int = BATCH) -> None:
         """Score those that came, a bounded number."""
         if self.new:
-            self._place([self.new.popitem()[0] for _ in range(min(BATCH, len(self.new)))], score)
+            self._place([self.new.popitem()[0] for _ in range(min(most, len(self.new)))], score)
 
     def refresh(self, some: Iterable[Resident], score: Score) -> None:
         """Bring the scores of some segments up to date."""

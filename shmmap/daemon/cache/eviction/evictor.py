@@ -94,6 +94,9 @@ class Evictor:
             self.wake_s = now_s
             return True
         first = order.front(score)
+        if first is None:
+            self.wake_s = now_s
+            return True
         if rather_than is not None:
             least, *scores = score.of([rather_than, *first])
             first = [resident for resident, its in zip(first, scores, strict=True) if its > least]

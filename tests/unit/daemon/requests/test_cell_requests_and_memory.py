@@ -14,6 +14,7 @@ import pytest
 
 from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.cache.reclaimer import LOOKS_AT_ONCE
+from shmmap.daemon.loading.room import AHEAD_SHARE
 from shmmap.daemon.records import Key, Resident
 from shmmap.protocol.messages import (
     Area,
@@ -118,6 +119,30 @@ def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
     one.offset_s += 2.0
     one.ask(other, Selected(3, ("20_20.pcd",), wait=30.0))
     assert names(one.cells_of(3)) == ["20_20.pcd"]
+
+
+def test_room_is_made_for_several_loads_at_once(inner: Inner, tmp_path: Path) -> None:
+    """For those that wait, within a part of the budget; not for each when the one before it has its room."""
+    made = make_map(tmp_path / "many", columns=13, rows=8, points=50)
+    one = inner(made.root)
+    ids = [one.cache.catalogue.id(index) for index in range(104)]
+    reader = one.session()
+    one.ask(reader, Selected(1, tuple(ids[:96]), wait=30.0))
+    assert len(one.cells_of(1).cells) == 96
+    one.cells.let_go(reader.drop(list(reader.held)))
+    (each,) = {resident.nbytes for resident in one.ledger.residents()}
+    estimate = one.cache.estimate(96, "points")
+    budget = one.ledger.budget_bytes = one.ledger.used_bytes
+    one.offset_s += 2.0
+    one.stop_clock()  # what gives way is not free before the clock has gone on
+    one.ask(reader, Selected(2, tuple(ids[96:]), wait=30.0))
+    for _ in range(50):
+        one.turn(0.0)
+    given_up = -(-(estimate + min(7 * estimate, budget // AHEAD_SHARE)) // each)
+    assert one.ledger.condemned_bytes == given_up * each > 2 * estimate
+    one.stopped_at_s = None
+    assert len(one.cells_of(2).cells) == 8
+    assert one.ledger.used_bytes <= budget
 
 
 def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: DividedMap) -> None:

@@ -15,7 +15,7 @@ from tests.support import connections
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner
 
-PARTS = 8
+PARTS = 9
 
 
 def beat(sampler: Sampler, now_s: float) -> int:
