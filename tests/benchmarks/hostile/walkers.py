@@ -19,19 +19,34 @@ INSIDE_M: Final = STEP_M - 21.0
 PATIENCE_S: Final = 900.0
 
 
+def steps(along_m: tuple[float, float]) -> int:
+    """How many steps a walk has along a side of a rectangle."""
+    low, high = along_m
+    return max(1, int((high - low) // STEP_M))
+
+
 def places(x_m: tuple[float, float], y_m: tuple[float, float]) -> Iterator[tuple[float, float]]:
     """Corners of the steps of a walk over a rectangle of the map, row by row, for ever."""
     xs, ys = (
-        [low + 1.0 + STEP_M * number for number in range(max(1, int((high - low) // STEP_M)))]
-        for low, high in (x_m, y_m)
+        [along_m[0] + 1.0 + STEP_M * number for number in range(steps(along_m))] for along_m in (x_m, y_m)
     )
     return itertools.cycle((x, y) for y in ys for x in xs)
 
 
 def walks_cold(
-    orders: Orders, endpoint: str, seconds: float, x_m: tuple[float, float], y_m: tuple[float, float]
+    orders: Orders,
+    endpoint: str,
+    seconds: float,
+    x_m: tuple[float, float],
+    y_m: tuple[float, float],
+    once: bool = False,
 ) -> tuple[int, float]:
     """Walk over a rectangle, ask for 36 cells at each step, and let go of them.
+
+    Parameters
+    ----------
+    once
+        Do not begin again at its end, where cells may still be in memory.
 
     Returns
     -------
@@ -43,7 +58,8 @@ def walks_cold(
     with RawClient(endpoint, name="walks", timeout=PATIENCE_S) as client:
         before = client.ask("stats")[4]["loads_finished"]
         begin_s = time.monotonic()
-        for x, y in places(x_m, y_m):
+        way = places(x_m, y_m)
+        for x, y in itertools.islice(way, steps(x_m) * steps(y_m)) if once else way:
             if time.monotonic() - begin_s > seconds or not orders.go_on():
                 break
             client.area(["box", x, y, x + INSIDE_M, y + INSIDE_M, None, None], wait=60.0)
