@@ -24,7 +24,7 @@ STATES_REMEMBERED: Final = 64
 CELLS_REMEMBERED: Final = 2048
 """Changes of cells, in all states that are remembered; who asks for changes before reads the whole list."""
 SEGMENTS_A_STEP: Final = 16
-ENTRIES_A_STEP: Final = 2048
+ENTRIES_A_STEP: Final = 512
 """Segments looked at, and entries of tables freed, in one turn: less than a millisecond."""
 
 

@@ -24,6 +24,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import SPACE_CODES, Key
 from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.sparse_table import sparse_zeros
 
 __all__ = ["KeepingAhead"]
 
@@ -32,8 +33,8 @@ LOOKS_S: Final = 0.0003
 """Most steps along clients' ways at one beat, and time of the processor after which none is begun: around an
 area of very many cells one takes a millisecond."""
 STEP_M: Final = 10.0
-MOST_COUNTED: Final = 1 << 16
-"""Cells that are known to be counted in a round; beyond that they may count twice."""
+MOST_TABLES: Final = 16
+"""Layers of which it is known which cells are counted in a round; those of further ones may count twice."""
 PASSING_CODES: Final = SPACE_CODES | {"offline", "load_timeout"}
 """Failures that are no matter of the file: a cell that failed otherwise cannot be had, and is not missed."""
 
@@ -43,7 +44,8 @@ class _Round:
     """What was found of the clients looked at so far.
 
     ``needed`` is in loads a second, ``least_s`` the least time for which all is in memory, ``look_ahead_s``
-    the longest that is looked at, ``counted`` the cells and layers that somebody needs.
+    the longest that is looked at, ``counted`` says by layer of each cell whether somebody needs it: a set
+    of as many as many clients need takes ten milliseconds to be freed.
     """
 
     left: deque[Session]
@@ -54,7 +56,18 @@ class _Round:
     needed: float = 0.0
     least_s: float = float("inf")
     look_ahead_s: float = 0.0
-    counted: set[tuple[int, str]] = field(default_factory=set)
+    counted: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    def count(self, index: int, layer: str) -> bool:
+        """Count what somebody needs; whether nobody did before."""
+        table = self.counted.get(layer)
+        if table is None:
+            if len(self.counted) >= MOST_TABLES:
+                return True
+            table = self.counted[layer] = sparse_zeros(len(self.catalogue), np.bool_)
+        is_new = not table[index]
+        table[index] = True
+        return is_new
 
 
 @dataclass(eq=False, slots=True)
@@ -150,11 +163,7 @@ class KeepingAhead:
             way.take()
             for layer in way.layers:
                 looking.found += 1
-                if len(current.counted) < MOST_COUNTED:
-                    looking.new += (index, layer) not in current.counted
-                    current.counted.add((index, layer))
-                else:
-                    looking.new += 1
+                looking.new += current.count(index, layer)
                 if looking.ahead_s is None and self._is_missing(index, layer):
                     looking.ahead_s = needed_in_s
         if way.over:

@@ -93,6 +93,14 @@ def test_what_one_client_needs(one: InnerDaemon) -> None:
     assert told["ahead_ns"] == told["look_ahead_ns"] == 10_000_000_000, "all of it is there"
 
 
+def test_of_very_many_layers_cells_may_count_twice(one: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeping_ahead, "MOST_TABLES", 1)
+    at(one, -30.0, 0.0, layers=("points", "voxel(leaf=1.0)"))
+    alone = gauges(one)["needed_per_1000s"]
+    at(one, -30.0, 0.0, layers=("points", "voxel(leaf=1.0)"))
+    assert gauges(one)["needed_per_1000s"] == pytest.approx(1.5 * alone, abs=1)
+
+
 def test_what_several_need_counts_once(one: InnerDaemon) -> None:
     for _ in range(3):
         at(one, -30.0, 0.0)
