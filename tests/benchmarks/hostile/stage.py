@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import subprocess
@@ -47,6 +48,8 @@ class Stage:
     def __post_init__(self) -> None:
         if self.lifted:
             lift(os.getpid())
+            # the session is the shell's, too: whatever is started from it later would go before its daemons
+            atexit.register(lift, os.getpid(), 0)
 
     def many_cells(self, side: int, points: int = 1) -> Path:
         """Return a map of ``side`` x ``side`` cells, their corner at the origin."""
@@ -93,9 +96,9 @@ class Stage:
                 subprocess.run(["umount", path], check=True)
 
 
-def lift(pid: int) -> None:
-    """Let the session of a process have its processor time before others."""
-    Path(f"/proc/{pid}/autogroup").write_text("-19")
+def lift(pid: int, niceness: int = -19) -> None:
+    """Let the session of a process have its processor time before others; with 0, as others."""
+    Path(f"/proc/{pid}/autogroup").write_text(str(niceness))
 
 
 Play = Callable[[Report, Stage], None]
