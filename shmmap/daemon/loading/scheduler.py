@@ -31,6 +31,8 @@ from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
+ROOM_AGAIN_S: Final = 0.05
+"""A load that waits for room asks again after so long, whether anything has changed or not: a precaution."""
 LOOKS_A_PUMP: Final = 16
 """Loads that one `pump` finds to be of cells that left the map."""
 
@@ -78,6 +80,7 @@ class Scheduler:
         self._doubtful: deque[Key] = deque()
         self._job_numbers, self.unfinished = 0, False
         self._no_room_at: tuple[int, ...] | None = None
+        self._no_room_until_s = 0.0
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
@@ -134,7 +137,8 @@ class Scheduler:
 
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
-        if self._no_room_at == self._state_of_memory() and now_s < self._cache.evictor.wake_s:
+        no_room_until_s = min(self._no_room_until_s, self._cache.evictor.wake_s)
+        if now_s < no_room_until_s and self._no_room_at == self._state_of_memory():
             return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         if not points and not layers:
@@ -147,7 +151,7 @@ class Scheduler:
             if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
             else:
-                self._no_room_at = self._state_of_memory()
+                self._no_room_at, self._no_room_until_s = self._state_of_memory(), now_s + ROOM_AGAIN_S
             return bool(refusal)
         if (job := self._job(load, self._job_numbers + 1)) is None:
             self._end(load)

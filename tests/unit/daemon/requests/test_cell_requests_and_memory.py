@@ -14,8 +14,8 @@ import pytest
 
 from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.cache.reclaimer import LOOKS_AT_ONCE
-from shmmap.daemon.loading.room import AHEAD_SHARE
-from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.loading.room import AHEAD_SHARE, Room
+from shmmap.daemon.records import Key, Load, Resident
 from shmmap.protocol.messages import (
     Area,
     CircleMessage,
@@ -121,7 +121,9 @@ def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
     assert names(one.cells_of(3)) == ["20_20.pcd"]
 
 
-def test_room_is_made_for_several_loads_at_once(inner: Inner, tmp_path: Path) -> None:
+def test_room_is_made_for_several_loads_at_once(
+    inner: Inner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """For those that wait, within a part of the budget; not for each when the one before it has its room."""
     made = make_map(tmp_path / "many", columns=13, rows=8, points=50)
     one = inner(made.root)
@@ -140,6 +142,17 @@ def test_room_is_made_for_several_loads_at_once(inner: Inner, tmp_path: Path) ->
         one.turn(0.0)
     given_up = -(-(estimate + min(7 * estimate, budget // AHEAD_SHARE)) // each)
     assert one.ledger.condemned_bytes == given_up * each > 2 * estimate
+    asked: list[Load] = []
+    refusal = Room.refusal
+
+    def noted(room: Room, load: Load, shortage: int, behind: int, now_s: float) -> str:
+        asked.append(load)
+        return refusal(room, load, shortage, behind, now_s)
+
+    monkeypatch.setattr(Room, "refusal", noted)
+    for _ in range(50):
+        one.turn(0.0)
+    assert asked == [], "nothing has changed"
     one.stopped_at_s = None
     assert len(one.cells_of(2).cells) == 8
     assert one.ledger.used_bytes <= budget
