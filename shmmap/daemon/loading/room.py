@@ -19,6 +19,8 @@ __all__ = ["Room"]
 
 AHEAD_SHARE: Final = 32
 """For loads that come after the next one room is made in this part of the budget at most."""
+AGAIN_S: Final = 0.05
+"""A load that waits for room asks again after so long, whether anything has changed or not: a precaution."""
 
 
 @dataclass(eq=False, slots=True)
@@ -36,6 +38,8 @@ class Room:
     pool: WorkerPool
     prefetcher: Prefetcher
     hungry: dict[int, tuple[Worker, int]] = field(default_factory=dict)
+    _waited_at: tuple[int, ...] = ()
+    _waited_until_s: float = 0.0
 
     def hear_of_closes(self, now_s: float) -> None:
         """The kernel reports that segments were closed."""
@@ -70,6 +74,21 @@ class Room:
         if free(shortage + more, now_s) or free(shortage, now_s) or self._may_be_given_back():
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
+
+    def wait(self, running: int, now_s: float) -> bool:
+        """The load that comes next waits for room, while so many loads are ``running``; returns True."""
+        self._waited_at, self._waited_until_s = self._state(running), now_s + AGAIN_S
+        return True
+
+    def is_waited_for(self, running: int, now_s: float) -> bool:
+        """Whether a load waits for room, and nothing has changed since it began to."""
+        until_s = min(self._waited_until_s, self.cache.evictor.wake_s)
+        return now_s < until_s and self._waited_at == self._state(running)
+
+    def _state(self, running: int) -> tuple[int, ...]:
+        """Another one whenever there may be room, or another load comes next."""
+        ledger = self.cache.ledger
+        return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, self.loads.changes, running
 
     def ask(self, worker: Worker, message: Need) -> None:
         """A worker needs more than was reserved, and waits for `feed`."""

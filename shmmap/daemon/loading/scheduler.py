@@ -2,8 +2,7 @@
 """Loads from the queue to their end: room is made, a worker is given the job, its word is heard.
 
 Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is replaced,
-and the jobs behind the one it died of go back into the queue.  A segment of an earlier life of the daemon is
-checked by a worker before it is handed out, so is the file of a cell that failed: a look may take long.
+and the jobs behind the one it died of go back into the queue.  A look at a file is a worker's, too.
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]
 
-ROOM_AGAIN_S: Final = 0.05
-"""A load that waits for room asks again after so long, whether anything has changed or not: a precaution."""
 LOOKS_A_PUMP: Final = 16
 """Loads that one `pump` finds to be of cells that left the map."""
 
@@ -69,18 +66,14 @@ class Scheduler:
         prefetch_share: float = 0.0,
         ride_out_s: float = 0.0,
     ) -> None:
-        self._cache = cache
-        self._map_switch = map_switch
-        self._statistics = cache.statistics
+        self._cache, self._map_switch, self._statistics = cache, map_switch, cache.statistics
         self.loads = Loads(cache.ledger)
         self.pool = pool
         pool.on_message = lambda worker: self.on_worker(worker, clock())
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
-        self._job_numbers, self.unfinished = 0, False
-        self._no_room_at: tuple[int, ...] | None = None
-        self._no_room_until_s = 0.0
+        self._job_numbers, self.unfinished, self._one_waits = 0, False, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
@@ -137,21 +130,18 @@ class Scheduler:
 
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
-        no_room_until_s = min(self._no_room_until_s, self._cache.evictor.wake_s)
-        if now_s < no_room_until_s and self._no_room_at == self._state_of_memory():
+        if self._one_waits and self.room.is_waited_for(len(self._jobs), now_s):
             return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
-        if not points and not layers:
-            return False
-        if (load := self.loads.next_queued(points=points, layers=layers)) is None:
+        load = self.loads.next_queued(points=points, layers=layers) if points or layers else None
+        if load is None:
             return False
         estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
         if estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
+            self._one_waits = not refusal and self.room.wait(len(self._jobs), now_s)
             if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
-            else:
-                self._no_room_at, self._no_room_until_s = self._state_of_memory(), now_s + ROOM_AGAIN_S
             return bool(refusal)
         if (job := self._job(load, self._job_numbers + 1)) is None:
             self._end(load)
@@ -173,11 +163,6 @@ class Scheduler:
         else:
             self.loads.requeue(load)
         return taken
-
-    def _state_of_memory(self) -> tuple[int, ...]:
-        """What a load that waits for room waits for a change of, until the evictor wakes."""
-        ledger, loads = self._cache.ledger, self.loads
-        return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, loads.changes, len(self._jobs)
 
     def _job(self, load: Load, number: int) -> Job | Check | None:
         """What a worker has to do for a load; None if its cell left the map, or nobody wants it any more."""
