@@ -31,6 +31,8 @@ class Room:
     ----------
     hungry : dict
         Per job number, the worker that waits for more room, and how many bytes it needs in all.
+    waited_for : bool
+        Whether the load that comes next waits for room, as far as is known.
     """
 
     cache: CellCache
@@ -38,6 +40,7 @@ class Room:
     pool: WorkerPool
     prefetcher: Prefetcher
     hungry: dict[int, tuple[Worker, int]] = field(default_factory=dict)
+    waited_for: bool = False
     _waited_at: tuple[int, ...] = ()
     _waited_until_s: float = 0.0
 
@@ -75,15 +78,16 @@ class Room:
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
-    def wait(self, running: int, now_s: float) -> bool:
-        """The load that comes next waits for room, while so many loads are ``running``; returns True."""
+    def wait(self, running: int, now_s: float) -> None:
+        """The load that comes next waits for room, while so many loads are ``running``."""
+        self.waited_for = True
         self._waited_at, self._waited_until_s = self._state(running), now_s + AGAIN_S
-        return True
 
-    def is_waited_for(self, running: int, now_s: float) -> bool:
-        """Whether a load waits for room, and nothing has changed since it began to."""
+    def still_waited_for(self, running: int, now_s: float) -> bool:
+        """Whether nothing has changed since a load began to wait; else it is worth another try."""
         until_s = min(self._waited_until_s, self.cache.evictor.wake_s)
-        return now_s < until_s and self._waited_at == self._state(running)
+        self.waited_for = now_s < until_s and self._waited_at == self._state(running)
+        return self.waited_for
 
     def _state(self, running: int) -> tuple[int, ...]:
         """Another one whenever there may be room, or another load comes next."""

@@ -73,7 +73,7 @@ class Scheduler:
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
-        self._job_numbers, self.unfinished, self._one_waits = 0, False, False
+        self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
@@ -130,7 +130,7 @@ class Scheduler:
 
     def _hand_out_one(self, now_s: float) -> bool:
         """See to the load that comes next; False if there is none, or it has to wait."""
-        if self._one_waits and self.room.is_waited_for(len(self._jobs), now_s):
+        if self.room.waited_for and self.room.still_waited_for(len(self._jobs), now_s):
             return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         load = self.loads.next_queued(points=points, layers=layers) if points or layers else None
@@ -139,9 +139,10 @@ class Scheduler:
         estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
         if estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
-            self._one_waits = not refusal and self.room.wait(len(self._jobs), now_s)
             if refusal:
                 self._fail(load, "over_budget", refusal, None, now_s)
+            else:
+                self.room.wait(len(self._jobs), now_s)
             return bool(refusal)
         if (job := self._job(load, self._job_numbers + 1)) is None:
             self._end(load)

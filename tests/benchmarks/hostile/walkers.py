@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator
 from typing import Final
 
 from tests.benchmarks.hostile.actors import Orders
@@ -19,18 +18,13 @@ INSIDE_M: Final = STEP_M - 21.0
 PATIENCE_S: Final = 900.0
 
 
-def steps(along_m: tuple[float, float]) -> int:
-    """How many steps a walk has along a side of a rectangle."""
-    low, high = along_m
-    return max(1, int((high - low) // STEP_M))
-
-
-def places(x_m: tuple[float, float], y_m: tuple[float, float]) -> Iterator[tuple[float, float]]:
-    """Corners of the steps of a walk over a rectangle of the map, row by row, for ever."""
+def places(x_m: tuple[float, float], y_m: tuple[float, float]) -> list[tuple[float, float]]:
+    """Corners of the steps of a walk over a rectangle of the map, row by row."""
     xs, ys = (
-        [along_m[0] + 1.0 + STEP_M * number for number in range(steps(along_m))] for along_m in (x_m, y_m)
+        [low + 1.0 + STEP_M * number for number in range(max(1, int((high - low) // STEP_M)))]
+        for low, high in (x_m, y_m)
     )
-    return itertools.cycle((x, y) for y in ys for x in xs)
+    return [(x, y) for y in ys for x in xs]
 
 
 def walks_cold(
@@ -59,7 +53,7 @@ def walks_cold(
         before = client.ask("stats")[4]["loads_finished"]
         begin_s = time.monotonic()
         way = places(x_m, y_m)
-        for x, y in itertools.islice(way, steps(x_m) * steps(y_m)) if once else way:
+        for x, y in way if once else itertools.cycle(way):
             if time.monotonic() - begin_s > seconds or not orders.go_on():
                 break
             client.area(["box", x, y, x + INSIDE_M, y + INSIDE_M, None, None], wait=60.0)
