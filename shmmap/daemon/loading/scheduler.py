@@ -2,7 +2,7 @@
 """Loads from the queue to their end: room is made, a worker is given the job, its word is heard.
 
 Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is replaced,
-and the jobs behind the one it died of go back into the queue.  Only workers look at files: that may take long.
+and the jobs behind the one it died of go back into the queue.  Only workers look at files: it may take long.
 """
 
 from __future__ import annotations
