@@ -91,8 +91,6 @@ ROOMS = [
     {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"}, {"config_file", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
-MOST_MODULES = 12
-MOST_LINES = 350
 
 CLIENT_PACKAGES = {"numpy", "zmq", "posix_ipc", "msgspec"}
 HEAVY = {"open3d", "numba", "laspy", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
@@ -172,16 +170,6 @@ def test_no_imports_in_a_circle() -> None:
         for module in free:
             del left[module]
     assert not left, f"these import one another: {sorted(left)}"
-
-
-def test_modules_and_folders_are_small() -> None:
-    for root in (PACKAGE, CLIENTS):
-        for path in root.rglob("*.py"):
-            lines = path.read_text(encoding="utf-8").count("\n")
-            assert lines <= MOST_LINES, f"{path.relative_to(root)} has {lines} lines: is it one concept?"
-    for folder in [PACKAGE / "daemon", *(path.parent for path in (PACKAGE / "daemon").rglob("__init__.py"))]:
-        count = len([path for path in folder.glob("*.py") if not path.name.startswith("__")])
-        assert count <= MOST_MODULES, f"{folder.relative_to(PACKAGE)} has {count} modules: is it one concept?"
 
 
 @pytest.mark.parametrize("module", modules(CLIENTS))
