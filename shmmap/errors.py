@@ -76,6 +76,7 @@ __all__ = [
     "SegmentCorrupt",
     "SegmentError",
     "ShmmapError",
+    "ShmmapWarning",
     "SocketPermission",
     "StaleHandle",
     "StaleSocket",
@@ -104,6 +105,10 @@ class ShmmapError(Exception):
 
     def __str__(self) -> str:
         return f"{self.message} ({self.hint})" if self.hint else self.message
+
+
+class ShmmapWarning(UserWarning):
+    """A result is less than what was asked for, or contradicts itself; the text says what and why."""
 
 
 class ConfigError(ShmmapError):
