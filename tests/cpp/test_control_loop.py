@@ -105,12 +105,12 @@ def test_a_daemon_that_comes_later(
     assert loop.close() == 0
 
 
-def killed(one: DaemonProcess) -> Callable[[], None]:
+def killed(one: DaemonProcess) -> Callable[[], object]:
     one.kill()
-    return lambda: one.start() and None
+    return one.start
 
 
-def stopped(one: DaemonProcess) -> Callable[[], None]:
+def stopped(one: DaemonProcess) -> Callable[[], object]:
     one.send(signal.SIGSTOP)
     return lambda: one.send(signal.SIGCONT)
 
@@ -122,7 +122,7 @@ def test_no_call_of_the_kernel_may_wait_longer(
     divided_map: DividedMap,
     loop_program: Path,
     tmp_path: Path,
-    trouble: Callable[[DaemonProcess], Callable[[], None]],
+    trouble: Callable[[DaemonProcess], Callable[[], object]],
 ) -> None:
     """Whatever can wait, waits at most 20 ms; and no call waits that does not say how long."""
     one = daemon(divided_map.root)
