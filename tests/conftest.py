@@ -10,6 +10,7 @@ import signal
 import tempfile
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from shmmap.kernel_cache import compiled_mark
@@ -29,11 +30,15 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         # a shell's background job ignores SIGINT, and so would the programs it starts for the tests
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    # how long an example takes is for the machine to say
+    hypothesis.settings.register_profile("shmmap", deadline=None)
+    hypothesis.settings.load_profile("shmmap")
     if "NUMBA_CACHE_DIR" not in os.environ:
         cache = getattr(config, "cache", None)
         path = (
             cache.mkdir("kernels") if cache is not None else Path(tempfile.mkdtemp(prefix="shmmap-kernels-"))
         )
+        path.chmod(0o700)  # whatever the umask is: who else could write there is not trusted
         os.environ["NUMBA_CACHE_DIR"] = str(path)
         if (mark := compiled_mark()) is not None:
             mark.touch()  # no daemon of a test compiles what nobody asks it for
