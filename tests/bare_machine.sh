@@ -29,7 +29,9 @@ user=newcomer
 
 if [ ! -e "$machine/etc/shmmap-is-bare" ]; then
   rm -rf "$machine"
-  debootstrap --variant=minbase --include=ca-certificates "$suite" "$machine" "${BARE_MIRROR:-http://deb.debian.org/debian}" \
+  script=/usr/share/debootstrap/scripts/$suite
+  [ -e "$script" ] || script=${script%/*}/sid # newer than this debootstrap
+  debootstrap --variant=minbase --include=ca-certificates "$suite" "$machine" "${BARE_MIRROR:-http://deb.debian.org/debian}" "$script" \
     >"$machine.log" 2>&1 || { tail -n 5 "$machine.log" >&2; exit 1; }
   chroot "$machine" useradd --create-home --shell /bin/bash "$user"
   touch "$machine/etc/shmmap-is-bare"

@@ -17,6 +17,7 @@ from shmmap.kernel_cache import compiled_mark
 from tests.support.built_once import built_once
 from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
+    NEEDS_ROOT,
     pytest_collectreport,
     pytest_runtest_logreport,
     pytest_sessionfinish,
@@ -57,7 +58,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if os.geteuid() != 0:
         for item in items:
             if item.get_closest_marker("root"):
-                item.add_marker(pytest.mark.skip(reason="needs root (other user accounts, private tmpfs)"))
+                item.add_marker(pytest.mark.skip(reason=NEEDS_ROOT))
 
 
 def pytest_collection_finish() -> None:
