@@ -77,6 +77,18 @@ def data_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
+def layer_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Have the kernels of layers compiled before a daemon needs them: there a load has a deadline."""
+
+    def compile_them(_folder: Path) -> None:
+        from shmmap.layers import height_kernels, lattice_kernels, ndt_kernels
+
+        del height_kernels, lattice_kernels, ndt_kernels  # they are compiled as they are imported
+
+    built_once(tmp_path_factory, "layer_kernels", compile_them)
+
+
+@pytest.fixture(scope="session")
 def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the client in C++, compiled once for all processes of the tests; needs g++."""
     if shutil.which("g++") is None:
