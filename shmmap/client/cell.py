@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
 from shmmap.protocol.messages import Handle
-from shmmap.segment.attach import AttachedSegment
+from shmmap.segment.attach import AttachedSegment, attach_writable
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
 
 if TYPE_CHECKING:
@@ -17,7 +17,19 @@ if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
-__all__ = ["Cell"]
+__all__ = ["Access", "Cell"]
+
+
+class Access(NamedTuple):
+    """How this process gets at a daemon's segments.
+
+    ``shm_dir`` is their directory, ``slot`` the session whose use of them the daemon sees, ``owner`` the user
+    they must belong to, None where that is not known.
+    """
+
+    shm_dir: str
+    slot: int | None
+    owner: int | None
 
 
 class Cell:
@@ -54,6 +66,7 @@ class Cell:
 
     __slots__ = (
         "__weakref__",
+        "_access",
         "_attached",
         "_views",
         "box",
@@ -68,7 +81,9 @@ class Cell:
         "version",
     )
 
-    def __init__(self, cell_id: str, segment: str, handle: Handle, attached: AttachedSegment) -> None:
+    def __init__(
+        self, cell_id: str, segment: str, handle: Handle, attached: AttachedSegment, access: Access | None
+    ) -> None:
         self.id = cell_id
         self.name = handle.id
         self.version = handle.version
@@ -80,6 +95,7 @@ class Cell:
         self.offset = handle.offset
         self.nbytes = handle.bytes
         self._attached = attached
+        self._access = access  # None: memory of this process
         self._views: dict[str, NDArray[Any]] = {}
 
     def __repr__(self) -> str:
@@ -192,25 +208,42 @@ class Cell:
         """
         self._attached.verify()
 
-    # --- other libraries, over the same memory ----------------------------------------------------
+    # --- other libraries ------------------------------------------------------------------------
 
     def to_open3d(self) -> open3d.t.geometry.PointCloud:
-        """Return an Open3D tensor point cloud over the same memory.
+        """Return an Open3D tensor point cloud over the cell's memory, which may be written.
 
         ``xyz`` is its ``positions``; every other column is an attribute of its own name, (N, 1) or
-        (N, k).  Open3D does not know read-only memory: **writing through the result ends the
-        process** (SIGSEGV).  ``.clone()`` makes a private copy.
+        (N, k).  Nothing is copied to be read.  What is written becomes memory of this process, 4 KiB at a
+        time, and shows in this result alone: the cell, other results and other processes keep their bytes.
+
+        Raises
+        ------
+        LimitReached
+            There is no room for another mapping, and no memory for a copy.
         """
         from shmmap.client.wrapping import open3d_cloud
 
-        return open3d_cloud(self.columns)
+        return open3d_cloud(self._writable())
 
     def to_torch(self) -> dict[str, torch.Tensor]:
-        """Return torch tensors by column name over the same memory.
+        """Return torch tensors by column name over the cell's memory, which may be written.
 
-        Torch does not know read-only memory: **writing through a tensor ends the process**
-        (SIGSEGV).  ``.clone()`` makes a private copy.
+        As for `to_open3d`, what is written shows in this result alone.  (``torch.from_numpy(cell.xyz)`` would
+        be over the shared memory itself, where writing ends the process.)
+
+        Raises
+        ------
+        LimitReached
+            There is no room for another mapping, and no memory for a copy.
         """
         from shmmap.client.wrapping import torch_tensors
 
-        return torch_tensors(self.columns)
+        return torch_tensors(self._writable())
+
+    def _writable(self) -> Mapping[str, NDArray[Any]]:
+        """Return the columns over memory that may be written without anybody else's seeing it."""
+        segment = self._attached
+        if self._access is not None:
+            segment = attach_writable(segment, self.segment, offset=self.offset, shm_dir=self._access.shm_dir)
+        return {row[0]: segment.column(index) for index, row in enumerate(segment.columns)}

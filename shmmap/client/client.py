@@ -10,7 +10,6 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Final
 
 from shmmap import geometry
-from shmmap.client.attaching import Unmapper
 from shmmap.client.cell_set import CellSet
 from shmmap.client.discovery import candidates
 from shmmap.client.held import Held, HeldCells
@@ -115,11 +114,6 @@ class Client(OperatorRequests):
     def session(self) -> Session:
         """What its requests share; for windows."""
         return self._session
-
-    @property
-    def unmapper(self) -> Unmapper:
-        """Where this client's mappings go when their last view is gone."""
-        return self._session.attacher.unmapper
 
     # --- cells ------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from shmmap.client.answer import Answer
 from shmmap.client.attaching import Attacher
-from shmmap.client.cell import Cell
+from shmmap.client.cell import Access, Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
 from shmmap.client.turn import Turn, check_not_within, out_of_time
@@ -73,8 +73,8 @@ class Session:
         self._shm_dir = shm_dir
         self._lock = threading.Lock()
         self._closed = False
-        self._owner_epoch = 0
-        self._owner: int | None = None
+        self._access_epoch = 0
+        self._access: Access | None = None
         self._waiting: list[SimpleQueue[Any]] = []
         self._inherited: list[Connection] = []
         self._connection: Connection | None = None
@@ -251,16 +251,17 @@ class Session:
 
     def _attach(self, handle: Handle, connection: Connection, populate: bool) -> Cell:
         welcome = connection.welcome
-        if welcome.epoch != self._owner_epoch:
-            self._owner_epoch = welcome.epoch
-            self._owner = owner_of_segments(self._shm_dir or welcome.shm_dir, welcome.segment_prefix)
+        access = self._access
+        if access is None or welcome.epoch != self._access_epoch:
+            shm_dir = self._shm_dir or welcome.shm_dir
+            owner = owner_of_segments(shm_dir, welcome.segment_prefix)
+            self._access = access = Access(shm_dir, welcome.session, owner)
+            self._access_epoch = welcome.epoch
         return self.attacher.attach(
             handle,
             handle.id if handle.id.startswith("/") else welcome.id_prefix + handle.id,
             welcome.segment_prefix + handle.segment,
-            shm_dir=self._shm_dir or welcome.shm_dir,
-            slot=welcome.session,
-            owner=self._owner,
+            access,
             populate=populate,
         )
 

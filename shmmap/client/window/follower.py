@@ -67,7 +67,6 @@ class WindowFollower:
         self.owner = weakref.ref(owner)
         self._refresher = refresher
         self._session = session
-        self._unmapper = session.attacher.unmapper
         self._update_distance = update_distance
         self._refresh_interval_s = refresh_interval_s
         self._mailbox: SimpleQueue[Owned | None] = SimpleQueue()
@@ -83,7 +82,7 @@ class WindowFollower:
         self.state = EMPTY
         self.error: ShmmapError | None = None
         self.stale_since: float | None = None
-        self._unmapper.defer_to(self._mailbox)
+        session.attacher.unmap_in(self._mailbox)
         session.tell_when_lost(self._mailbox)
         self._thread = 0
         _thread.start_new_thread(self._run, ())
@@ -176,7 +175,7 @@ class WindowFollower:
             raise
         finally:
             self._session.stop_telling(self._mailbox)
-            self._unmapper.stop_deferring(self._mailbox)
+            self._session.attacher.stop_unmapping_in(self._mailbox)
             running.discard(self)
             self._ended = True
             self._over.put(None)
