@@ -317,6 +317,8 @@ def connect(
         Why no daemon can be reached; all of them are `DaemonUnreachable`.
     ProtocolMismatch
         Who listens is no shmmap daemon, or one of another major version.
+    LimitReached
+        This process may not have the descriptors or threads that are needed.
     BadRequest
         The endpoint cannot be a socket path.
     """

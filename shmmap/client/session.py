@@ -19,7 +19,7 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
-from shmmap.client.turn import Turn, check_not_within, out_of_time
+from shmmap.client.turn import Turn, check_not_within, closed, out_of_time
 from shmmap.client.visible import check_visible, owner_of_segments, statistics_path
 from shmmap.errors import BadRequest
 from shmmap.failpoints import step
@@ -144,7 +144,7 @@ class Session:
             with Turn(self._lock, timeout_s):  # type: ignore[misc]
                 entered = True
                 if self._closed:
-                    raise BadRequest("this client is closed", hint="connect again")
+                    raise closed("client", "connect again")
                 connection = self._connection or self._connect()
                 self._tell_unmapped(connection)
                 return work(connection)

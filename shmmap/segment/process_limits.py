@@ -2,7 +2,7 @@
 """What a process may have no more of: descriptors, threads, memory; the limit is named with its value.
 
 libzmq ends the process where it gets no descriptor or thread (``epoll.cpp``, ``thread.cpp``), so whether
-there are enough is found out before, by taking them for a moment.  What is read here needs neither.
+there are enough is found out before, by taking them for a moment.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ def no_files_left(error: Exception, what: str = "") -> LimitReached | None:
             hint="close some, or raise it: sysctl fs.file-max",
         )
     if number == errno.EMFILE or (number is None and _may_open_none()):
+        most = os.sysconf("SC_OPEN_MAX")  # as `resource` says, which would have to be loaded from a file
         return LimitReached(
-            f"{what}this process has as many files open as it may, {_limit('SC_OPEN_MAX')} (RLIMIT_NOFILE)",
+            f"{what}this process has as many files open as it may, {most} (RLIMIT_NOFILE)",
             hint="close some, or raise the limit: ulimit -n, in a unit LimitNOFILE=",
         )
     return None
@@ -102,12 +103,15 @@ def check_threads(count: int, what: str) -> None:
 
 def no_threads_left(what: str = "") -> LimitReached:
     """Return the error that names what limits threads, and how far each limit is."""
-    limits = [f"{_limit('SC_CHILD_MAX')} processes and threads of this user (RLIMIT_NPROC)"]
+    limits = []
+    if (most := os.sysconf("SC_CHILD_MAX")) >= 0:
+        limits.append(f"{most} processes and threads of this user (RLIMIT_NPROC)")
     if (group := _group_limit()) is not None:
         limits.append(group)
-    limits.append(f"{_address_space()} of address space (RLIMIT_AS)")
+    limits += _memory_limits()
+    named = ", ".join(limits) or "those of the machine (kernel.threads-max)"
     return LimitReached(
-        f"{what}this process may have no more: the limits are {', '.join(limits)}",
+        f"{what}the limits of this process are {named}",
         hint="end some, or raise the limit: ulimit -u, in a unit LimitNPROC= or TasksMax=",
     )
 
@@ -129,28 +133,20 @@ def _group_limit() -> str | None:
     return None
 
 
-def _limit(name: str) -> str:
-    value = os.sysconf(name)  # as `resource`, which would have to be loaded from a file
-    return "without limit" if value < 0 else str(value)
-
-
-def _address_space() -> str:
-    import resource
-
-    most = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return "without limit" if most == resource.RLIM_INFINITY else f"{most >> 20} MiB"
-
-
 def no_memory_left(nbytes: int) -> LimitReached:
     """Return the error of a process that gets no more memory of its own, with what limits it."""
-    import resource
-
-    limits = [
-        f"{name} {most >> 20} MiB"
-        for name in ("RLIMIT_DATA", "RLIMIT_AS")
-        if (most := resource.getrlimit(getattr(resource, name))[0]) != resource.RLIM_INFINITY
-    ]
+    limits = ", ".join(_memory_limits()) or "no limit is set"
     return LimitReached(
-        f"{nbytes} bytes of private memory are not to be had ({', '.join(limits) or 'no limit is set'})",
+        f"{nbytes} bytes of private memory are not to be had ({limits})",
         hint="raise the limit: ulimit -d and -v, or free memory",
     )
+
+
+def _memory_limits() -> list[str]:
+    import resource
+
+    limits = {
+        "data (RLIMIT_DATA)": resource.getrlimit(resource.RLIMIT_DATA)[0],
+        "address space (RLIMIT_AS)": resource.getrlimit(resource.RLIMIT_AS)[0],
+    }
+    return [f"{most >> 20} MiB of {name}" for name, most in limits.items() if most != resource.RLIM_INFINITY]

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Final
 
+from shmmap.client.connection_watch import start_thread
 from shmmap.client.orphans import running
 from shmmap.client.session import Session
 from shmmap.client.window.refresh import WindowRefresher
@@ -21,6 +22,7 @@ from shmmap.client.window.state import EMPTY, WindowState, moved
 from shmmap.errors import BadRequest, InternalError, ShmmapError
 from shmmap.protocol.messages import Intent
 from shmmap.segment.owned import Owned
+from shmmap.segment.process_limits import no_files_left
 
 __all__ = ["PENDING_WAIT_S", "WindowFollower"]
 
@@ -85,7 +87,12 @@ class WindowFollower:
         session.attacher.unmap_in(self._mailbox)
         session.tell_when_lost(self._mailbox)
         self._thread = 0
-        _thread.start_new_thread(self._run, ())
+        try:
+            start_thread(self._run)
+        except BaseException:
+            session.stop_telling(self._mailbox)
+            session.attacher.stop_unmapping_in(self._mailbox)
+            raise
 
     @property
     def _elsewhere(self) -> bool:
@@ -207,6 +214,12 @@ class WindowFollower:
             state, progress = self._refresher.refresh(before, pose, wait_s)
         except ShmmapError as error:
             self._publish(before, error)
+            return self._pause()
+        except (OSError, ImportError) as error:
+            limit = no_files_left(error)  # to load a module, say
+            if limit is None:
+                raise
+            self._publish(before, limit)
             return self._pause()
         del before  # the last reference to what was replaced may be this one
         self._publish(state, None)

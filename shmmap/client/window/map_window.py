@@ -78,6 +78,8 @@ class MapWindow:
     ------
     DaemonUnreachable, ProtocolMismatch
         As `connect`, where an endpoint is given.
+    LimitReached
+        This process may not have the descriptors or threads that are needed.
     BadRequest
         A parameter makes no sense.
     """
@@ -123,24 +125,25 @@ class MapWindow:
                 populate=background,  # page faults, too, are better taken by the thread
                 timeout_s=timeout,
             )
-        except ShmmapError:
+            if background:
+                self._follower = WindowFollower(
+                    self._refresher,
+                    self._client.session,
+                    owner=self,
+                    update_distance=update_distance,
+                    refresh_interval_s=refresh_interval,
+                )
+            else:
+                self._follower = BlockingFollower(
+                    self._refresher, update_distance=update_distance, refresh_interval_s=refresh_interval
+                )
+        except BaseException:
             if self._owns_client:
                 self._client.close()
             raise
-        if background:
-            self._follower = WindowFollower(
-                self._refresher,
-                self._client.session,
-                owner=self,
-                update_distance=update_distance,
-                refresh_interval_s=refresh_interval,
-            )
-        else:
-            self._follower = BlockingFollower(
-                self._refresher, update_distance=update_distance, refresh_interval_s=refresh_interval
-            )
-        # also when nobody calls close(), and at the end of the program before sockets are closed
+        # also when nobody calls close(); at the end of the program Python stops the thread
         self._finalizer = weakref.finalize(self, self._follower.stop)
+        self._finalizer.atexit = False
 
     def __enter__(self) -> MapWindow:
         return self

@@ -164,7 +164,7 @@ def test_without_room_for_data_it_is_a_copy_or_refused_by_the_limits_name(segmen
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, before)
     if view is None:
-        assert "RLIMIT_DATA 1 MiB" in refusal
+        assert "1 MiB of data (RLIMIT_DATA)" in refusal
     else:
         assert mappings_under(segments.path) == 1, "the kernel refuses a mapping"
         np.testing.assert_array_equal(view, XYZ)
