@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment, attach_writable
-from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
+from shmmap.segment.layout import ColumnRow, Lattice, SegmentHeader, SourceStamp
 
 if TYPE_CHECKING:
     import open3d
@@ -38,6 +38,9 @@ class Cell:
     Every array is a read-only view of shared memory, zero-copy, and valid as long as it or any
     view of it lives: after the cell object is gone, after the client is closed, after the daemon
     ended.  Its bytes never change; a changed map comes as a new cell.
+
+    A pickled cell is its handle, and is attached where it is unpickled; what is gone by then is a
+    `StaleHandle` (``MULTIPROCESSING.md``).  `copy` makes a cell that does not depend on the daemon.
 
     Attributes
     ----------
@@ -100,6 +103,41 @@ class Cell:
 
     def __repr__(self) -> str:
         return f"<Cell {self.id} {self.layer} version {self.version_hex}, {self.points} points>"
+
+    # --- copies, and other processes --------------------------------------------------------------
+
+    def copy(self) -> Cell:
+        """Return the cell in memory of this process alone: it may be written, and pickles with its points.
+
+        Such a cell has no `segment`, and keeps nothing in the daemon.
+
+        Raises
+        ------
+        LimitReached
+            There is not so much memory.
+        """
+        return Cell(self.id, "", self._handle(), self._attached.copy(), None)
+
+    def __copy__(self) -> Cell:
+        return self if self._access is not None else self.copy()  # what never changes need not be copied
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Cell:
+        return self.__copy__()
+
+    def __reduce__(self) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
+        if self._access is None:
+            return _private_cell, (self.id, self._handle(), self._attached.columns, self._attached.raw)
+        from shmmap.client.handed_over import hand_over
+
+        return hand_over(self, self._access, self._handle())
+
+    def _handle(self) -> Handle:
+        return Handle(
+            self.name, self.version, self.layer, self.segment, self.offset, self.nbytes, self.points,
+            *self.box, self.stale,
+        )  # fmt: skip
+
+    # --- what it is ---------------------------------------------------------------------------
 
     @property
     def version_hex(self) -> str:
@@ -247,3 +285,8 @@ class Cell:
         if self._access is not None:
             segment = attach_writable(segment, self.segment, offset=self.offset, shm_dir=self._access.shm_dir)
         return {row[0]: segment.column(index) for index, row in enumerate(segment.columns)}
+
+
+def _private_cell(cell_id: str, handle: Handle, columns: list[ColumnRow], raw: NDArray[Any]) -> Cell:
+    """Unpickle a copy."""
+    return Cell(cell_id, "", handle, AttachedSegment(columns, raw), None)

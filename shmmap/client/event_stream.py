@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Final, TypeAlias
+from typing import Final, NoReturn, TypeAlias
 
 import msgspec
 import zmq
@@ -129,6 +129,12 @@ class EventStream:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "an EventStream cannot be pickled: it is this process's connection to the daemon."
+            " Make one in each process, EventStream(...)"
+        )
 
     def close(self) -> None:
         """End the subscription; another thread that waits for an event gets `BadRequest`."""

@@ -10,7 +10,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from queue import SimpleQueue
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
@@ -82,7 +82,7 @@ class Session:
         connection = self._connect()
         self.welcome = connection.welcome
         self.map_version = self.welcome.map_version
-        _sessions.add(self)
+        _sessions.append(weakref.ref(self, _sessions.remove))
 
     def _connect(self) -> Connection:
         connection = Connection(
@@ -114,6 +114,12 @@ class Session:
     def stop_telling(self, queue: SimpleQueue[Any]) -> None:
         """End `tell_when_lost`."""
         self._waiting.remove(queue)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "what asks the daemon cannot be pickled: it uses this process's connection."
+            " Connect in each process, shmmap.connect(...)"
+        )
 
     def close(self) -> None:
         """End the session; attached cells stay readable.
@@ -277,12 +283,14 @@ class Session:
 
 _TURNS: Final = (Session._in_turn.__code__, Session.close.__code__)
 
-_sessions: weakref.WeakSet[Session] = weakref.WeakSet()
+_sessions: Final[list[weakref.ref[Session]]] = []
+"""Those alive; not a weak set, which runs functions in Python when one ends (`shmmap.client.attaching`)."""
 
 
 def _after_fork_in_child() -> None:
-    for session in list(_sessions):
-        session._restart_in_child()
+    for one in tuple(_sessions):
+        if (session := one()) is not None:
+            session._restart_in_child()
 
 
 os.register_at_fork(after_in_child=_after_fork_in_child)

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Sequence
 from threading import TIMEOUT_MAX
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
@@ -159,6 +159,12 @@ class MapWindow:
     def __repr__(self) -> str:
         where = "closed" if self._closed else f"of radius {self._radius:g} m"
         return f"<MapWindow {where}, {len(self.cells)} cells of {', '.join(self._layers)}>"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a MapWindow cannot be pickled: a thread of this process keeps it current. Make one in each"
+            " process, MapWindow(...); cells can be pickled, window.cells: they go as handles"
+        )
 
     def close(self) -> None:
         """Stop following and let the window's cells go; views that live elsewhere stay readable."""
