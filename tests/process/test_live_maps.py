@@ -236,6 +236,7 @@ def test_what_is_no_marks_is_refused_and_costs_only_its_sender(
         (directory / f"{mine}.8").write_bytes(good)
         with pytest.raises(BadRequest, match="not scan 2"):
             send(f"{mine}.8", len(good), scan=2)
+        (directory / f"{mine}.8").write_bytes(good)  # what was taken is removed
         assert send(f"{mine}.8", len(good)).scan == 1
         assert held(live) == reference(drive(1))
         with pytest.raises(BadRequest, match="no live map 'radar'"):

@@ -280,7 +280,7 @@ def _segments(counters: dict[str, int]) -> list[Line]:
 
 def _live(row: LiveRow, width: int) -> list[Line]:
     states = [[(f"{count:,} {state}", STATE_STYLES[state])] for state, count in row.states.items() if count]
-    memory = f"{format_bytes(row.bytes + row.evicting_bytes)} of {format_bytes(row.budget_bytes)}"
+    memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
     pieces: list[Line] = [
         [(f"{row.name}:", "bold"), (f" {counted(row.chunks, 'chunk')}", "")],
         *states,
