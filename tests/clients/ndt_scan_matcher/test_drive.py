@@ -61,6 +61,7 @@ def frame(number: int, T: NDArray[np.float64], truth: NDArray[np.float64] | None
         T_truth=truth,
         state="lost",
         relocalized=False,
+        clock_jumped=False,
         thin_s=0.001,
         map_s=0.0,
         align_s=0.01 + number * 1e-3,
