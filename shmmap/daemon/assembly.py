@@ -110,8 +110,9 @@ class Service:
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
-            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left
-        )
+            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
+            cache.events.minutes,
+        )  # fmt: skip
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log)
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)

@@ -40,6 +40,7 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
+    "log_level": (lambda value: value in ("debug", "info", "warning"), "debug, info or warning"),
     "eviction": (lambda value: value in ("time", "distance", "lru"), "time, distance or lru"),
     "ride_out_s": (lambda value: 0 <= value <= 3600, "seconds, 0 to 3600"),
     "prefetch_share": (
@@ -112,6 +113,8 @@ class DaemonConfig:
         else ``shm_dir``.
     live_group
         Group whose members may map, besides root and the daemon's own user.
+    log_level
+        The least that is logged: ``debug``, ``info`` or ``warning``.
     """
 
     map_path: str = ""
@@ -137,6 +140,7 @@ class DaemonConfig:
     live_budget_bytes: int = 0
     live_shm_dir: str = ""
     live_group: str = ""
+    log_level: str = "info"
 
     def socket(self) -> str:
         """Path of the request socket."""

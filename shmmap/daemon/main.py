@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import os
 import sys
 import time
@@ -46,6 +47,7 @@ from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.prerequisites import (
     access_of_segments,
+    check_file_size_limit,
     choose_pins,
     give_back_large_tables,
     import_ahead,
@@ -88,7 +90,7 @@ def run(config: DaemonConfig) -> int:
     CannotStart
         Something is full, not there yet, or in the way.
     """
-    set_up_logging()
+    set_up_logging(getattr(logging, config.log_level.upper()))
     if not config.map_path and not config.live:
         raise ConfigError(
             "no map is named", key="map_path",
@@ -136,6 +138,7 @@ def run(config: DaemonConfig) -> int:
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early)
             stack.push(partial(_close, memory, signals))
+        check_file_size_limit(memory.cache.ledger.budget_bytes)
         del catalogue  # a reload replaces it
         live = _live_maps(config, memory, gid)
         stack.push(partial(_close_live, live, signals))

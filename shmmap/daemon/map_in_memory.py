@@ -28,6 +28,7 @@ from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.processes.limits import limit_behind
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
@@ -85,8 +86,10 @@ class MapInMemory:
             said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
             if is_full(error):
                 raise CannotStart(said, hint="free some, or enlarge it") from error
-            hint = "lift limits on the size of files (ulimit -f, LimitFSIZE=)"
-            raise ConfigError(said, key="shm_dir", hint=hint) from error
+            limit = limit_behind(error)
+            if limit is not None:
+                raise CannotStart(limit.message, hint=limit.hint) from error
+            raise ConfigError(said, key="shm_dir") from error
         self.statistics.set("pin_source", list(PinSource).index(pins.source))
         self.statistics.set("last_reload_unix_ns", time.time_ns())
         self.statistics.set("map_problems", len(catalogue.problems))

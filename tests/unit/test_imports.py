@@ -69,7 +69,7 @@ PARTS = {
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
         "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
-        "daemon.pins.probe", "daemon.service_manager",
+        "daemon.pins.probe", "daemon.service_manager", "daemon.host.budget",
     },
     "simulation": BASE | {"formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},

@@ -158,7 +158,7 @@ def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[s
     return {
         "id": f"…{row.id}" if row.id_cut else id_prefix + row.id,
         "version": f"{row.version:016x}",
-        "layer": row.layer,
+        "layer": row.whole_layer,
         "state": row.state,
         "segment": retired_name(segment) if row.state == "zombie" else segment,
         "ahead": row.ahead,
@@ -183,7 +183,7 @@ def _as_text(row: CellRow, now_ns: int) -> list[str]:
         format_metres(row.box[1]),
         f"{format_metres(max(row.box[2] - row.box[0], row.box[3] - row.box[1]))} m",
         _shown_state(row),
-        row.layer,
+        row.whole_layer,
         f"{row.points:,}",
         format_bytes(row.bytes),
         f"{row.hits:,}",

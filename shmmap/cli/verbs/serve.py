@@ -133,6 +133,12 @@ def add_parser(subparsers: Subparsers) -> None:
         "are (default: 0.5)",
     )
     parser.add_argument(
+        "--log-level",
+        metavar="LEVEL",
+        help="the least that is logged: debug (each eviction, each client that left), info or warning "
+        "(default: info)",
+    )
+    parser.add_argument(
         "--cache-dir",
         metavar="DIR",
         help="where the map's index, divided clouds and computed layers are kept between starts (default: "
@@ -149,6 +155,19 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal says stop."""
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy's threads would spin, and nobody could be forked
+    from shmmap.processes.limits import limit_behind
+
+    try:
+        return _serve(args)
+    except (OSError, RuntimeError, MemoryError, ImportError) as error:
+        if (limit := limit_behind(error)) is None:
+            raise
+        from shmmap.errors import CannotStart
+
+        raise CannotStart(limit.message, hint=limit.hint) from None
+
+
+def _serve(args: argparse.Namespace) -> int:
     from shmmap.daemon.config import load_config
     from shmmap.daemon.main import run as serve
     from shmmap.daemon.service_manager.status import ServiceManager

@@ -98,7 +98,8 @@ class CellCache:
         self.heights = Heights(len(catalogue))
         self.unentered = 0
         self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
-        self.events = CellEvents(event_log, statistics, self.wire_id, PressureEvents(event_log, self._memory))
+        pressure = PressureEvents(event_log, self._memory, reclaimer.sessions.largest_holder)
+        self.events = CellEvents(event_log, statistics, self.wire_id, pressure)
         self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
         self.used: set[Resident] = set()
         self.statistics = statistics

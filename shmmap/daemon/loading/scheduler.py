@@ -25,6 +25,7 @@ from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
+from shmmap.processes.limits import limit_behind
 from shmmap.processes.start_child import how_ended
 from shmmap.segment.version import Stamp
 
@@ -276,7 +277,9 @@ class Scheduler:
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
-            self._fail(load, failure_code(error), f"cannot publish: {error.strerror}", None, now_s)
+            limit = limit_behind(error)
+            why = f"{limit.message} ({limit.hint})" if limit is not None else str(error.strerror)
+            self._fail(load, failure_code(error), f"its segment cannot be published: {why}", None, now_s)
             return
         took_ns = int((now_s - load.started_s) * 1e9)
         cache.tell(cache.events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)

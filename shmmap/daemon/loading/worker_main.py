@@ -10,6 +10,7 @@ without a name that the daemon has made, so that an orphan leaves nothing behind
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import resource
 import signal
@@ -31,6 +32,7 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
+from shmmap.processes.limits import limit_behind
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
@@ -137,6 +139,10 @@ class _Worker:
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
+            limit = limit_behind(error) if error.errno == errno.EFBIG else None
+            if limit is not None:  # of the segment, whatever the map's file is like
+                self._fail(job, "load_failed", f"{job.path}: its segment: {limit.message} ({limit.hint})")
+                return
             self._fail(job, failure_code(error), f"{job.path}: {error.strerror or error}", unread=True)
         except MemoryError:
             most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])

@@ -119,7 +119,8 @@ class Sampler:
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
-        cache.events.pressure.turn(now_s)
+        cache.events.pressure.step(now_s)
+        cache.events.minutes.step(now_s)
         cache.events.late.turn(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
