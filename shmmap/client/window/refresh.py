@@ -177,6 +177,7 @@ class WindowRefresher:
             by_name=by_name,
             populate=self._populate,
             timeout=self._timeout_s,
+            strict=None,  # `WindowUpdate` says what is missing
         )
 
     def _apply(
