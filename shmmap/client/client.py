@@ -5,20 +5,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from threading import TIMEOUT_MAX
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 import numpy as np
 
 from shmmap import geometry
+from shmmap.client.arguments import heights, names, timeout_s
 from shmmap.client.cell_set import CellSet
 from shmmap.client.discovery import candidates
 from shmmap.client.held import Held, HeldCells
-from shmmap.client.operator_requests import OperatorRequests, several
+from shmmap.client.operator_requests import OperatorRequests
 from shmmap.client.route import sendable
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Intent, Welcome
 
@@ -167,8 +166,7 @@ class Client(OperatorRequests):
         strict: bool | None = False,
     ) -> CellSet:
         """Cells within ``radius`` metres of a place, whole: `area` with a circle."""
-        heights = geometry.ZRange(*z) if z is not None else None
-        return self.area(geometry.Circle(x, y, radius, heights), layers, wait=wait, strict=strict)
+        return self.area(geometry.Circle(x, y, radius, heights(z)), layers, wait=wait, strict=strict)
 
     def area(
         self,
@@ -212,7 +210,7 @@ class Client(OperatorRequests):
         SegmentError
             This user may not read the segments, or the process has no room for more mappings.
         """
-        specs = several(layers)
+        specs = names("layers", layers)
         message, sent = messages.area_to_message(area), sendable(intent)
         found = self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
         return found if strict is None else self._judged(found, area, wait, strict)
@@ -248,8 +246,7 @@ class Client(OperatorRequests):
         """
         from shmmap.client.points_around import points_around  # windows need it, and few others
 
-        heights = geometry.ZRange(*z) if z is not None else None
-        found = self.area(geometry.Circle(x, y, radius, heights), layer, wait=wait, strict=strict)
+        found = self.area(geometry.Circle(x, y, radius, heights(z)), layer, wait=wait, strict=strict)
         boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
         return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
 
@@ -285,7 +282,7 @@ class Client(OperatorRequests):
 
         Other parameters and errors are those of `area`.
         """
-        specs = several(layers)
+        specs = names("layers", layers)
         message, sent = messages.area_to_message(area), sendable(intent)
         mine = HeldCells(held, by_name=by_name)
         found = self._session.ask_cells(
@@ -313,8 +310,8 @@ class Client(OperatorRequests):
         An id is the absolute path of the cell's file, or its base name where that is unique.  Other
         parameters and errors are those of `area`.
         """
-        specs = several(layers)
-        wanted, sent = several(ids), sendable(intent)
+        specs = names("layers", layers)
+        wanted, sent = names("ids", ids), sendable(intent)
         found = self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, sent), wait)
         return found if strict is None else self._judged(found, None, wait, strict)
 
@@ -394,6 +391,7 @@ class Client(OperatorRequests):
 def connect(
     endpoint: str | os.PathLike[str] | None = None,
     *,
+    instance: str | None = None,
     timeout: float = 5.0,
     connect_timeout: float = CONNECT_S,
     name: str = "",
@@ -404,9 +402,12 @@ def connect(
     Parameters
     ----------
     endpoint
-        The daemon's socket, a path or an ``ipc://`` URL.  Without one: ``SHMMAP_ENDPOINT``, else the socket
-        of the instance ``SHMMAP_INSTANCE`` (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not
+        The daemon's socket, a path or an ``ipc://`` URL; or an instance's name (a string without slash and
+        point).  Without one: ``SHMMAP_ENDPOINT``, else the socket of the instance ``SHMMAP_INSTANCE``
+        (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not
         set in ``$XDG_RUNTIME_DIR/shmmap`` and in ``/run/shmmap``, whichever answers first.
+    instance
+        Name of the daemon's instance, instead of an endpoint or ``SHMMAP_INSTANCE``.
     timeout
         Seconds a reply may take; what a request lets the daemon wait comes on top.
     connect_timeout
@@ -428,15 +429,12 @@ def connect(
     LimitReached
         This process may not have the descriptors or threads that are needed.
     BadRequest
-        The endpoint cannot be a socket path.
+        The endpoint cannot be a socket path, or another argument makes no sense.
     """
-    for what, seconds in (("timeout", timeout), ("connect_timeout", connect_timeout)):
-        if not 0 < seconds <= TIMEOUT_MAX:
-            raise BadRequest(f"{what} must be a positive number of seconds, not {seconds!r}")
     return Client(
-        candidates(os.fspath(endpoint) if endpoint is not None else None),
-        timeout=timeout,
-        connect_timeout=connect_timeout,
+        candidates(endpoint, instance=instance),
+        timeout=timeout_s("timeout", timeout),
+        connect_timeout=timeout_s("connect_timeout", connect_timeout),
         name=name,
         shm_dir=shm_dir or os.environ.get("SHMMAP_SHM_DIR", ""),
     )
