@@ -70,7 +70,7 @@ def _hand_over(cell: Cell) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
     return hand_over(cell)
 
 
-copyreg.pickle(Cell, _hand_over)  # type: ignore[arg-type]
+copyreg.pickle(Cell, _hand_over)
 
 
 def __getattr__(name: str) -> Any:

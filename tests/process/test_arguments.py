@@ -94,7 +94,8 @@ def test_an_argument_that_makes_no_sense(client: shmmap.Client, name: str) -> No
 
 def test_numbers_of_any_kind_are_numbers(client: shmmap.Client) -> None:
     whole = client.around(0.0, 0.0, 5.0)
-    for kind in (int, np.float32, np.float64, np.int16, np.array):
+    kinds: tuple[Any, ...] = (int, np.float32, np.float64, np.int16, np.array)
+    for kind in kinds:
         assert len(client.around(kind(0), kind(0), kind(5), wait=kind(5))) == len(whole)
     assert len(client.around(0, 0, 5, z=np.array([-50.0, 50.0]))) == len(whole)  # type: ignore[arg-type]
     assert len(client.around(0, 0, 5, layers=np.array(["points"]))) == len(whole)  # type: ignore[arg-type]
