@@ -16,6 +16,7 @@ from shmmap.daemon.config_live import LiveSettings, live_settings
 from shmmap.errors import BadRequest, ConfigError
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
+    EVENTS_LONGER,
     SYSTEM_RUNTIME_DIR,
     endpoint_path,
     runtime_dirs,
@@ -145,14 +146,19 @@ class DaemonConfig:
     def socket(self) -> str:
         """Path of the request socket."""
         if self.endpoint:
-            return endpoint_path(self.endpoint)
+            return endpoint_path(self.endpoint, longer=_events_longer(self.endpoint))
         given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]  # systemd lists all there are
         directory = self.runtime_dir or given or _default_runtime_dir()
-        return endpoint_path(socket_path(directory, self.instance))
+        return endpoint_path(socket_path(directory, self.instance), longer=EVENTS_LONGER)
 
     def loaders(self) -> int:
         """Most loader processes at a time."""
         return self.workers or min(4, max(1, len(os.sched_getaffinity(0)) - 1))
+
+
+def _events_longer(endpoint: str) -> int:
+    """How much longer the path of the socket of events is."""
+    return EVENTS_LONGER + (0 if endpoint.endswith(".sock") else len(".sock"))
 
 
 def _default_runtime_dir() -> str:

@@ -9,10 +9,19 @@ from typing import Final
 
 from shmmap.errors import BadRequest
 
-__all__ = ["DEFAULT_INSTANCE", "SYSTEM_RUNTIME_DIR", "endpoint_path", "runtime_dirs", "socket_path"]
+__all__ = [
+    "DEFAULT_INSTANCE",
+    "EVENTS_LONGER",
+    "SYSTEM_RUNTIME_DIR",
+    "endpoint_path",
+    "runtime_dirs",
+    "socket_path",
+]
 
 DEFAULT_INSTANCE: Final = "default"
 SYSTEM_RUNTIME_DIR: Final = "/run/shmmap"
+EVENTS_LONGER: Final = len(".events")
+"""By how much the path of the socket of events is longer than that of requests."""
 _SUN_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) - 1 on Linux
 
 
@@ -27,8 +36,15 @@ def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:
     return f"{runtime_dir.rstrip('/')}/{instance}.sock"
 
 
-def endpoint_path(endpoint: str) -> str:
+def endpoint_path(endpoint: str, *, longer: int = 0) -> str:
     """Return the absolute socket path of an endpoint given as path or ``ipc://`` URL.
+
+    Parameters
+    ----------
+    endpoint
+        The path or URL.
+    longer
+        How many bytes a name beside it is longer, which must fit into a socket address, too.
 
     Raises
     ------
@@ -36,12 +52,15 @@ def endpoint_path(endpoint: str) -> str:
         For another transport, or a path longer than a socket address can hold (107 bytes).
     """
     path = endpoint.removeprefix("ipc://")
-    if "://" in path or not path or path.startswith("@"):
+    if "://" in path or not path or path.startswith("@") or "\0" in path:
         raise BadRequest(f"endpoint {endpoint!r} is not usable", hint="give a socket path or an ipc:// URL")
     absolute = os.path.abspath(path)
-    if len(os.fsencode(absolute)) > _SUN_PATH_BYTES:
+    nbytes, most = len(os.fsencode(absolute)), _SUN_PATH_BYTES - longer
+    if nbytes > most:
+        events = f", {longer} more for the socket of events beside it" if longer else ""
         raise BadRequest(
-            f"socket path {absolute} is longer than the {_SUN_PATH_BYTES} bytes a socket address holds",
-            hint="use a shorter --runtime-dir or --endpoint",
+            f"socket path {absolute} has {nbytes} bytes, and at most {most} may be used: a socket address"
+            f" holds {_SUN_PATH_BYTES}{events}",
+            hint="use a shorter directory or name: --runtime-dir, --instance or --endpoint",
         )
     return absolute

@@ -227,8 +227,8 @@ def _shared_text(raw: bytes) -> str:
 def _text(raw: bytes | memoryview) -> str:
     try:
         return str(raw, "utf-8")
-    except UnicodeDecodeError as error:
-        raise SegmentCorrupt(f"{bytes(raw)!r} in the header is no UTF-8") from error
+    except UnicodeDecodeError:
+        raise SegmentCorrupt(f"{bytes(raw)!r} in the header is no UTF-8") from None
 
 
 def _unpack_lattice(page: memoryview) -> Lattice | None:

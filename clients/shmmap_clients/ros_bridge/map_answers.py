@@ -83,7 +83,7 @@ class MapAnswers:
         if isinstance(message, GetPartialRequest):
             area = sensible(message.area)
             if area is not None:
-                cells = self._all(lambda wait: self._client.area(area, wait=wait))
+                cells = self._all(lambda wait: self._client.area(area, wait=wait, strict=None))
             else:
                 cells = self._selected(self._touched(message.area))
         else:
@@ -100,7 +100,7 @@ class MapAnswers:
         held = self._requesters.held(requester, message.cached_ids, self._catalogue.versions)
         area = sensible(message.area)
         if area is not None:
-            found = self._all(lambda wait: self._client.differential(area, held, wait=wait))
+            found = self._all(lambda wait: self._client.differential(area, held, wait=wait, strict=None))
             cells: Sequence[Cell] = found
             removed: Collection[str] = found.removed
         else:
@@ -124,7 +124,7 @@ class MapAnswers:
     def _selected(self, ids: Sequence[str]) -> CellSet:
         if not ids:
             return CellSet()
-        return self._all(lambda wait: self._client.selected(ids, wait=wait))
+        return self._all(lambda wait: self._client.selected(ids, wait=wait, strict=None))
 
     def _all(self, ask: Callable[[float], CellSet]) -> CellSet:
         """Ask until the daemon knows what there is; what is missing is told."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
+from shmmap.cli.areas import add_area_options, area_from, around, those_in
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import (
@@ -19,6 +19,7 @@ from shmmap.cli.screens.output import (
     print_table,
 )
 from shmmap.errors import DaemonUnreachable
+from shmmap.lacking import area_text, extent_text
 
 if TYPE_CHECKING:
     from shmmap.statistics.cell_rows import CellRow
