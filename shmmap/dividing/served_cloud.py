@@ -26,7 +26,7 @@ from xxhash import xxh3_64_hexdigest
 
 from shmmap.dividing.report import LINK_NAME
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
-from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.formats.block_reader import READABLE_SUFFIXES
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_change import Tables
@@ -76,7 +76,7 @@ def find_origin(
     """
     path = absolute_path(map_path)
     suffix = os.path.splitext(path)[1].lower()
-    is_cloud = os.path.isfile(path) and suffix in CLOUD_SUFFIXES and not metadata
+    is_cloud = os.path.isfile(path) and suffix in READABLE_SUFFIXES and not metadata
     if is_cloud and not (suffix == ".pcd" and is_served_whole(path)):
         cache_dir = absolute_path(cache_dir or default_cache_directory())
         return DividedCloud(path, cache_dir, strict=strict, tell=tell)

@@ -73,8 +73,12 @@ class LasReader:
         header = self._reader.header
         self.points = int(header.point_count)
         self.version = str(header.version)
-        self.bounds = (np.array(header.mins, np.float64), np.array(header.maxs, np.float64))
-        self.warnings = (GEOGRAPHIC_SYSTEM,) if is_geographic(header) else ()
+        self.encoding = ""
+        self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = (
+            np.array(header.mins, np.float64),
+            np.array(header.maxs, np.float64),
+        )
+        self.warnings: tuple[str, ...] = (GEOGRAPHIC_SYSTEM,) if is_geographic(header) else ()
         self._names = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
         empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
         self._columns = column_names(self._names)

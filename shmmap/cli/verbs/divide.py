@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "metres", "run", "translation"]
 
 _EPILOG = """\
-IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb) or a directory
-of files; all together become one map.  PCD, LAS and LAZ may be larger than memory.
+IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb, or a table of
+numbers: .txt .csv .asc) or a directory of files, tables left out; all together become one map.  Files may
+be larger than memory.
 A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite are
 left out and counted.  All fields are kept, with their types, unless --fields names those to keep.
 OUT appears complete or not at all.  Autoware's map loader reads it.

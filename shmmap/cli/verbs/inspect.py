@@ -68,7 +68,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "path",
         metavar="PATH",
-        help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb, or a directory of such files",
+        help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb .txt .csv .asc, or a directory of files",
     )
     add_allow_empty(parser)
     add_json_option(parser)

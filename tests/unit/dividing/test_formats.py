@@ -83,7 +83,6 @@ def test_names_of_dimensions_that_pcd_does_not_have(tmp_path: Path) -> None:
 
 
 def test_names_of_ply_properties(tmp_path: Path) -> None:
-    open3d_or_skip()
     properties = ["x", "y", "z", "intensity", "xyz", "_"]
     lines = [
         "ply",
@@ -138,7 +137,7 @@ def test_a_las_header_that_lies_about_bounds(tmp_path: Path) -> None:
     assert made.points == 100
 
 
-def test_ply_and_xyz_through_open3d(tmp_path: Path) -> None:
+def test_ply_as_open3d_writes_it_and_xyz(tmp_path: Path) -> None:
     o3d = open3d_or_skip()
     columns = xyzircaedt(800)
     xyz = np.column_stack([columns[axis] for axis in "xyz"])
