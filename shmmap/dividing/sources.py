@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.dividing.row_layout import AXES, RowLayout
+from shmmap.dividing.row_layout import AXES, NO_SCALE, RowLayout
 from shmmap.errors import MapDataError
 from shmmap.formats.block_reader import cloud_suffix, open_blocks
 from shmmap.formats.causes import refusal
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.mapped import expanded_blocks
 from shmmap.formats.pcd.reader import PcdReader
 
@@ -40,6 +41,10 @@ class Source(Protocol):
         Packed type of a point: x, y, z (both float32 or float64) and every other field.
     claimed_bounds
         (min_xyz, max_xyz) where the file's header says so.
+    crs
+        What the file says of its coordinate system; None where it says nothing.
+    scale
+        Metres per unit, in the plane and in height, to be set before it is read; 1 at first.
     warnings
         Oddities of the file.
     """
@@ -48,6 +53,8 @@ class Source(Protocol):
     points: int
     row: np.dtype[np.void]
     claimed_bounds: Bound3 | None
+    crs: CoordinateSystem | None
+    scale: tuple[float, float]
     warnings: tuple[str, ...]
 
     def begin(self, layout: RowLayout, start: int) -> None:
@@ -109,6 +116,8 @@ class _BinaryPcd:
     """
 
     claimed_bounds: Bound3 | None = None
+    crs: CoordinateSystem | None = None
+    scale = NO_SCALE
 
     def __init__(self, reader: PcdReader) -> None:
         self.path = reader.path
@@ -177,6 +186,8 @@ class _Stream(ABC):
     """What is common to formats that come as blocks of columns."""
 
     claimed_bounds: Bound3 | None = None
+    crs: CoordinateSystem | None = None
+    scale = NO_SCALE
 
     def __init__(self, path: str, points: int, columns: tuple[ColumnSpec, ...]) -> None:
         self.path = path
@@ -260,6 +271,7 @@ class _Blocks(_Stream):
         with open_blocks(path, suffix) as reader:
             super().__init__(path, reader.points, reader.columns)
             self.claimed_bounds = reader.bounds
+            self.crs = reader.crs
             self.warnings = reader.warnings
 
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.ply_reader import PlyReader
 from shmmap.formats.source_file import open_regular
@@ -40,6 +41,8 @@ class BlockReader(Protocol):
         (min_xyz, max_xyz) where the header says so, float64.
     encoding, version
         Empty where the format has none.
+    crs
+        What the file says of its coordinate system; None where it says nothing.
     warnings
         Oddities of the file; of its data, once that was read.
     """
@@ -50,6 +53,7 @@ class BlockReader(Protocol):
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None
     encoding: str
     version: str
+    crs: CoordinateSystem | None
 
     @property
     def warnings(self) -> tuple[str, ...]: ...

@@ -33,6 +33,7 @@ CAUSES: Final[dict[str, str]] = {
     "bad_row": "a row has too few or many values, or one that is not a number of its type",
     "coordinate_range": "a 64-bit integer coordinate that float64 cannot hold exactly",
     "unsupported_format": "a file format that is not read",
+    "not_metres": "coordinates in feet or another unit, and nothing that says to convert them",
     "bad_las": "a LAS or LAZ file that contradicts itself or cannot be decompressed",
 }
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.block_reader import cloud_suffix, open_blocks
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.finite import Bounds
 from shmmap.formats.pcd.header import IDENTITY_VIEWPOINT
@@ -71,6 +72,8 @@ class CloudDescription:
         As `PointCloud.columns` would have them.
     bounds, viewpoint, warnings
         As in `PointCloud`.
+    crs
+        What the file says of its coordinate system; None where it says nothing.
     digest
         XXH3-128 of a PCD file's bytes; empty for other formats.
     """
@@ -88,6 +91,7 @@ class CloudDescription:
     bounds: tuple[Bound, Bound]
     viewpoint: tuple[float, ...] = IDENTITY_VIEWPOINT
     warnings: tuple[str, ...] = ()
+    crs: CoordinateSystem | None = None
     digest: bytes = field(default=b"", repr=False)
 
 
@@ -209,6 +213,7 @@ def _describe_blocks(path: str, suffix: str) -> CloudDescription:
             columns=reader.columns,
             bounds=bounds.result(),
             warnings=reader.warnings,
+            crs=reader.crs,
         )
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.causes import refusal
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.binary import record_blocks
 from shmmap.formats.pcd.table import FieldTable
 from shmmap.formats.ply_header import HEADER_LIMIT_BYTES, PlyElement, PlyHeader, parse_ply_header
@@ -71,6 +72,7 @@ class PlyReader:
             raise
         self._table = FieldTable(self._header.fields)
         self._oddities: list[str] = []
+        self.crs: CoordinateSystem | None = None
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.version = ""
         self.points = self._header.vertex.count

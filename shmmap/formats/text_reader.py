@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError
 from shmmap.formats.causes import refusal
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.pcd.table import FieldTable
 from shmmap.formats.source_file import SourceFile, open_regular
@@ -104,6 +105,7 @@ class TextReader:
             self.close()
             raise
         self.columns: tuple[ColumnSpec, ...] = self._table.columns
+        self.crs: CoordinateSystem | None = None
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.encoding = self.version = ""
         self.warnings: tuple[str, ...] = (self._layout.guess,) if self._layout.guess else ()

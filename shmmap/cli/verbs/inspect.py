@@ -25,6 +25,7 @@ from shmmap.errors import MapDataError, MapMissing
 
 if TYPE_CHECKING:
     from shmmap.formats.cloud import CloudDescription
+    from shmmap.formats.coordinate_system import CoordinateSystem
 
 __all__ = ["add_parser", "run"]
 
@@ -33,7 +34,9 @@ _JSON = """\
    "dropped": how many of them are not finite (NOT FINITE), "width", "height",
    "fields": [{"name": "xyz" for x, y and z, "dtype": as numpy writes it, "count": values per point, "unit"}],
    "bounds": {"min": [x, y, z], "max": [x, y, z]} of the finite points, null when there are none,
-   "viewpoint": [x, y, z, qw, qx, qy, qz], "warnings": [text]}
+   "viewpoint": [x, y, z, qw, qx, qy, qz], "warnings": [text],
+   "crs": {"name", "epsg": 0 when not said, "geographic": x and y are degrees,
+           "unit_m": [metres per unit of x and y, of z], "units": [name, name]}, null when nothing is said}
 Of a directory:
   {"path", "files": [the same of each file], "failed": [{"path", "message"}], "points", "dropped",
    "file_bytes", "bounds": sums and bounds of all files}
@@ -232,14 +235,44 @@ def _as_json(found: CloudDescription) -> dict[str, Any]:
         "bounds": _bounds(found),
         "viewpoint": list(found.viewpoint),
         "warnings": list(found.warnings),
+        "crs": _crs_json(found.crs),
     }
 
 
-def _bounds_lines(bounds: dict[str, list[float]] | None) -> list[tuple[str, str]]:
+def _crs_json(crs: CoordinateSystem | None) -> dict[str, Any] | None:
+    if crs is None:
+        return None
+    return {
+        "name": crs.name,
+        "epsg": crs.epsg,
+        "geographic": crs.geographic,
+        "unit_m": [unit.metres for unit in crs.units],
+        "units": [unit.name for unit in crs.units],
+    }
+
+
+def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
+    """Name and units of a file's system; of its warnings nothing is said twice."""
+    if crs is None:
+        return []
+    from shmmap.formats.degrees import units_text
+
+    said = "x and y are in degrees" if crs.geographic else units_text(*crs.units)
+    unsaid = "" if crs.geographic or crs.plane is not None else " (taken so: the file does not say)"
+    return [("crs", crs.label or "without a name"), ("units", said + unsaid)]
+
+
+def _in_metres(crs: CoordinateSystem | None) -> bool:
+    """Whether coordinates are in metres, as far as the file says."""
+    return crs is None or not (crs.geographic or any(unit.metres != 1.0 for unit in crs.units))
+
+
+def _bounds_lines(bounds: dict[str, list[float]] | None, metric: bool = True) -> list[tuple[str, str]]:
     if bounds is None:
         return [("bounds", "none: no finite point")]
+    unit = " m" if metric else ""
     return [
-        (axis, f"{low:.3f} .. {high:.3f} m ({high - low:.3f} m)")
+        (axis, f"{low:.3f} .. {high:.3f}{unit} ({high - low:.3f}{unit})")
         for axis, low, high in zip("xyz", bounds["min"], bounds["max"], strict=True)
     ]
 
@@ -252,7 +285,8 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))
-    lines += _bounds_lines(_bounds(found))
+    lines += _bounds_lines(_bounds(found), _in_metres(found.crs))
+    lines += _crs_lines(found.crs)
     if tuple(found.viewpoint) != (0, 0, 0, 1, 0, 0, 0):
         lines.append(("viewpoint", " ".join(f"{value:g}" for value in found.viewpoint)))
     lines += [("warning", warning) for warning in found.warnings]

@@ -7,6 +7,7 @@ import io
 import random
 import struct
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ CODES = {"float": "f", "double": "d", "short": "h", "ushort": "H", "uchar": "B",
 
 
 def ply(
-    form: str, properties: list[tuple[str, str]], rows: list[tuple[float, ...]], *, newline: str = "\n",
+    form: str, properties: Sequence[tuple[str, str]], rows: Sequence[tuple[float, ...]], *, newline: str = "\n",
     before: str = "", lines: str = "", ahead: bytes = b"", count: int | None = None,
 ) -> bytes:  # fmt: skip
     """Return a file whose vertices have properties (type, name), after ``before`` with bytes ``ahead``."""
