@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 import weakref
 from collections import deque
 from queue import Empty, SimpleQueue
@@ -12,6 +13,7 @@ from typing import Final
 from weakref import WeakValueDictionary
 
 from shmmap.client.cell import Cell
+from shmmap.errors import ShmmapWarning
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import attach
 from shmmap.segment.owned import Owned
@@ -81,6 +83,7 @@ class Attacher:
     def __init__(self) -> None:
         self.unmapper = Unmapper()
         self._cells: WeakValueDictionary[tuple[int, str], Cell] = WeakValueDictionary()
+        self._named_outside: set[str] = set()
         self._mapped: dict[int, _Mapped] = {}  # the last one of each version, which knows the one before
         self._ended: deque[_Mapped] = deque()
         self._unmapped: list[int] = []
@@ -104,6 +107,11 @@ class Attacher:
         ------
         StaleHandle, SegmentCorrupt, SegmentError
             As `shmmap.segment.attach.attach`.
+
+        Warns
+        -----
+        ShmmapWarning
+            Points of the cell lie outside its box; once a cell.
         """
         key = (handle.version, handle.layer)
         cell = self._cells.get(key)
@@ -122,6 +130,14 @@ class Attacher:
             on_mapped=lambda memory: self._note(memory, handle.version),
         )
         cell = self._cells[key] = Cell(cell_id, segment, handle, attached)
+        if (outside := attached.outside_points) and cell_id not in self._named_outside:
+            self._named_outside.add(cell_id)
+            warnings.warn(
+                f"{cell.name}: {outside} of the cell's points lie outside its box {cell.box}:"
+                " was the file moved, and the map's metadata not?",
+                ShmmapWarning,
+                stacklevel=2,
+            )
         return cell
 
     def _note(self, memory: Owned, version: int) -> None:

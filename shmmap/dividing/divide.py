@@ -38,6 +38,7 @@ from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
+from shmmap.origin.far_cells import far_cells_notes
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
 from shmmap.quantities import format_bytes
 
@@ -288,6 +289,13 @@ class _Run:
         if not any(GEOGRAPHIC_SYSTEM in note for note in notes):
             low, high = stream.extremes + self._frame.origin
             notes += [warning] if (warning := degrees_warning(low, high)) else []
+        where = list(cells.counts)
+        notes += far_cells_notes(
+            np.array([self._lattice.corner(*one) for one in where]),
+            self._lattice.size,
+            [self._name(*one) for one in where],
+            [cells.counts[one] for one in where],
+        )
         if not self._lattice.whole:
             notes.append(
                 "cells have fractional corners: Autoware's loader, which reads whole metres, refuses them"

@@ -39,9 +39,15 @@ _JSON = """\
            "unit_m": [metres per unit of x and y, of z], "units": [name, name]}, null when nothing is said}
 Of a directory:
   {"path", "files": [the same of each file], "failed": [{"path", "message"}], "points", "dropped",
-   "file_bytes", "bounds": sums and bounds of all files}
+   "file_bytes", "bounds": sums and bounds of all files,
+   "map": of a divided map, else null: {"cells", "outside_box": [{"path", "box": [x0, y0, x1, y1]}] of cells
+          with points outside their box, "far": [text] on cells far from all others, "origin": [x, y, z] to
+          add to come back to the frame of the clouds it was divided from, "crs", "unit_m" as of
+          `divide --json`, "problems": [text]}}
 Exit code: 0; 1 when there is no finite point, 65 bad data (the message has path, byte offset and cause),
 66 no such file, or no cloud in the directory."""
+
+_NAMED_OUTSIDE = 10
 
 _FILES = (
     Column("FILE"),
@@ -133,6 +139,7 @@ def _directory(args: argparse.Namespace) -> int:
     points, dropped = sum(one.points for one in found), sum(one.dropped for one in found)
     nbytes = sum(one.file_bytes for one in found)
     bounds = _all_bounds(found)
+    served = _as_map(args.path, found)
     if args.json:
         print_json(
             {
@@ -143,6 +150,7 @@ def _directory(args: argparse.Namespace) -> int:
                 "dropped": dropped,
                 "file_bytes": nbytes,
                 "bounds": bounds,
+                "map": served,
             }
         )
     else:
@@ -155,6 +163,7 @@ def _directory(args: argparse.Namespace) -> int:
                 ("size", format_bytes(nbytes)),
                 *_bounds_lines(bounds),
                 *_grouped_warnings(found),
+                *_map_lines(served),
             ]
         )
     for _, message in failed:
@@ -164,6 +173,70 @@ def _directory(args: argparse.Namespace) -> int:
     if bounds is None:
         return nothing_found(args, f"{args.path}: no finite point in {counted(len(found), 'file')}")
     return 0
+
+
+def _as_map(path: str, found: list[CloudDescription]) -> dict[str, Any] | None:
+    """What the metadata says of files as cells of a map, and where it is wrong; None where there is none."""
+    import numpy as np
+
+    from shmmap.layers.outside import OutsideBox
+    from shmmap.origin.far_cells import far_cells_notes
+    from shmmap.origin.map_directory import open_map
+    from shmmap.origin.map_layout import absolute_path, find_layout
+
+    try:
+        if find_layout(absolute_path(path), None, ()).metadata is None:
+            return None
+        catalogue = open_map(path).load(fresh=True)
+    except (MapDataError, MapMissing) as error:
+        return {"cells": 0, "outside_box": [], "far": [], "problems": [error.message]}
+    cells: list[tuple[CloudDescription, tuple[float, float, float, float]]] = []
+    for one in found:
+        index = catalogue.find(os.path.abspath(one.path))
+        if index is not None:
+            cells.append((one, catalogue.box(index)))
+    outside = []
+    for one, box in cells:
+        corners = np.array(one.bounds)
+        checked = OutsideBox(box)
+        checked.add(corners, (corners[0], corners[1]))
+        if checked.count:
+            outside.append({"path": one.path, "box": list(box)})
+    far = far_cells_notes(
+        np.array([box[:2] for _, box in cells]).reshape(-1, 2),
+        max(catalogue.mean_size),
+        [os.path.basename(one.path) for one, _ in cells],
+        [one.points for one, _ in cells],
+    )
+    return {
+        "cells": len(catalogue),
+        "outside_box": outside,
+        "far": far,
+        "origin": list(catalogue.frame.origin),
+        "crs": catalogue.frame.crs,
+        "unit_m": list(catalogue.frame.unit_m),
+        "problems": list(catalogue.problems),
+    }
+
+
+def _map_lines(served: dict[str, Any] | None) -> list[tuple[str, str]]:
+    if served is None:
+        return []
+    lines = [("map", counted(served["cells"], "cell"))] if served["cells"] else []
+    if served.get("crs"):
+        lines.append(("crs", served["crs"]))
+    if any(served.get("origin", ())):
+        x, y, z = map(format_metres, served["origin"])
+        lines.append(("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from"))
+    outside = served["outside_box"]
+    for one in outside[:_NAMED_OUTSIDE]:
+        min_x, min_y, max_x, max_y = one["box"]
+        box = f"x {min_x:g} .. {max_x:g}, y {min_y:g} .. {max_y:g}"
+        what = f"{os.path.basename(one['path'])} has points outside its box {box}"
+        lines.append(("outside", f"{what}: was it moved, and the metadata not?"))
+    if len(outside) > _NAMED_OUTSIDE:
+        lines.append(("outside", f"and {len(outside) - _NAMED_OUTSIDE:,} more cells"))
+    return [*lines, *(("far", text) for text in served["far"]), *(("problem", t) for t in served["problems"])]
 
 
 def _row(found: CloudDescription, directory: str) -> list[str]:

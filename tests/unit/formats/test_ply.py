@@ -27,8 +27,8 @@ CODES = {"float": "f", "double": "d", "short": "h", "ushort": "H", "uchar": "B",
 
 
 def ply(
-    form: str, properties: Sequence[tuple[str, str]], rows: Sequence[tuple[float, ...]], *, newline: str = "\n",
-    before: str = "", lines: str = "", ahead: bytes = b"", count: int | None = None,
+    form: str, properties: Sequence[tuple[str, str]], rows: Sequence[tuple[float, ...]], *,
+    newline: str = "\n", before: str = "", lines: str = "", ahead: bytes = b"", count: int | None = None,
 ) -> bytes:  # fmt: skip
     """Return a file whose vertices have properties (type, name), after ``before`` with bytes ``ahead``."""
     head = f"ply\nformat {form} 1.0\n{before}element vertex {len(rows) if count is None else count}\n"
