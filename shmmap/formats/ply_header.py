@@ -218,7 +218,7 @@ class _Parser:
         elif key == "element" and len(rest) == 2:
             self._element(*rest)
         elif (
-            key == "property" and self.elements and (len(rest) == 2 or (rest[0] == "list" and len(rest) == 4))
+            key == "property" and self.elements and (len(rest) == 2 or (len(rest) == 4 and rest[0] == "list"))
         ):
             self._property(rest)
         else:
