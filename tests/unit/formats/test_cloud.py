@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+import builtins
 import os
+import platform
 import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from shmmap.errors import MapDataError
+from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_cloud, read_pcd
+from shmmap.formats.open3d_package import SYSTEM_PACKAGES, load_open3d
 from tests.support.pcd_bytes import Field, column, pcd
 
 PLY = (
@@ -157,3 +161,20 @@ def test_what_is_no_file_is_refused_for_that(tmp_path: Path, name: str) -> None:
     with pytest.raises(MapDataError) as caught:
         describe(tmp_path / name)
     assert caught.value.cause == "not_regular"
+
+
+def test_missing_system_libraries_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "open3d":
+            raise ImportError("libEGL.so.1: cannot open shared object file")
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ShmmapError) as caught:
+        load_open3d("the layer normals")
+    assert not isinstance(caught.value, MapDataError)
+    for package in SYSTEM_PACKAGES:
+        assert package in str(caught.value)
+    assert ("libgfortran5" in SYSTEM_PACKAGES) == (platform.machine() != "x86_64")
