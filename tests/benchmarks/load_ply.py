@@ -11,8 +11,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.formats.cloud import read_cloud
 from shmmap.formats.pcd.writer import write_pcd
@@ -24,7 +26,7 @@ LIMIT = 1.3
 def write_both(folder: Path, points: int) -> tuple[Path, Path, Path]:
     """Write the same rows as PCD and as PLY of both byte orders; returns their paths."""
     rng = np.random.default_rng(1)
-    columns = {axis: rng.random(points, np.float32) * 100 for axis in "xyz"}
+    columns: dict[str, NDArray[Any]] = {axis: rng.random(points, np.float32) * 100 for axis in "xyz"}
     columns["intensity"] = rng.random(points, np.float32)
     columns["ring"] = rng.integers(0, 128, points).astype(np.uint16)
     columns["time"] = rng.random(points)

@@ -198,4 +198,5 @@ def test_a_cloud_in_feet_is_refused_with_the_factor_or_converted(
         one = daemon(tmp_path / "feet.las", "--unit", unit)
         reply = connect(one).area(circle(0.0, 0.0, 4000.0))
         x = np.concatenate([read_pcd(Path(cell.id))["x"] for cell in reply.cells])
-        assert (len(x), float(x.max())) == (500, pytest.approx(farthest, abs=1e-3))
+        assert len(x) == 500
+        assert float(x.max()) == pytest.approx(farthest, abs=1e-3)

@@ -11,6 +11,7 @@ import numpy as np
 
 from shmmap.formats.pcd.writer import write_pcd
 from tests.support.daemon_process import ROOT
+from tests.support.las_files import write_las
 
 _WITHOUT = (
     "import sys\n"
@@ -57,7 +58,8 @@ def test_no_format_needs_open3d(tmp_path: Path) -> None:
 
 
 def test_las_without_laspy(tmp_path: Path) -> None:
-    (tmp_path / "a.las").write_bytes(b"LASF" + bytes(400))
+    columns = {axis: np.arange(5, dtype=np.float32) for axis in "xyz"}
+    write_las(tmp_path / "a.las", {**columns, "intensity": np.zeros(5)})
     done = without("laspy", "inspect", tmp_path / "a.las")
     assert done.returncode == 69
     assert "LAS and LAZ need the Python package laspy" in done.stderr
