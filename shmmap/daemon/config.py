@@ -14,6 +14,7 @@ from typing import Any, Final
 from shmmap.daemon.config_file import KINDS, Setting, read_settings_file
 from shmmap.daemon.config_live import LiveSettings, live_settings
 from shmmap.errors import BadRequest, ConfigError
+from shmmap.formats.coordinate_system import UNITS
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
     EVENTS_LONGER,
@@ -42,6 +43,8 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
     "log_level": (lambda value: value in ("debug", "info", "warning"), "debug, info or warning"),
+    "unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
+    "vertical_unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
     "eviction": (lambda value: value in ("time", "distance", "lru"), "time, distance or lru"),
     "ride_out_s": (lambda value: 0 <= value <= 3600, "seconds, 0 to 3600"),
     "prefetch_share": (
@@ -89,6 +92,9 @@ class DaemonConfig:
         more, for points alone.
     load_timeout_s
         How long loading one cell may take.
+    unit, vertical_unit
+        Of a cloud's coordinates, in the plane and in height: ``auto``, ``m``, ``ft`` or ``us-ft``; empty:
+        metres, and a cloud that says otherwise is refused.
     strict
         Accept only what Autoware's own loader accepts.
     watch
@@ -130,6 +136,8 @@ class DaemonConfig:
     session_quota: float = 0.9
     workers: int = 0
     load_timeout_s: float = 60.0
+    unit: str = ""
+    vertical_unit: str = ""
     strict: bool = False
     watch: bool = False
     cache_dir: str = ""

@@ -116,7 +116,7 @@ def run(config: DaemonConfig) -> int:
         if config.map_path:
             origin = find_origin(
                 config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
-                tell=notify,
+                unit=config.unit, vertical_unit=config.vertical_unit, tell=notify,
             )  # fmt: skip
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere

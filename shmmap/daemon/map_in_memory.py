@@ -118,7 +118,7 @@ class MapInMemory:
             prefetch_share=config.prefetch_share,
             ride_out_s=config.ride_out_s,
         )
-        Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
+        Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced).take_over(time.monotonic())
         self.cache.tell_all()
         self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
         if pins.fd >= 0:

@@ -147,6 +147,13 @@ def check_map_access(patient: Patient) -> Finding:
                 f"{path} is being served, but reading it found {counted(problems, 'problem')}",
                 "the daemon's log names them, and so does `shmmap reload`",
             )
+        outside = patient.seen.counters.get("cells_outside_box", 0) if patient.seen is not None else 0
+        if outside:
+            return warn(
+                name,
+                f"{path} is being served, but points of {counted(outside, 'cell')} lie outside its box",
+                "moved without the metadata? the daemon's log names them, and so does `shmmap inspect`",
+            )
         return ok(name, f"{path} is being served")
     if not os.path.exists(path):
         try:

@@ -116,6 +116,7 @@ def derive(
             source_digest=combined_digest(source.digest, [digest for _, digest in around]),
             source_points=source.source_points,
             dropped_points=source.dropped_points,
+            outside_points=source.outside_points,
         ),
         builder_version=spec.builder_version,
         units=table.units,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 
-from shmmap.cli.options import Subparsers, add_verb
+from shmmap.cli.options import Subparsers, add_unit_options, add_verb
 
 __all__ = ["add_parser", "run"]
 
@@ -43,6 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--strict", action="store_true", default=None, help="refuse what Autoware's own loader refuses"
     )
+    add_unit_options(parser)
     parser.add_argument(
         "--watch",
         action="store_true",

@@ -16,6 +16,7 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
+from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
@@ -49,8 +50,9 @@ class Scheduler:
     ----------
     loads
         What is wanted, queued and under way, and what failed.
-    prefetcher, room, lost
-        Wishes for what nobody has asked for yet; asks the cache for room; replaces workers.
+    prefetcher, room, misplaced, lost
+        Wishes for what nobody has asked for yet; asks the cache for room; counts cells with points outside
+        their box; replaces workers.
     on_settled
         Called with a key when its load ended, in whichever way.
     unfinished : bool
@@ -77,6 +79,7 @@ class Scheduler:
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
+        self.misplaced = MisplacedCells(cache)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
     # --- being asked ----------------------------------------------------------------------------
@@ -106,6 +109,7 @@ class Scheduler:
     def map_changed(self) -> None:
         """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
         self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+        self.misplaced.map_changed()
 
     def _drop_some(self) -> None:
         for _ in range(min(LOOKS_A_PUMP, len(self._doubtful))):
@@ -127,6 +131,7 @@ class Scheduler:
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
         self._drop_some()
+        self.misplaced.check_some(LOOKS_A_PUMP)
         self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
 
     def _hand_out_one(self, now_s: float) -> bool:
@@ -281,6 +286,7 @@ class Scheduler:
             why = f"{limit.message} ({limit.hint})" if limit is not None else str(error.strerror)
             self._fail(load, failure_code(error), f"its segment cannot be published: {why}", None, now_s)
             return
+        self.misplaced.note(key.cell_id, index, done.outside)
         took_ns = int((now_s - load.started_s) * 1e9)
         cache.tell(cache.events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)
         for warning in done.warnings:

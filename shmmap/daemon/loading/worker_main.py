@@ -127,7 +127,7 @@ class _Worker:
                 job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
                 header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
                 tuple(warning[:500] for warning in made.warnings[:20]),
-                tuple(stamp.token for stamp in made.neighbours), made.cached,
+                tuple(stamp.token for stamp in made.neighbours), made.cached, header.outside_points,
             )  # fmt: skip
             step("worker.pass")
             self._send(done)

@@ -88,7 +88,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
-    the disk cache.
+    the disk cache; ``outside`` points lie outside the cell's box.
     """
 
     number: int
@@ -103,6 +103,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     warnings: tuple[str, ...] = ()
     neighbours: tuple[Stamp, ...] = ()
     cached: bool = False
+    outside: int = 0
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
