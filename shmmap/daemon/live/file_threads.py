@@ -35,12 +35,17 @@ class FileThreads:
     def __init__(self, on_done: Callable[[], None]) -> None:
         self._threads = ThreadPoolExecutor(THREADS, "live-files")
         self._running: dict[Future[list[Future[Any]]], list[Job]] = {}
+        self._progress_s = 0.0
         self._on_done = on_done
 
     @property
     def are_idle(self) -> bool:
         """Whether all was done and told."""
         return not self._running
+
+    def idle_s(self, now_s: float) -> float:
+        """For how long nothing has been done although something is to be."""
+        return now_s - self._progress_s if self._running else 0.0
 
     def start(self, jobs: list[Job]) -> None:
         """Have them done, several by one thread."""
@@ -52,7 +57,10 @@ class FileThreads:
 
     def tell(self, now_s: float) -> None:
         """Tell what came of those that are done."""
-        for future in [future for future in self._running if future.done()]:
+        done = [future for future in self._running if future.done()]
+        if done or not self._running:
+            self._progress_s = now_s
+        for future in done:
             for job, outcome in zip(self._running.pop(future), future.result(), strict=True):
                 job.then(outcome, now_s)
 
@@ -60,10 +68,11 @@ class FileThreads:
         """Wait until there is something to tell, at most so long; not at all if nothing is being done."""
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
-    def close(self) -> list[Any]:
-        """Wait until all is done; returns what came of it and was not told, but errors."""
-        self._threads.shutdown()
-        untold = [outcome for future in self._running for outcome in future.result()]
+    def close(self, seconds: float) -> list[Any]:
+        """Wait until all is done, at most so long; returns what came of it and was not told, but errors."""
+        done, _ = wait(list(self._running), timeout=seconds)
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        untold = [outcome for future in done for outcome in future.result()]
         self._running.clear()
         return [outcome.result() for outcome in untold if outcome.exception() is None]
 
