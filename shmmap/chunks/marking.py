@@ -93,7 +93,7 @@ class Marker:
         reach_m = FURTHEST_SENSOR * self.resolution
         if not (np.abs(rigid[:, 3]) < reach_m).all():
             raise BadRequest(
-                f"pose: the sensor is at {rigid[:, 3].tolist()}; {reach_m:.4g} m along an axis are the most",
+                f"pose: sensor at {rigid[:, 3].tolist()}, further than {reach_m:.4g} m from the map's origin",
                 hint="map in a frame whose origin is nearer, or make the map with larger voxels",
             )
         sensor = voxel_indices(rigid[None, :, 3], self.resolution)[0].astype(np.int64)
@@ -174,12 +174,12 @@ def _rigid(pose: ArrayLike) -> NDArray[np.float64]:
     whole = _numbers("pose", pose).astype(np.float64)
     if whole.shape not in ((3, 4), (4, 4)):
         raise BadRequest(f"pose: need the shape (3, 4) or (4, 4), not {whole.shape}")
-    if len(whole) == 4 and not np.allclose(whole[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
-        raise BadRequest(f"pose: its last row is {whole[3].tolist()}, not 0 0 0 1: is it transposed?")
     rigid = np.ascontiguousarray(whole[:3])
     rotation = rigid[:, :3]
     if not np.isfinite(rigid).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
         raise BadRequest("pose: need a rotation and a finite position")
     if np.linalg.det(rotation) < 0:
         raise BadRequest("pose: it mirrors what it should turn")
+    if len(whole) == 4 and not np.allclose(whole[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=1e-6):
+        raise BadRequest(f"pose: its last row is {whole[3].tolist()}, not 0 0 0 1: is it transposed?")
     return rigid

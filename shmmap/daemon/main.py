@@ -70,7 +70,7 @@ from shmmap.statistics.exclusive_name import refuse_second
 
 __all__ = ["run"]
 
-LIVE_S: Final = 2.0
+LIVE_S: Final = 1.5
 """How long points wait for live maps at the start: whatever is wrong with those, points are served."""
 LIVE_ALONE_S: Final = 120.0
 """How long the daemon waits for live maps where it serves nothing else: kernels are compiled, too."""

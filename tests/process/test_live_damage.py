@@ -15,15 +15,17 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
 import shmmap
-from shmmap.errors import CannotWrite, LiveInterrupted
+from shmmap.errors import BadRequest, CannotWrite, LiveInterrupted
 from shmmap.protocol.live import LiveMapRow
 from tests.process.conftest import DaemonFactory
-from tests.process.test_doctor import doctor
 from tests.support.divided_map import DividedMap
+from tests.support.doctor_verb import doctor
 from tests.support.hanging_directory import HangingDirectory
 from tests.support.live_daemon import SETTINGS, LiveDaemon
 from tests.support.live_drive import FILTER, RESOLUTION, drive
@@ -92,6 +94,16 @@ def sparse_map(directory: Path) -> None:
     sparse(directory / "map.json")
 
 
+def a_file_instead(directory: Path) -> None:
+    directory.rename(f"{directory}.away")
+    directory.touch()
+
+
+def the_directory_again(directory: Path) -> None:
+    directory.unlink()
+    Path(f"{directory}.away").rename(directory)
+
+
 DEVICE = stat.S_IFCHR | 0o600
 DAMAGES = [
     instead_of_a_chunk("directory", "it is a directory", lambda path: path.mkdir()),
@@ -111,10 +123,7 @@ DAMAGES = [
         "sparse", "more than", sparse_map,
         lambda path: (path.parent / "sparse.map.json").replace(path / "map.json"),
     ),
-    Damage(
-        "file", "Not a directory", lambda path: [path.rename(f"{path}.away"), Path(path).write_bytes(b"")],
-        lambda path: [os.remove(path), Path(f"{path}.away").rename(path)][1],
-    ),
+    Damage("file", "Not a directory", a_file_instead, the_directory_again),
     Damage(
         "closed", "Permission denied", lambda path: os.chmod(largest(path), 0),
         lambda path: os.chmod(largest(path), 0o600),
@@ -310,6 +319,43 @@ def test_a_directory_that_is_moved_or_replaced(live_daemon: LiveDaemon, tmp_path
             away.rename(tmp_path / "lidar")
             until_problems(client, set())
         assert held(live, "disk") == reference(scans[:2])
+
+
+def test_arguments_that_make_no_sense_end_no_mapper(live_daemon: LiveDaemon) -> None:
+    """Each is refused before anything is sent, with an error of ours; the mapper and the reader live on."""
+    one, scans = live_daemon(), drive(2)
+    nan, nothing = float("nan"), cast("Any", None)
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            mapper.add(*scans[0])
+            reach = 2**29 * RESOLUTION
+            for axis, metres in ((0, reach), (1, -reach), (2, 1.9 * reach), (0, 1e300)):
+                pose = scans[1][1].copy()
+                pose[axis, 3] = metres
+                with pytest.raises(BadRequest, match="pose"):
+                    mapper.add(scans[1][0], pose)
+            refused: list[Callable[[], object]] = [
+                lambda: mapper.add(scans[1][0], nothing), lambda: mapper.add(nothing, scans[1][1]),
+                lambda: mapper.wait_applied(nan), lambda: mapper.wait_durable(nan),
+                lambda: mapper.wait_applied(-1),
+                lambda: mapper.wait_durable(cast("Any", "soon")),
+                lambda: live.mapper("rear", timeout_s=nan), lambda: live.save(timeout_s=nan),
+                lambda: live.move_to(nan, 0.0, 0.0), lambda: live.move_to(nothing, 0.0, 0.0),
+                lambda: live.move_to(reach, 0.0, 0.0), lambda: live.log_odds(nothing),
+                lambda: live.log_odds([[nan] * 3]), lambda: live.log_odds([1.0, 2.0]),
+                lambda: live.first_hits([0.0, 0.0, 0.0], [1e5, 0.0, 0.0]),
+                lambda: live.first_hits([0.0, 0.0, 0.0], [nan, 0.0, 0.0]),
+                lambda: live.first_hits(np.zeros((2, 3)), np.ones((3, 3))),
+                lambda: live.first_hits(np.ma.MaskedArray(np.zeros((1, 3)), True), [1.0, 0.0, 0.0]),
+            ]  # fmt: skip
+            for call in refused:
+                with pytest.raises(BadRequest):
+                    call()
+            assert mapper.add(*(array.tolist() for array in scans[1])) == 2
+            mapper.wait_applied()
+        assert held(live) == reference(scans)
+        assert live.first_hits([0.0, 0.0, 0.0], [10_000.0, 0.0, 0.0]).shape == (1,)
 
 
 @pytest.mark.root
