@@ -17,7 +17,7 @@ from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
 from shmmap.client.live.patience import checked_seconds, until_served
-from shmmap.client.live.voxels import Voxels, open_voxels
+from shmmap.client.live.voxels import Voxels, read_voxels
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, StaleHandle
 from shmmap.optional_packages import needed_packages
@@ -37,6 +37,8 @@ LIST_S: Final = 60.0
 SAVE_S: Final = 300.0
 MOST_RAY_VOXELS: Final = 100_000
 """Along an axis, of a ray that is followed: 5 km of voxels of 5 cm take about half a second."""
+LISTS: Final = 4
+"""Lists of voxels that are asked for, one after the other, until one is there while it is read."""
 
 
 class Sphere(msgspec.Struct, frozen=True):
@@ -196,10 +198,7 @@ class LiveMap:
 
     def _place(self) -> Place:
         opened = self._opened
-        return Place(
-            self._shm_dir + opened.prefix, self.map_id, self._session.welcome.session, self.resolution,
-            opened.occupied_above,
-        )  # fmt: skip
+        return Place(self._shm_dir + opened.prefix, self.map_id, self.resolution, opened.occupied_above)
 
     @property
     def _shm_dir(self) -> str:
@@ -215,7 +214,7 @@ class LiveMap:
         scope: str = "memory",
         since: int = 0,
     ) -> Voxels:
-        """Voxels of an area, which the daemon puts together in shared memory.
+        """Voxels of an area, which the daemon puts together.
 
         Parameters
         ----------
@@ -238,14 +237,15 @@ class LiveMap:
         def ask(request: int) -> messages.LiveRequest:
             return messages.LiveVoxels(request, self.name, kind, message, scope, since)
 
-        with contextlib.suppress(StaleHandle):  # the process that made it ended just then
-            return self._listed(ask)
+        for _ in range(LISTS - 1):
+            with contextlib.suppress(StaleHandle):  # its maker ended, or this process was stopped for long
+                return self._listed(ask)
         return self._listed(ask)
 
     def _listed(self, ask: Callable[[int], messages.LiveRequest]) -> Voxels:
         reply = self._ask(ask, messages.LiveVoxelsReply, quiet_s=LIST_S)
         try:
-            return open_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
+            return read_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
         finally:
             self._ask(lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased)
 
@@ -331,8 +331,19 @@ def _area(area: geometry.Box | Sphere | None) -> messages.LiveArea | None:
     if area is None:
         return None
     if isinstance(area, Sphere):
-        return messages.SphereMessage(area.x, area.y, area.z, area.radius)
+        x, y, z, radius = _metres(area.x, area.y, area.z, area.radius)
+        if not all(abs(value) < messages.FURTHEST_M for value in (x, y, z, radius)) or radius < 0.0:
+            raise BadRequest(f"{area}: it is not finite, or nothing can lie in it")
+        return messages.SphereMessage(x, y, z, radius)
     message = area_to_message(area)
     if not isinstance(message, BoxMessage):
         raise BadRequest("an area of a live map is a Box or a Sphere")
     return message
+
+
+def _metres(*values: float) -> tuple[float, ...]:
+    """Numbers as they can be sent; BadRequest where one is greater than any float."""
+    try:
+        return tuple(float(value) for value in values)
+    except OverflowError as error:
+        raise BadRequest(f"{values}: a number of metres is not finite") from error

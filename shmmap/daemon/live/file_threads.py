@@ -7,11 +7,13 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any, Final, NamedTuple
 
-__all__ = ["FileThreads", "Job"]
+__all__ = ["CLOSE_S", "FileThreads", "Job"]
 
 THREADS: Final = 4
 """One of them flushes.  More would wait for each other: all that they do between two calls of the kernel
 they do one at a time."""
+CLOSE_S: Final = 5.0
+"""How long files that are being read or written at the end may take: a directory that hangs is left alone."""
 FILES_TOGETHER: Final = 8
 """Files that a thread reads or writes, one after the other, until it says so: to be told costs as much."""
 
@@ -30,10 +32,12 @@ class FileThreads:
     ----------
     on_done
         Called, in a thread, when there is something to be told.
+    threads
+        How many there are.
     """
 
-    def __init__(self, on_done: Callable[[], None]) -> None:
-        self._threads = ThreadPoolExecutor(THREADS, "live-files")
+    def __init__(self, on_done: Callable[[], None], threads: int = THREADS) -> None:
+        self._threads = ThreadPoolExecutor(threads, "live-files")
         self._running: dict[Future[list[Future[Any]]], list[Job]] = {}
         self._progress_s = 0.0
         self._on_done = on_done
@@ -68,7 +72,7 @@ class FileThreads:
         """Wait until there is something to tell, at most so long; not at all if nothing is being done."""
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
-    def close(self, seconds: float) -> list[Any]:
+    def close(self, seconds: float = CLOSE_S) -> list[Any]:
         """Wait until all is done, at most so long; returns what came of it and was not told, but errors."""
         done, _ = wait(list(self._running), timeout=seconds)
         self._threads.shutdown(wait=False, cancel_futures=True)

@@ -32,6 +32,7 @@ from shmmap.protocol.live import LiveList, LiveListed, LiveMapRow, LiveRequest
 
 __all__ = ["LiveRelay", "NoLiveMaps"]
 
+BEAT_S: Final = 0.5
 BEGINNING_S: Final = 2.0
 """How long a worker that does not serve yet may take to end."""
 END_S: Final = 60.0
@@ -172,8 +173,9 @@ class LiveRelay:
                 if self._failures > STARTS:
                     break
                 self.start()
-            self._wait(left_s)
+            self._wait(min(left_s, BEAT_S))
             self.hear()
+            self._events.beat()
         if alone and self._refused is not None:
             raise self._refused
         if not self._serving:
