@@ -59,7 +59,7 @@ from shmmap.daemon.service_manager.more_time import MoreTime
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.service_manager.status import ServiceManager, notify
 from shmmap.dividing.served_cloud import find_origin
-from shmmap.errors import ConfigError, ShmmapError
+from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.origin.map_layout import absolute_path
@@ -72,6 +72,10 @@ from shmmap.statistics.exclusive_name import refuse_second
 
 __all__ = ["run"]
 
+LIVE_S: Final = 1.5
+"""How long points wait for live maps at the start: whatever is wrong with those, points are served."""
+LIVE_ALONE_S: Final = 120.0
+"""How long the daemon waits for live maps where it serves nothing else: kernels are compiled, too."""
 SWITCH_S: Final = 0.0005
 """How long a thread that reads the map again may keep the serving loop waiting for the interpreter."""
 
@@ -156,7 +160,7 @@ def run(config: DaemonConfig) -> int:
         )
         service.run(started_s)
     log.info("stopped", instance=config.instance)
-    return 0
+    return CannotWrite.exit_code if live.unsaved else 0
 
 
 def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:
@@ -165,7 +169,7 @@ def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException]
 
 
 def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay | NoLiveMaps:
-    """Bring the live maps into memory."""
+    """Have the live maps brought into memory."""
     if not config.live:
         return NoLiveMaps()
     mappers = Authorization(config.live_group, "live_group")
@@ -178,7 +182,7 @@ def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay
     relay = LiveRelay(begin, memory.watched, mappers.allow, events)
     try:
         relay.start()
-        relay.wait_until_serving()
+        relay.wait_until_serving(LIVE_S if config.map_path else LIVE_ALONE_S, alone=not config.map_path)
     except BaseException:
         relay.close(keep=True)
         raise

@@ -18,6 +18,7 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.budget import choose_budget, loader_bytes
 from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
+from shmmap.daemon.live.place import bytes_beside_cells
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
 from shmmap.daemon.loading.scheduler import Scheduler
@@ -76,6 +77,12 @@ class MapInMemory:
             config.budget_bytes,
             directory,
             ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
+            beside_bytes=bytes_beside_cells(
+                len(config.live),
+                cells=directory,
+                shm_dir=config.live_shm_dir,
+                budget_bytes=config.live_budget_bytes,
+            ),
             limit_bytes=group_limit,
         )
         try:

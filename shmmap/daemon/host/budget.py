@@ -45,7 +45,12 @@ def room_in_group(limit_bytes: int) -> int:
 
 
 def choose_budget(
-    asked_bytes: int, directory: ShmDirectory, *, ours_bytes: int = 0, limit_bytes: int | None = None
+    asked_bytes: int,
+    directory: ShmDirectory,
+    *,
+    ours_bytes: int = 0,
+    beside_bytes: int = 0,
+    limit_bytes: int | None = None,
 ) -> int:
     """Return the budget in bytes.
 
@@ -60,6 +65,8 @@ def choose_budget(
         The explicit budget; 0 for the default.
     ours_bytes
         What an earlier life of the daemon left in the directory: it is ours to keep or to free.
+    beside_bytes
+        What the default budget leaves of the file system to live maps.
     limit_bytes
         Memory limit of the control group; None for none.
 
@@ -101,7 +108,8 @@ def choose_budget(
                 f"a budget of {asked_bytes} bytes is too small", key="budget", hint="use at least 1M"
             )
         return asked_bytes
-    budget = min((_memory_bytes("MemAvailable") + ours_bytes) // 4, DEFAULT_CEILING_BYTES, room)
+    available_bytes = (_memory_bytes("MemAvailable") + ours_bytes) // 4
+    budget = min(available_bytes, DEFAULT_CEILING_BYTES, room - beside_bytes)
     if budget < SMALLEST_BYTES:
         raise CannotStart(
             f"{directory.path} has only {free} bytes free",

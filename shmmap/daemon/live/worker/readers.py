@@ -110,7 +110,7 @@ class Readers:
         self.lists.left(session)
 
     def close(self) -> None:
-        """Wait for what is in threads."""
+        """Wait a moment for what is in threads."""
         self._threads.close()
 
     def begin(self, ask: Ask, message: messages.LiveChunks | messages.LiveVoxels) -> None:
