@@ -119,7 +119,8 @@ class Scheduler:
         """Free what is due: what was refused for lack of memory may fit now."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.forget_refusals()
-        self._cache.look_for_some(now_s)
+        if self._cache.look_for_some(now_s):
+            self.loads.forget_refusals()
 
     def pump(self, now_s: float) -> None:
         """Hand a queued load to a worker if memory and workers allow; see `unfinished`."""
