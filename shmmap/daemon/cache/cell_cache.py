@@ -9,7 +9,7 @@ of `shmmap.daemon.loading.scheduler`, which publishes here.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Any, Final
 
@@ -321,14 +321,15 @@ class CellCache:
         if names is None:
             self._unsure = self.ledger.segments.walk()
             return False
-        residents = map(self.ledger.resident_named, names)
-        return any([self.retire_if_lost(one, now_s) for one in residents if one is not None])
+        return self._retire_lost(names, now_s)
 
     def look_for_some(self, now_s: float) -> bool:
         """Look for a few segments after so many names vanished that the kernel lost count."""
-        some = list(islice(self._unsure, LOOKS_FOR_NAMES))
-        residents = (self.ledger.resident_named(one.name) for one in some)
-        return any([self.retire_if_lost(one, now_s) for one in residents if one is not None])
+        return self._retire_lost([one.name for one in islice(self._unsure, LOOKS_FOR_NAMES)], now_s)
+
+    def _retire_lost(self, names: Iterable[str], now_s: float) -> bool:
+        residents = map(self.ledger.resident_named, names)
+        return sum(self.retire_if_lost(one, now_s) for one in residents if one is not None) > 0
 
     def retire_if_lost(self, resident: Resident, now_s: float) -> bool:
         """Retire a segment that others removed or cut short, so that its cell is loaded again."""

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from shmmap.daemon.records import Resident
 from shmmap.daemon.host.inotify import NAME_GONE, OVERFLOW, Inotify
-
+from shmmap.daemon.records import Resident
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes
 
