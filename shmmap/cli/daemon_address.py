@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
+__all__ = ["connect", "endpoint", "has_lost_socket", "instance", "shm_dir", "snapshot"]
 
 ANSWER_S: Final = 5.0
 """How long a verb waits for a daemon that is there, to connect and for each answer."""
@@ -81,6 +81,23 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
             else "start one with `shmmap serve MAP`, or say which: --endpoint, or --instance with --shm-dir",
         )
     return found, found.identity
+
+
+def has_lost_socket(found: Snapshot) -> bool:
+    """Whether clients cannot find the socket of a daemon that lives: another program removed it."""
+    from shmmap.statistics.identity import pid_namespace
+
+    if found.identity is None or found.counters.get("sockets_missing", 0):
+        return found.identity is not None
+    if found.identity.pid_namespace != pid_namespace():  # its paths may mean others here
+        return False
+    try:
+        os.lstat(found.identity.endpoint)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def _instances(directory: str) -> list[str]:

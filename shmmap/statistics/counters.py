@@ -154,6 +154,9 @@ COUNTERS: Final = (
     Counter(
         "live_restarts", "counter", "", "Times the process that keeps live maps ended, and was started anew"
     ),
+    Counter(
+        "sockets_missing", "gauge", "", "Sockets whose files others removed, and that cannot be made again"
+    ),
     *(
         Counter(f"longest_turn_{kind}_ns", "gauge", "ns", f"Longest turn in which {text}")
         for kind, text in TURN_KINDS.items()

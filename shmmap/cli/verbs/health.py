@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped": paused | "hung" | "dead", "beat_age_s", "pid", "instance",
+  {"state": "healthy" | "unreachable": its socket was removed | "stopped": paused | "hung" | "dead",
+   "beat_age_s", "pid", "instance",
    "defects": exceptions that the daemon survived, whose tracebacks its log has}
-Exit code: 0 healthy, 1 paused or hung, 69 dead or never started."""
+Exit code: 0 healthy, 1 unreachable, paused or hung, 69 dead or never started."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -28,8 +29,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "health",
         run,
         help="is the daemon healthy? (exit code 0: yes)",
-        description="Say whether the daemon is healthy, paused (by SIGSTOP or a debugger), hung or "
-        "dead.  Reads its statistics in shared memory, so it answers whatever the daemon does.",
+        description="Say whether the daemon is healthy, paused (by SIGSTOP or a debugger), hung, dead or "
+        "unreachable.  Reads its statistics in shared memory, so it answers whatever the daemon does.",
         json=_JSON,
     )
     add_statistics_options(parser)
@@ -37,13 +38,15 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print one word and why; return what the exit code says."""
-    from shmmap.cli.daemon_address import snapshot
+    from shmmap.cli.daemon_address import has_lost_socket, snapshot
 
     found, identity = snapshot(args)
+    lost = found.state == "healthy" and has_lost_socket(found)
+    state = "unreachable" if lost else found.state
     if args.json:
         print_json(
             {
-                "state": found.state,
+                "state": state,
                 "beat_age_s": round(found.beat_age_s, 6),
                 "pid": identity.pid,
                 "instance": identity.instance,
@@ -52,9 +55,14 @@ def run(args: argparse.Namespace) -> int:
         )
     else:
         age = format_duration(found.beat_age_s)
-        state = "paused" if found.state == "stopped" else found.state
-        print_line(f"{state}: pid {identity.pid}, last heartbeat {age} ago{_defects(found)}")
-    return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(found.state, 1)
+        told = "paused" if state == "stopped" else state
+        print_line(f"{told}: pid {identity.pid}, last heartbeat {age} ago{_defects(found)}")
+        if lost:
+            print_line(
+                f"another program removed its socket {identity.endpoint}: it makes it again within seconds,"
+                " or its log says what is in the way"
+            )
+    return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(state, 1)
 
 
 def _defects(found: Snapshot) -> str:

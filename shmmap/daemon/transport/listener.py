@@ -142,6 +142,15 @@ class Listener:
     hear: Callable[[Connection, bytes, bool], None]
     on_ended: Callable[[Connection], None]
 
+    def move_to(self, other: socket.socket) -> None:
+        """Listen at another socket; the connections there are stay, and those that wait are accepted."""
+        for _ in range(0, socket.SOMAXCONN, ACCEPTED_AT_ONCE):
+            self._accept()
+        self.watched.unwatch(self.socket.fileno())
+        self.socket.close()
+        self.socket = other
+        self.begin()
+
     def begin(self) -> None:
         """Accept connections from now on."""
         self.watched.watch(self.socket.fileno(), self._accept)
