@@ -13,6 +13,7 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.cell_names import CellNames
+from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
@@ -50,6 +51,11 @@ class Catalogue:
     by_base, made, fixed_digest
         What was made of the same names and boxes before: `CellNames.by_base`, `SpatialIndex.made` and
         `fixed_digest`.
+
+    Attributes
+    ----------
+    opened
+        Directories that its cells are to be read through; None: their paths have to do.
 
     Raises
     ------
@@ -90,6 +96,7 @@ class Catalogue:
         self._fixed_digest = fixed_digest
         self._map_version: int | None = None
         self.problems = tuple(problems)
+        self.opened: OpenedDirectories | None = None
 
     def _refuse_bad(self, boxes: NDArray[np.float64]) -> None:
         bad = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)

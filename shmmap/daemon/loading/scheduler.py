@@ -19,7 +19,7 @@ from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
-from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
@@ -105,6 +105,15 @@ class Scheduler:
     def map_changed(self) -> None:
         """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
         self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+        self.pool.read_through(self._opened)
+
+    @property
+    def _opened(self) -> Opened:
+        """The directory that files of the map are read through."""
+        catalogue = self._cache.catalogue
+        if catalogue.opened is None:
+            return NOT_OPENED
+        return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
     def _drop_some(self) -> None:
         for _ in range(min(LOOKS_A_PUMP, len(self._doubtful))):
@@ -153,7 +162,7 @@ class Scheduler:
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
-            taken = self.pool.submit(job, now_s, prefetch=load.prefetch)
+            taken = self.pool.submit(job, now_s, prefetch=load.prefetch, opened=self._opened)
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
             return True
