@@ -304,7 +304,7 @@ def connect(
     endpoint
         The daemon's socket, a path or an ``ipc://`` URL.  Without one: ``SHMMAP_ENDPOINT``, else the socket
         of the instance ``SHMMAP_INSTANCE`` (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not
-        set in ``$XDG_RUNTIME_DIR/shmmap`` and in ``/run/shmmap``, whichever answers first.
+        set in ``$XDG_RUNTIME_DIR/shmmap``, ``/tmp/shmmap-UID`` and ``/run/shmmap``, whichever answers first.
     timeout
         Seconds a reply may take; what a request lets the daemon wait comes on top.
     connect_timeout

@@ -160,6 +160,7 @@ class Service:
         try:
             self._watch_map()
             with contextlib.closing(ServingSignals()) as heard:
+                self._signals.raise_if_stopped()
                 watched.watch(heard.fd, lambda: self._on_signals(heard))
                 self._listen()
                 self._tell_epoch("started")
@@ -297,10 +298,10 @@ class Service:
 
     def _on_signals(self, heard: ServingSignals) -> None:
         for number in heard.take():
-            if number == RELOAD_SIGNAL:
+            if number == RELOAD_SIGNAL and not self._signals.hangup_stops:
                 self._reload()
-            elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._loop.stopping:
-                keep = self._signals.keep = number == KEEP_SIGNAL
+            elif number in (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL) and not self._loop.stopping:
+                keep = self._signals.keep = self._signals.keep or number == KEEP_SIGNAL
                 log.info("stopping", signal=number.name, segments="kept" if keep else "removed")
                 if not keep:
                     for again in STOP_SIGNALS:
