@@ -53,11 +53,9 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.doctor.patient import examine
 
     file = args.config or installed_config_file()
-    flags = {
-        "instance": daemon_address.instance(args) if args.instance or daemon_address.endpoint(args) else None,
-        "endpoint": daemon_address.endpoint(args),
-        "shm_dir": args.shm_dir,
-    }
+    flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}
+    if flags["endpoint"]:
+        flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
         print_json({"worst": worst(findings), "findings": [asdict(one) for one in findings]})
