@@ -7,7 +7,7 @@ ten (https://github.com/python/cpython/issues/95959).  What was ignored is signa
 
 from __future__ import annotations
 
-import _signal as signal  # of `signal`, which takes 2 ms to import
+import _signal as signal  # type: ignore[import-not-found]  # `signal` takes 2 ms to import
 import sys
 from types import FrameType
 from typing import Any, Final

@@ -24,6 +24,7 @@ from shmmap.daemon.host.inotify import (
     DIRECTORY,
     ENDED,
     NAMES_CHANGED,
+    OVERFLOW,
     SELF_GONE,
     SELF_MOVED,
     Inotify,
@@ -147,7 +148,8 @@ class FileWatch:
     def drain(self, now_s: float) -> None:
         """Take note of what the kernel tells, a bounded number of events at a time."""
         for event in self._inotify.read():
-            if event.mask & SELF_GONE or event.name in self._steps.get(event.watch, ()):
+            lost = event.mask & OVERFLOW
+            if lost or event.mask & SELF_GONE or event.name in self._steps.get(event.watch, ()):
                 self._way_changed(now_s)
             if event.mask & ENDED:
                 self._steps.pop(event.watch, None)
