@@ -163,6 +163,8 @@ class Service:
                 self._signals.raise_if_stopped()
                 watched.watch(heard.fd, lambda: self._on_signals(heard))
                 self._listen()
+                memory.statistics.set("starting", 0)
+                memory.statistics.beat()
                 self._tell_epoch("started")
                 self._live.tell()
                 memory.scheduler.pool.start_one()

@@ -18,6 +18,7 @@ from shmmap.origin.catalogue_bytes import Source
 from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
+from shmmap.origin.map_frame import read_map_frame
 from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
 from shmmap.origin.metadata_entries import MapMetadata, list_some
 from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES, TOO_LARGE, metadata_bytes, parse_metadata
@@ -109,19 +110,27 @@ class MapDirectory:
             The metadata is wrong, fits none of the files, or (strict) lacks some of them.
         """
         opened = OpenedDirectories()
-        key = self._key(find_layout(self.path, self.metadata, self.pcd_paths, opened))
+        layout = find_layout(self.path, self.metadata, self.pcd_paths, opened)
+        catalogue = self._catalogue(self._key(layout), fresh, before, opened)
+        catalogue.opened = opened
+        if layout.metadata is not None:
+            catalogue.frame = read_map_frame(opened.at(os.path.dirname(layout.metadata)))
+        return catalogue
+
+    def _catalogue(
+        self, key: str, fresh: bool, before: Tables | None, opened: OpenedDirectories
+    ) -> Catalogue:
         sidecar = sidecar_file(self.cache_dir, key)
-        found = None if fresh else load_sidecar(sidecar, key, opened.at)
+        if not fresh and (cached := load_sidecar(sidecar, key, opened.at)) is not None:
+            return cached
         try:
-            found = found or self.scanned(_READ_HERE_BYTES, opened)
+            return self.scanned(_READ_HERE_BYTES, opened)
         except MapDataError as error:
             if error.cause != TOO_LARGE:
                 raise
-            earlier = before if isinstance(before, Catalogue) else None
-            words = json.dumps([dataclasses.asdict(self), opened.descriptors])
-            found = read_apart(self.path, words, earlier, tuple(opened.descriptors.values()))
-        found.opened = opened
-        return found
+        earlier = before if isinstance(before, Catalogue) else None
+        words = json.dumps([dataclasses.asdict(self), opened.descriptors])
+        return read_apart(self.path, words, earlier, tuple(opened.descriptors.values()))
 
     def _key(self, layout: MapLayout) -> str:
         return json.dumps([layout.roots, layout.metadata, self.strict])

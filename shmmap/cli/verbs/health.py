@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "unreachable": its socket was removed | "stopped": paused | "hung" | "dead",
-   "beat_age_s", "pid", "instance",
+  {"state": "healthy" | "starting" | "unreachable": its socket was removed | "stopped": paused | "hung" |
+   "dead", "beat_age_s", "pid", "instance",
    "defects": exceptions that the daemon survived, whose tracebacks its log has}
-Exit code: 0 healthy, 1 unreachable, paused or hung, 69 dead or never started."""
+Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -29,8 +29,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "health",
         run,
         help="is the daemon healthy? (exit code 0: yes)",
-        description="Say whether the daemon is healthy, paused (by SIGSTOP or a debugger), hung, dead or "
-        "unreachable.  Reads its statistics in shared memory, so it answers whatever the daemon does.",
+        description="Say whether the daemon is healthy, starting (it does not listen yet), unreachable (its"
+        " socket was removed), paused (by SIGSTOP or a debugger), hung or dead.  Reads its statistics in shared"
+        " memory, so it answers whatever the daemon does.",
         json=_JSON,
     )
     add_statistics_options(parser)
