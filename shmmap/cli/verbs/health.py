@@ -30,8 +30,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="is the daemon healthy? (exit code 0: yes)",
         description="Say whether the daemon is healthy, starting (it does not listen yet), unreachable (its"
-        " socket was removed), paused (by SIGSTOP or a debugger), hung or dead.  Reads its statistics in shared"
-        " memory, so it answers whatever the daemon does.",
+        " socket was removed), paused (by SIGSTOP or a debugger), hung or dead.  Reads its statistics in"
+        " shared memory, so it answers whatever the daemon does.",
         json=_JSON,
     )
     add_statistics_options(parser)

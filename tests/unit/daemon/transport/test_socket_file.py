@@ -64,7 +64,8 @@ def test_a_socket_left_over_is_replaced(place: Path) -> None:
     one = SocketFile(str(place), -1)
     with closing(one):
         assert stat.S_IMODE(place.stat().st_mode) == 0o600
-        assert one.is_there
+        there = one.is_there
+        assert there
         one.remove()
         assert not place.exists()
         assert not one.is_there
