@@ -66,6 +66,11 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
 
     What a socket is named after need not be the instance's name, and its segments may be anywhere: where the
     statistics of that name are not those of the daemon at this socket, the socket is asked.
+
+    Raises
+    ------
+    NoSocket
+        No daemon has this socket, and the one of that name has another.
     """
     named, by_name = _named_socket(args), (instance(args), shm_dir(args))
     if _is_at(*by_name, named):
@@ -76,6 +81,11 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
         found = next(
             ((name, place) for place in places for name in _instances(place) if _is_at(name, place, named)),
             None,
+        )
+    if found is None and named and (other := _endpoint_of(*by_name)):
+        raise NoSocket(
+            f"no daemon has the socket {named}; instance {by_name[0]!r} listens at {other}",
+            hint="name that one with --endpoint or --instance",
         )
     return found or by_name
 
@@ -88,17 +98,25 @@ def _named_socket(args: argparse.Namespace) -> str:
 
 def _is_at(name: str, directory: str, socket: str) -> bool:
     """Whether there are statistics of a daemon, and it has this socket (any, if empty)."""
+    other = _endpoint_of(name, directory)
+    return other != "" and (not socket or os.path.realpath(other) == os.path.realpath(socket))
+
+
+def _endpoint_of(name: str, directory: str) -> str:
+    """The socket of the daemon with these statistics; empty where there are none, or none for this user.
+
+    That of one in another container, whose paths mean others here, is the one that the name stands for.
+    """
     from shmmap.statistics.identity import pid_namespace
     from shmmap.statistics.reader import read_statistics
 
     try:
         identity = read_statistics(name, directory).identity
     except (ShmmapError, OSError):
-        return False
-    if identity is None:
-        return False
-    elsewhere = identity.pid_namespace != pid_namespace()  # its paths may mean others here
-    return not socket or identity.endpoint == socket or (elsewhere and not os.path.exists(identity.endpoint))
+        return ""
+    if identity is None or identity.pid_namespace != pid_namespace():
+        return ""
+    return identity.endpoint
 
 
 def _asked(args: argparse.Namespace, socket: str) -> tuple[str, str] | None:

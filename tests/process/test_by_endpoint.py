@@ -80,6 +80,10 @@ def test_another_daemon_of_the_socket_s_name_is_not_meant(
     options = ("--endpoint", other_name.endpoint, "--shm-dir", other_name.shm_dir)
     assert f"pid {other_name.pid}," in shmmap("health", *options).stdout
     assert shmmap("health", "--endpoint", f"{other_name.runtime_dir}/none.sock").returncode == 69
+    other_name.stop()
+    for verb in ("health", "metrics", "status"):
+        done = shmmap(verb, *options)
+        assert (done.returncode, str(namesake.pid) in done.stdout) == (69, False), done
 
 
 def test_what_a_live_daemon_has_is_not_to_be_removed(other_name: DaemonProcess, tmp_path: Path) -> None:

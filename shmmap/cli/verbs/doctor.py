@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import print_hanging, print_json
+from shmmap.errors import NoSocket
 
 if TYPE_CHECKING:
     from shmmap.doctor.finding import Finding
@@ -55,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     file = args.config or installed_config_file()
     flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}
     if flags["endpoint"]:
-        flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
+        with contextlib.suppress(NoSocket):
+            flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
         print_json({"worst": worst(findings), "findings": [asdict(one) for one in findings]})
