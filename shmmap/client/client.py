@@ -404,8 +404,8 @@ def connect(
     endpoint
         The daemon's socket, a path or an ``ipc://`` URL; or an instance's name (a string without slash and
         point).  Without one: ``SHMMAP_ENDPOINT``, else the socket of the instance ``SHMMAP_INSTANCE``
-        (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not
-        set in ``$XDG_RUNTIME_DIR/shmmap`` and in ``/run/shmmap``, whichever answers first.
+        (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not set in ``$XDG_RUNTIME_DIR/shmmap``,
+        ``/tmp/shmmap-UID`` and ``/run/shmmap``, whichever answers first.
     instance
         Name of the daemon's instance, instead of an endpoint or ``SHMMAP_INSTANCE``.
     timeout

@@ -29,7 +29,7 @@ from shmmap.protocol.endpoint import (
 )
 from shmmap.segment.names import check_instance
 
-__all__ = ["candidates", "check_socket", "find_socket"]
+__all__ = ["candidates", "check_socket", "find_socket", "is_served"]
 
 _SIGNATURE_BYTES: Final = 10
 _FULL_S: Final = 0.005
@@ -181,6 +181,25 @@ def check_socket(path: str, deadline_s: float) -> None:
                     f"{path}: what listens there does not speak ZeroMQ",
                     hint="is this the socket of another program?",
                 )
+
+
+def is_served(path: str) -> bool:
+    """Whether a daemon runs that has the request socket ``path``, without connecting to that.
+
+    A service manager may listen there for a daemon that does not run, and would start it; the socket of
+    events is made by daemons alone.
+    """
+    import socket
+
+    events = path.removesuffix(".sock") + ".events.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        try:
+            probe.connect(events)
+        except BlockingIOError:  # it has not got round to accepting
+            return True
+        except OSError:
+            return False
+    return True
 
 
 def _no_answer(path: str) -> NoAnswer:

@@ -20,7 +20,7 @@ from shmmap.protocol.endpoint import (
     EVENTS_LONGER,
     SYSTEM_RUNTIME_DIR,
     endpoint_path,
-    runtime_dirs,
+    fallback_runtime_dir,
     socket_path,
 )
 from shmmap.segment.directory import DEFAULT_SHM_DIR
@@ -170,14 +170,10 @@ def _events_longer(endpoint: str) -> int:
 
 
 def _default_runtime_dir() -> str:
-    candidates = runtime_dirs()
-    if len(candidates) > 1 or os.geteuid() == 0:
-        return candidates[0]
-    raise ConfigError(
-        "no runtime directory: XDG_RUNTIME_DIR is not set and this user may not use " + SYSTEM_RUNTIME_DIR,
-        key="runtime_dir",
-        hint="give --runtime-dir DIR, and the same to clients or SHMMAP_ENDPOINT",
-    )
+    own = os.environ.get("XDG_RUNTIME_DIR", "")
+    if own.startswith("/"):
+        return f"{own}/shmmap"
+    return SYSTEM_RUNTIME_DIR if os.geteuid() == 0 else fallback_runtime_dir()
 
 
 def parse_bytes(text: str) -> int:

@@ -36,6 +36,7 @@ from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.live_events import LiveEvents
+from shmmap.daemon.events.publisher import events_path
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
@@ -58,6 +59,7 @@ from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.service_manager.more_time import MoreTime
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.service_manager.status import ServiceManager, notify
+from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
@@ -127,7 +129,7 @@ def run(config: DaemonConfig) -> int:
             config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
         )
         with signals.held():
-            lock = InstanceLock(lock_path(path))
+            lock = InstanceLock(lock_path(path), partial(_refuse_taken, path, activated))
             stack.callback(lock.release)
             # two runtime directories may share a directory of segments
             refuse_second(directory, config.instance)
@@ -157,10 +159,18 @@ def run(config: DaemonConfig) -> int:
             gid,
             signals,
             activated,
+            lock,
         )
         service.run(started_s)
     log.info("stopped", instance=config.instance)
     return CannotWrite.exit_code if live.unsaved else 0
+
+
+def _refuse_taken(path: str, activated: ActivatedSocket | None) -> None:
+    """Refuse sockets that others have now, not once the map is read."""
+    if activated is None:
+        refuse_taken(path)
+    refuse_taken(events_path(path))
 
 
 def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:

@@ -134,7 +134,7 @@ class MapInMemory:
             )
         if self.cache.names.fd >= 0:
             self.watched.watch(
-                self.cache.names.fd, lambda: self.cache.hear_of_names(time.monotonic()), "memory"
+                self.cache.names.fd, lambda: self.scheduler.room.names_vanished(time.monotonic()), "memory"
             )
 
     def close(self, *, keep: bool) -> None:

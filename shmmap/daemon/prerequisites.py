@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib
 import os
@@ -17,6 +18,7 @@ from shmmap.daemon.pins.watch import PinWatch
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.logfmt import log
 from shmmap.processes.limits import file_size_limit
+from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = [
@@ -86,7 +88,16 @@ def check_file_size_limit(budget_bytes: int) -> None:
 
 
 def make_runtime_dir(path: Path, gid: int) -> None:
-    """Make the directory of the socket, for the owner and, where there is one, the group."""
+    """Make the directory of the socket, for the owner and, where there is one, the group.
+
+    Raises
+    ------
+    CannotStart
+        It cannot be made, or in /tmp somebody else has made it.
+    """
+    if str(path) == fallback_runtime_dir():
+        _make_private(path)
+        return
     if path.is_dir():
         return
     try:
@@ -97,6 +108,18 @@ def make_runtime_dir(path: Path, gid: int) -> None:
         raise CannotStart(
             f"runtime directory {path}: {error.strerror}", hint="make it, or give another --runtime-dir"
         ) from error
+
+
+def _make_private(path: Path) -> None:
+    """Make the directory in /tmp that is used without ``XDG_RUNTIME_DIR``, for the owner alone."""
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    if why := why_not_private(str(path)):
+        raise CannotStart(
+            f"runtime directory {path}: {why}",
+            hint="see whose it is and remove it, or set XDG_RUNTIME_DIR, or give --runtime-dir",
+        )
+    log.info("runtime directory", path=path, reason="XDG_RUNTIME_DIR is not set")
 
 
 def choose_pins(directory: ShmDirectory) -> PinWatch:

@@ -154,7 +154,6 @@ class DividedCloud:
                 if not os.path.isdir(out):  # another daemon may have divided it
                     self._divide(out)
                 _point(link, name)
-                self._remove_others(name)
             self._sweep()
         except OSError as error:
             raise CannotWrite(
@@ -163,6 +162,8 @@ class DividedCloud:
         catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(
             fresh=fresh, before=before
         )
+        with contextlib.suppress(OSError), self._alone():  # what is served now is read until the change
+            self._remove_others(name)
         report = read_report(out) or {}
         catalogue.problems = (*catalogue.problems, *map(str, report.get("notes", ())))
         return catalogue

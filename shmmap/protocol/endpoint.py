@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Mapping
 from typing import Final
 
@@ -14,8 +15,10 @@ __all__ = [
     "EVENTS_LONGER",
     "SYSTEM_RUNTIME_DIR",
     "endpoint_path",
+    "fallback_runtime_dir",
     "runtime_dirs",
     "socket_path",
+    "why_not_private",
 ]
 
 DEFAULT_INSTANCE: Final = "default"
@@ -26,9 +29,37 @@ _SUN_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) - 1 on Linux
 
 
 def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
-    """Directories a client looks in, in order: the user's own, then the system's."""
+    """Directories a client looks in, in order: the user's own, then the system's.
+
+    ``XDG_RUNTIME_DIR`` is ignored where it is not absolute, as its specification has it.  The directory in
+    /tmp counts where it is there and is nobody else's.
+    """
     own = environ.get("XDG_RUNTIME_DIR", "")
-    return (*([f"{own}/shmmap"] if own else []), SYSTEM_RUNTIME_DIR)
+    found = [f"{own}/shmmap"] if own.startswith("/") else []
+    fallback = fallback_runtime_dir()
+    if os.path.lexists(fallback) and not why_not_private(fallback):
+        found.append(fallback)
+    return (*found, SYSTEM_RUNTIME_DIR)
+
+
+def fallback_runtime_dir() -> str:
+    """Where a user's daemon has its socket without ``XDG_RUNTIME_DIR``, in an ssh session, say."""
+    return f"/tmp/shmmap-{os.geteuid()}"  # noqa: S108  its owner is checked
+
+
+def why_not_private(directory: str) -> str:
+    """Why a directory that anybody could have made is not this user's own; empty where it is."""
+    try:
+        status = os.lstat(directory)
+    except OSError as error:
+        return str(error.strerror)
+    if stat.S_ISLNK(status.st_mode):
+        return "it is a symbolic link"
+    if not stat.S_ISDIR(status.st_mode):
+        return "it is no directory"
+    if status.st_uid != os.geteuid():
+        return f"it belongs to uid {status.st_uid}"
+    return "others may write or read there (chmod 700)" if status.st_mode & 0o077 else ""
 
 
 def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:

@@ -21,7 +21,8 @@ by how much.  To keep its frame: `shmmap divide --translate none`, and serve tha
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
 its next start (a restart sends it first, then SIGTERM as usual; in a container: --stop-signal USR1);
-SIGHUP reads the map again.
+SIGHUP reads the map again; where the daemon was started at a terminal it stops it, as when that is closed
+(not under nohup or a service manager).
 Exit code: 0 after a signal, 65 bad map, 66 no map there, 71 something is full, missing or in the way, 75 the
 instance runs already, 78 bad setting."""
 
@@ -70,8 +71,8 @@ def add_parser(subparsers: Subparsers) -> None:
     place.add_argument(
         "--runtime-dir",
         metavar="DIR",
-        help="directory of the request socket (default: /run/shmmap, or $XDG_RUNTIME_DIR/shmmap for a user's "
-        "daemon)",
+        help="directory of the request socket (default: /run/shmmap; for a user's daemon "
+        "$XDG_RUNTIME_DIR/shmmap, else /tmp/shmmap-UID)",
     )
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
     place.add_argument(

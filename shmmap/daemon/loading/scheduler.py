@@ -20,7 +20,7 @@ from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
-from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
@@ -110,6 +110,15 @@ class Scheduler:
         """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
         self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
         self.misplaced.map_changed()
+        self.pool.read_through(self._opened)
+
+    @property
+    def _opened(self) -> Opened:
+        """The directory that files of the map are read through."""
+        catalogue = self._cache.catalogue
+        if catalogue.opened is None:
+            return NOT_OPENED
+        return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
     def _drop_some(self) -> None:
         for _ in range(min(LOOKS_A_PUMP, len(self._doubtful))):
@@ -124,7 +133,8 @@ class Scheduler:
         """Free what is due: what was refused for lack of memory may fit now."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.forget_refusals()
-        self._cache.look_for_some(now_s)
+        if self._cache.look_for_some(now_s):
+            self.loads.forget_refusals()
 
     def pump(self, now_s: float) -> None:
         """Hand a queued load to a worker if memory and workers allow; see `unfinished`."""
@@ -158,7 +168,7 @@ class Scheduler:
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
-            taken = self.pool.submit(job, now_s, prefetch=load.prefetch)
+            taken = self.pool.submit(job, now_s, prefetch=load.prefetch, opened=self._opened)
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
             return True

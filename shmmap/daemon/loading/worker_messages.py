@@ -26,6 +26,7 @@ __all__ = [
     "Job",
     "Need",
     "Ready",
+    "Root",
     "ToWorker",
     "decode_from_worker",
     "decode_to_worker",
@@ -58,6 +59,12 @@ class Check(msgspec.Struct, array_like=True, tag="check"):
     path: str
     segment: str
     stamp: Stamp
+
+
+class Root(msgspec.Struct, array_like=True, tag="root"):
+    """Read files below the directory ``path`` through the descriptor that comes with the packet."""
+
+    path: str
 
 
 class Decision(msgspec.Struct, array_like=True, tag="decision"):
@@ -137,7 +144,7 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
     reason: str = ""
 
 
-ToWorker: TypeAlias = Job | Check | Decision
+ToWorker: TypeAlias = Job | Check | Root | Decision
 FromWorker: TypeAlias = Ready | Need | Done | Checked | Failed | Ended
 
 encode: Final = msgspec.msgpack.Encoder().encode
