@@ -58,7 +58,7 @@ def test_the_ground_is_that_of_the_pose(
     x, y, z, _, _, yaw = town.poses[2]
     rng = np.random.default_rng(1)
     edge = 4.0 if below == "reflections" else 1.5
-    deep = np.column_stack([rng.uniform(-edge / 2, edge / 2, (200, 2)) + (x, y), np.full(200, z - 5.0)])
+    deep = rng.uniform(-edge / 2, edge / 2, (200, 3)) * (1.0, 1.0, 0.0) + np.array([x, y, z - 5.0])
     keep = np.ones(len(town.points), np.bool_)
     if below == "a pit":
         keep = (np.abs(town.points[:, :2] - (x, y)) > edge / 2).any(axis=1)
