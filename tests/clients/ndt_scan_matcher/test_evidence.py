@@ -49,9 +49,9 @@ def sector(scan: Points, degrees: float, heading: float = 0.0) -> Points:
     return scan[np.abs((off + 180.0) % 360.0 - 180.0) < degrees / 2]
 
 
-def on_map(scan: Points) -> Points:
+def on_map(scan: Points) -> NDArray[np.float64]:
     T = matrix_from_pose(TRUTH)
-    return np.asarray(scan @ T[:3, :3].T + T[:3, 3])
+    return np.asarray(scan @ T[:3, :3].T + T[:3, 3], np.float64)
 
 
 def within(scan: Points, metres: float) -> Points:

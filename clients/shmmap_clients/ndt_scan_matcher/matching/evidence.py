@@ -73,16 +73,18 @@ def extent_of(points: NDArray[np.floating]) -> Extent:
     """
     if not len(points):
         return Extent(0.0, 0.0)
-    some = points[:: -(-len(points) // _ANGLE_POINTS), :2]
+    x, y = points[:: -(-len(points) // _ANGLE_POINTS), :2].T
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         squared = np.einsum("ij,ij->i", points, points)
-        headings = some / np.sqrt(np.einsum("ij,ij->i", some, some))[:, None]
+        level = np.sqrt(x * x + y * y)
+        cosine, sine = x / level, y / level
+        known = np.isfinite(cosine + sine)
     squared[~np.isfinite(squared)] = 0.0
     place = max(len(squared) - FAR_POINTS, 0)
     squared.partition(place)
-    headings = headings[np.isfinite(headings).all(axis=1)]
-    resultant = math.hypot(*headings.mean(axis=0, dtype=np.float64).tolist()) if len(headings) else 1.0
-    angle = math.degrees(math.sqrt(24.0 * max(1.0 - resultant, 0.0)))
+    count = max(int(np.count_nonzero(known)), 1)
+    resultant = math.hypot(float(cosine[known].sum()), float(sine[known].sum())) / count
+    angle = math.degrees(math.sqrt(24.0 * max(1.0 - resultant, 0.0))) if known.any() else 0.0
     return Extent(math.sqrt(float(squared[place])), angle)
 
 

@@ -86,7 +86,7 @@ class NdtMatcher:
         )
         if self._backend.most_map_bytes < self.limits.most_map_bytes:
             self.limits = replace(self.limits, map_bytes=self._backend.most_map_bytes)
-        self._map = VoxelMap({})
+        self.set_map(VoxelMap({}))
 
     def __enter__(self) -> NdtMatcher:
         return self
@@ -142,7 +142,7 @@ class NdtMatcher:
     @property
     def trust(self) -> TrustLimits:
         """What a result has to reach to be trusted, with the map's leaf."""
-        return self._trust.for_leaf(self._map.leaf, fine=self.settings.mode == "coarse_fine")
+        return self._trust_in_force
 
     @property
     def map(self) -> VoxelMap:
@@ -152,6 +152,7 @@ class NdtMatcher:
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on; takes microseconds where its tables are prepared."""
         self._map = voxel_map
+        self._trust_in_force = self._trust.for_leaf(voxel_map.leaf, fine=self.settings.mode == "coarse_fine")
         self._backend.set_map(voxel_map)
 
     def prepare(self, voxel_map: VoxelMap) -> VoxelMap:

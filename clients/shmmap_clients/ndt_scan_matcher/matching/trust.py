@@ -6,8 +6,9 @@ of 2.3 is for its leaf of 2 m, and 0.548 of that.  The same share separates righ
 other leaf sizes.  True covariances (``coarse_fine``) fit more closely, and score lower below 2 m: there the
 share falls to 0.41 at 1 m.
 
-Measured by ``python -m tests.benchmarks.ndt_trust --seeds 24`` on recorded scans, started 0.3 m to 16 m away:
-of 2663 results that were more than 1 m off, 3 were trusted (at 3 m); of 2998 within 0.3 m, 7 were refused.
+A score alone trusts what a few points, or points within a few metres, fit by chance: `Evidence` bounds that.
+Its limits were chosen on parts of recorded and simulated scans; ``python -m tests.benchmarks.ndt_trust`` says
+how well they separate right poses from wrong ones.
 """
 
 from __future__ import annotations
