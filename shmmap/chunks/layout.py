@@ -4,7 +4,7 @@
 The header's beginning says what the chunk is and never changes; it has a checksum.  The rest changes with
 every scan, and is true together with the bricks whenever ``sequence`` is even and the same before and after
 it was read.  Bricks lie in the order in which they were first touched; the brick index at the end of the
-header says where.  A chunk only grows.
+header says where.  A chunk grows until it is given up, and then there is nothing in it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ __all__ = [
     "MAPPERS",
     "MOST_BYTES",
     "OUT_OF_SERVICE",
+    "STATE_AT",
     "ChunkIdentity",
     "ChunkView",
     "check_consistent",
@@ -38,7 +39,9 @@ __all__ = [
     "read_identity",
 ]
 
-CHUNKS_VERSION: Final = (1, 0)
+CHUNKS_VERSION: Final = (2, 0)
+MAJORS_READ: Final = (1, 2)
+"""The same bytes; those of version 1 were not cut when they were given up, so that readers could map them."""
 HEADER_BYTES: Final = 4096
 BRICK_BYTES: Final = 2 * BRICK_VOXELS
 MOST_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES
@@ -153,7 +156,7 @@ def read_identity(page: bytes | bytearray | memoryview, name: str = "chunk") -> 
         raise SegmentCorrupt(f"{name}: no chunk: it starts with {magic!r}")
     if order != BYTE_ORDER:
         raise SegmentCorrupt(f"{name}: written on a machine of other byte order")
-    if major != CHUNKS_VERSION[0]:
+    if major not in MAJORS_READ:
         raise SegmentCorrupt(
             f"{name}: version {major}.{minor} of the layout, this reads {CHUNKS_VERSION[0]}",
             hint="update whichever of writer and reader is older",
@@ -203,6 +206,15 @@ class ChunkView:
     def identity(self) -> ChunkIdentity:
         """What the chunk is; raises as `read_identity`."""
         return read_identity(self.data[:STATE_AT])
+
+    def at(self, places: NDArray[np.integer]) -> NDArray[np.int16]:
+        """Voxels by their places in the chunk, (N,): 0 where nothing is known."""
+        bricks, within = np.divmod(places, BRICK_VOXELS)
+        numbers = self.index[bricks].astype(np.intp)
+        found = np.zeros(len(numbers), np.int16)
+        known = np.flatnonzero(numbers)
+        found[known] = self.bricks[numbers[known] - 1, within[known]]
+        return found
 
     def dense(self) -> NDArray[np.int16]:
         """All voxels by their place in the chunk, (262144,): 0 where nothing is known."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading chunks that somebody writes: a copy that is whole, and the voxels in it.
 
-A reader copies a chunk, and the copy counts if the chunk's ``sequence`` was even and the same before and
-after.  On x86 the processor keeps the order of reads; elsewhere a barrier of the kernel does.
+A reader copies a chunk by `os.pread`, and the copy counts if the chunk's ``sequence`` was even and the same
+before and after.  On x86 the processor keeps the order of reads; elsewhere a barrier of the kernel does.
 """
 
 from __future__ import annotations
@@ -10,25 +10,27 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import struct
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shmmap.chunks.layout import BRICK_BYTES, HEADER_BYTES, ChunkView
-from shmmap.chunks.voxels import BRICK_VOXELS, BRICKS, ChunkKey, voxels_of
-from shmmap.errors import BadRequest, SegmentCorrupt
+from shmmap.chunks.layout import HEADER_BYTES, MOST_BYTES, OUT_OF_SERVICE, STATE_AT, ChunkView, chunk_bytes
+from shmmap.chunks.voxels import BRICK_VOXELS, ChunkKey, voxels_of
+from shmmap.errors import BadRequest, SegmentCorrupt, StaleHandle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-__all__ = ["KINDS", "consistent_copy", "select_voxels"]
+__all__ = ["KINDS", "read_chunk", "select_voxels", "sequence_of"]
 
 KINDS: Final = ("occupied", "free")
 TRIES: Final = 1000
 """A writer takes 40 us for a chunk; one that died meanwhile leaves the sequence odd until the next comes."""
 
+_SEQUENCE: Final = struct.Struct("<Q")
 _MEMBARRIER: Final = {"aarch64": 283, "riscv64": 283, "armv7l": 389, "ppc64le": 365}
 _GLOBAL: Final = 1
 
@@ -44,15 +46,31 @@ def _barrier() -> Callable[[], object]:
 _fence: Final = _barrier()
 
 
-def consistent_copy(view: ChunkView, room: Callable[[int], ChunkView]) -> ChunkView | None:
-    """Copy a chunk as it was at one moment.
+def sequence_of(fd: int, name: str = "chunk") -> int:
+    """Return the ``sequence`` of an open chunk: a copy of it is up to date as long as this is the same.
+
+    Raises
+    ------
+    StaleHandle
+        The chunk was given up.
+    """
+    data = os.pread(fd, _SEQUENCE.size, STATE_AT)
+    if len(data) < _SEQUENCE.size:
+        raise StaleHandle(f"{name}: the chunk was given up")
+    number: int = _SEQUENCE.unpack(data)[0]
+    return number
+
+
+def read_chunk(fd: int, name: str = "chunk") -> ChunkView | None:
+    """Read a chunk as it was at one moment.
 
     Parameters
     ----------
-    view
-        The mapped chunk, at least its header.
-    room
-        Given a number of bricks, returns a view of the same chunk that has as many.
+    fd
+        Its file, open for reading.  (Nobody but the writer maps a chunk: its file is cut to nothing when it
+        is given up.)
+    name
+        What errors call it.
 
     Returns
     -------
@@ -61,25 +79,35 @@ def consistent_copy(view: ChunkView, room: Callable[[int], ChunkView]) -> ChunkV
 
     Raises
     ------
+    StaleHandle
+        The chunk was given up.
     SegmentCorrupt
-        It says that it has more bricks than a chunk can have.
+        It says that it has more bricks than its file, or than a chunk can have.
+    OSError
+        The file cannot be read.
     """
-    for attempt in range(TRIES):
-        before = int(view.state["sequence"])
+    for _ in range(TRIES):
+        before = sequence_of(fd, name)
         if before & 1:
             os.sched_yield()
             continue
         _fence()
-        bricks = int(view.state["bricks"])
-        if bricks > BRICKS:
-            if int(view.state["sequence"]) != before and attempt < TRIES - 1:
-                continue
-            raise SegmentCorrupt(f"a chunk says that it has {bricks} bricks; {BRICKS} are the most")
-        whole = room(bricks)
-        copy = bytes(whole.data[: HEADER_BYTES + bricks * BRICK_BYTES])
+        size = os.fstat(fd).st_size
+        if size > MOST_BYTES:
+            raise SegmentCorrupt(f"{name}: {size} bytes cannot be a chunk")
+        data = os.pread(fd, size, 0)
         _fence()
-        if int(view.state["sequence"]) == before:
-            return ChunkView(copy)
+        if sequence_of(fd, name) != before:
+            continue
+        if len(data) < HEADER_BYTES:
+            raise SegmentCorrupt(f"{name}: {len(data)} bytes cannot be a chunk")
+        view = ChunkView(data)
+        if int(view.state["state"]) == OUT_OF_SERVICE:
+            raise StaleHandle(f"{name}: the chunk is given up")
+        bricks = int(view.state["bricks"])
+        if bricks > len(view.bricks) or int(view.index.max()) > bricks:
+            raise SegmentCorrupt(f"{name}: it says that it has {bricks} bricks; {len(view.bricks)} are there")
+        return ChunkView(view.data[: chunk_bytes(bricks)])
     return None
 
 

@@ -24,9 +24,7 @@ SYSTEM_UIDS: Final = 999
 """logind spares the accounts below (SYS_UID_MAX, as Debian, Ubuntu, Fedora and systemd itself have it)."""
 
 _SEGMENT: Final = re.compile(r"shmmap\.([A-Za-z0-9_-]{1,64})\.[0-9a-f]{16}(?:\.zombie)?")
-_CHUNK: Final = re.compile(
-    r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+(?:\.gone)?"
-)
+_CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+")
 
 
 def check_daemon(patient: Patient) -> Finding:
@@ -50,6 +48,8 @@ def check_daemon(patient: Patient) -> Finding:
         )
     if state == "stopped":
         return fail(name, fact, f"continue it: kill -CONT {identity.pid}")
+    if state == "starting":
+        return warn(name, fact, "wait until it listens: kernels are compiled the first time")
     if state == "hung":
         return fail(
             name,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps: what is wrong with them, have they room on the disk, who holds their memory."""
+"""Live maps: what is wrong with them, have they room on the disk, which readers take much."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ from shmmap.errors import ConfigError, ShmmapError
 from shmmap.protocol.live import LiveMapRow
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.pins import holders
 from shmmap.statistics.live_rows import LiveRow
 
 __all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
 
 ANSWER_S: Final = 2.0
 NAMED: Final = 3
-"""Things and holders that are named."""
+"""Things and readers that are named."""
+OPEN: Final = 8
+"""Files of chunks that a reader may have open: it opens one at a time, and maps none."""
+BUSY: Final = 500
+"""Thousandths of a processor that are much for one reader's requests."""
 ROOM_BYTES: Final = 64 << 20
 """Less free disk space than this is little, whatever the budget."""
 _MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # with a group of mappers, and without
@@ -176,7 +179,7 @@ def _is_in(path: str, directory: str) -> bool:
 
 
 def check_live_memory(patient: Patient) -> Finding:
-    """Is the place of chunks in order, and do readers let go of what was given up?"""
+    """Is the place of chunks in order, and does no reader take much?"""
     name, rows = "live memory", _rows(patient)
     if not rows and not patient.config.live:
         return skip(name, "no live map is set up")
@@ -189,16 +192,21 @@ def check_live_memory(patient: Patient) -> Finding:
         )
     if wrong := _wrong_marks(patient, path):
         return warn(name, wrong, "restart the daemon: it puts the directory right, or says why it cannot")
-    for row in rows:
-        if row.evicting_bytes > row.budget_bytes // 4:
-            return warn(
-                name,
-                f"{row.name}: readers hold {format_bytes(row.evicting_bytes)} of chunks that were given up:"
-                f" {_holders_text(patient, path, row)}",
-                "end them, or have them let go: mapping goes on with what is left of"
-                f" {format_bytes(row.budget_bytes)}",
-            )
-    taken, budget = sum(row.bytes + row.evicting_bytes for row in rows), sum(row.budget_bytes for row in rows)
+    if keeping := _keeping(patient):
+        return warn(
+            name,
+            f"chunks are kept open or mapped: {keeping}",
+            "have it read them by pread, as CHUNKS.md says: it keeps no memory by that, and SIGBUS ends it"
+            " where it looks at one that was given up",
+        )
+    if busy := _busy(patient):
+        return warn(
+            name,
+            f"requests take much of the time of the process that keeps live maps: {busy}",
+            "have it ask less often, for smaller areas, or with `since`; mapping does not wait for it, other"
+            " readers do",
+        )
+    taken, budget = sum(row.bytes for row in rows), sum(row.budget_bytes for row in rows)
     return ok(name, f"{path}: {format_bytes(taken)} of {format_bytes(budget)} taken" if rows else path)
 
 
@@ -237,33 +245,46 @@ def _wrong_marks(patient: Patient, path: str) -> str:
     return ""
 
 
-def _holders_text(patient: Patient, path: str, row: LiveRow) -> str:
-    """Who maps the chunks that were given up, most bytes first: by the locks of readers."""
-    by_slot: dict[int, int] = {}
-    start = f"shmmap-live.{patient.config.instance}.{row.name}."
-    names: list[str] = []
+def _keeping(patient: Patient) -> str:
+    """Which processes have files of chunks mapped, or many open, the greediest first; empty for none."""
+    start = f"/shmmap-live.{patient.config.instance}."
+    chunk = re.compile(re.escape(start) + r"[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+")
+    found = []
+    processes = patient.machine.path("/proc")
     with contextlib.suppress(OSError):
-        names = os.listdir(patient.machine.path(path))
-    for name in names:
-        if not (name.startswith(start) and name.endswith(".gone")):
-            continue
-        with contextlib.suppress(OSError):  # freed meanwhile, or not for this user
-            fd = os.open(patient.machine.path(f"{path}/{name}"), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-            try:
-                nbytes = os.fstat(fd).st_blocks * 512
-                for slot in holders(fd):
-                    by_slot[slot] = by_slot.get(slot, 0) + nbytes
-            finally:
-                os.close(fd)
-    if not by_slot:
-        return "nobody who says who it is"
-    clients = {
-        client.session: client for client in (patient.seen.clients if patient.seen is not None else [])
-    }
+        for entry in os.listdir(processes):
+            if not entry.isdecimal() or patient.pid in (0, int(entry), _parent(patient, entry)):
+                continue  # the daemon, and the process that writes the chunks
+            mapped = set(chunk.findall(patient.machine.text(f"/proc/{entry}/maps")))
+            names = list(mapped)
+            with contextlib.suppress(OSError):  # it has ended, or is another account's
+                for fd in os.listdir(processes / entry / "fd"):
+                    with contextlib.suppress(OSError):
+                        names += chunk.findall(os.readlink(processes / entry / "fd" / fd))
+            if mapped or len(names) >= OPEN:
+                found.append((len(set(names)), entry))
+    texts = [
+        f"{patient.machine.text(f'/proc/{pid}/comm').strip() or '?'}, pid {pid}: {counted(count, 'chunk')}"
+        for count, pid in sorted(found, key=lambda row: -row[0])
+    ]
+    more = f"; and {len(texts) - NAMED:,} more" if len(texts) > NAMED else ""
+    return "; ".join(texts[:NAMED]) + more
+
+
+def _parent(patient: Patient, pid: str) -> int:
+    fields = patient.machine.text(f"/proc/{pid}/stat").rpartition(")")[2].split()
+    return int(fields[1]) if len(fields) > 1 else 0
+
+
+def _busy(patient: Patient) -> str:
+    """Which clients' requests about live maps take much time; empty for none."""
+    seen = patient.seen.clients if patient.seen is not None else []
+    clients = {client.session: client for client in seen}
     texts = []
-    for slot, nbytes in sorted(by_slot.items(), key=lambda item: -item[1])[:NAMED]:
-        client = clients.get(slot)
-        who = f"{client.client or client.command}, pid {client.pid or '?'}" if client else f"session {slot:x}"
-        texts.append(f"{who}: {format_bytes(nbytes)}")
-    more = f"; and {len(by_slot) - NAMED:,} more" if len(by_slot) > NAMED else ""
-    return "; ".join(texts) + more
+    for row in _told(patient):
+        for session, thousandths in row.readers:
+            if thousandths >= BUSY:
+                client = clients.get(session)
+                who = f"{client.client or client.command}, pid {client.pid or '?'}" if client else ""
+                texts.append(f"{who or f'session {session:x}'}: {thousandths / 10:.0f} % for {row.name}")
+    return "; ".join(texts[:NAMED])

@@ -13,6 +13,7 @@ import msgspec
 from shmmap.protocol.areas import BoxMessage
 
 __all__ = [
+    "FURTHEST_M",
     "LIVE_REQUESTS",
     "MOST_CHUNK_ROWS",
     "MOST_NAME_BYTES",
@@ -43,6 +44,8 @@ __all__ = [
 MOST_NAME_BYTES: Final = 64
 MOST_CHUNK_ROWS: Final = 1000
 """Rows of one page of chunks."""
+FURTHEST_M: Final = 1e150
+"""Place and radius of a sphere are less, metres: so that their squares are numbers."""
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(max_length=MOST_NAME_BYTES)]
 Point: TypeAlias = tuple[float, float, float]
@@ -141,7 +144,7 @@ class LiveVoxels(msgspec.Struct, array_like=True, tag="live_voxels"):
 
 
 class LiveRelease(msgspec.Struct, array_like=True, tag="live_release"):
-    """The client has opened the segment of a `LiveVoxelsReply`, or does not need it: its name may go."""
+    """The client has read the segment of a `LiveVoxelsReply`, or does not need it: it may go."""
 
     request: int
     map: Name
@@ -166,7 +169,7 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
     loading, dirty, saving
         Chunks that are being read, that are changed and not saved, that are being written.
     evicting, evicting_bytes
-        Chunks that were given up and are still mapped by readers.
+        0: memory of a chunk that is given up is free at once.
     waiting_bytes
         Scans that wait for chunks or for memory.
     files, file_bytes
@@ -181,6 +184,11 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
         What keeps chunks from being saved or loaded just now; empty: nothing.
     change
         Number of the map's last change, as in `LiveChunkPage`.
+    beside_bytes
+        Memory of lists of voxels and of marks, within the budget as the chunks.
+    readers
+        Sessions whose requests took most of the worker's time in the last seconds, and how much of one
+        processor each took, in thousandths; the greatest first.
     """
 
     name: str
@@ -205,6 +213,8 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
     mappers: tuple[str, ...] = ()
     problem: str = ""
     change: int = 0
+    beside_bytes: int = 0
+    readers: tuple[tuple[int, int], ...] = ()
 
 
 class LiveListed(msgspec.Struct, array_like=True, tag="live_listed"):
@@ -230,7 +240,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     marks_dir
         Where files of marks are to lie; empty for who does not map.
     slot
-        The byte that the client locks in each chunk that it opens.
+        Of no use: nobody locks chunks any more.
     mapper, next_scan
         The mapper's number, and the least that a new scan of it may have.
     most_marks_bytes
@@ -286,9 +296,7 @@ class LiveDurable(msgspec.Struct, array_like=True, tag="live_durable"):
 
 
 class LiveChunkRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """A chunk: ``state`` is ``loading``, ``clean``, ``dirty``, ``saving``, ``evicting`` or ``saved``.
-
-    ``evicting``: given up, and still mapped by readers; ``saved``: on disk alone.
+    """A chunk: ``state`` is ``loading``, ``clean``, ``dirty``, ``saving`` or ``saved`` (on disk alone).
 
     ``version`` rises with each scan that it takes in; ``bytes`` is its memory, or its file.
     """

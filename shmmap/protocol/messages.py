@@ -107,4 +107,4 @@ __all__ = [
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (1, 5)
+PROTOCOL_VERSION: Final = (1, 6)

@@ -32,7 +32,7 @@ class LiveRow(NamedTuple):
     loading, dirty, saving
         Chunks that are being read, that are changed and not saved, that are being written.
     evicting, evicting_bytes
-        Chunks that were given up and are still mapped by readers.
+        0: memory of a chunk that is given up is free at once.
     waiting_bytes
         Scans that wait for chunks or for memory.
     files, file_bytes
@@ -81,10 +81,10 @@ class LiveRow(NamedTuple):
 
     @property
     def states(self) -> dict[str, int]:
-        """How many chunks are in which state; ``evicting`` ones are in memory beside the others."""
+        """How many chunks are in which state."""
         return {
             "loading": self.loading, "clean": max(0, self.chunks - self.unsaved), "dirty": self.dirty,
-            "saving": self.saving, "evicting": self.evicting,
+            "saving": self.saving,
         }  # fmt: skip
 
 

@@ -17,9 +17,8 @@ __all__ = ["exposition"]
 
 _LIVE = {
     # attribute of a row: name, kind, help
-    "states": ("chunks", "gauge", "Chunks by state; evicting ones were given up and are still mapped"),
+    "states": ("chunks", "gauge", "Chunks by state"),
     "bytes": ("bytes", "gauge", "Memory of chunks in service"),
-    "evicting_bytes": ("evicting_bytes", "gauge", "Memory of chunks given up that somebody still maps"),
     "waiting_bytes": ("waiting_bytes", "gauge", "Scans that wait for chunks or for memory"),
     "budget_bytes": ("budget_bytes", "gauge", "Most memory of the map's chunks"),
     "active": ("active_voxels", "gauge", "Known voxels in memory"),

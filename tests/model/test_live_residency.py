@@ -2,20 +2,22 @@
 """A paged map equals an unbounded one: every chunk takes in every scan once and in order, whatever happens.
 
 The machine plays mappers, clients, worker and disk in any order: scans come, clients move, jump and leave,
-files are read and written and cannot be, chunks grow while others wait, readers keep what is out of service.
+files are read and written and cannot be, chunks grow while others wait, lists take room beside them.
 A chunk's voxels are stood for by the list of scans that it took in.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan, State
+from shmmap.daemon.live.paging.key_index import EVERYWHERE
+from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
 from shmmap.daemon.live.paging.residency import RETRY_S, Residency
 
 NEW = 10
@@ -57,13 +59,14 @@ class LiveMap(RuleBasedStateMachine):
         self.sent = 0
 
     @initialize(
-        chunks=st.integers(2, 4), reserve=st.sampled_from([0, 2 * MOST]), active=st.sampled_from([0, 6]),
-        radius=st.integers(0, 1), waiting=st.sampled_from([1, 1000]),
+        chunks=st.integers(2, 4), reserve=st.booleans(), active=st.sampled_from([0, 6]),
+        radius=st.integers(0, 1), waiting=st.sampled_from([1, 1000]), most=st.sampled_from([0, 0, 2, 5]),
     )  # fmt: skip
-    def begin(self, chunks: int, reserve: int, active: int, radius: int, waiting: int) -> None:
+    def begin(self, chunks: int, *, reserve: bool, active: int, radius: int, waiting: int, most: int) -> None:
+        budget = chunks * MOST
         self.limits = Limits(
-            budget_bytes=chunks * MOST, reserve_bytes=reserve, most_active=active, radius=radius,
-            waiting_bytes=waiting, loads=2, saves=2, checkpoint_s=5.0,
+            budget_bytes=budget, reserve_bytes=budget * 3 // 4 if reserve else 0, most_chunks=most,
+            most_active=active, radius=radius, waiting_bytes=waiting, loads=2, saves=2, checkpoint_s=5.0,
         )  # fmt: skip
         self.map = Residency(self.limits, new_bytes=NEW)
 
@@ -179,21 +182,26 @@ class LiveMap(RuleBasedStateMachine):
 
     @rule()
     def evict(self) -> None:
-        lease = self.map.next_eviction(self.now_s)
-        if lease is not None:
-            self._evicted(lease)
+        chunk = self.map.next_eviction(self.now_s)
+        if chunk is not None:
+            content = self.memory.pop(chunk.key)
+            assert content.scans == self.disk.get(chunk.key, Content()).scans, (
+                "nothing is given up that is not saved"
+            )
 
-    def _evicted(self, lease: Lease) -> None:
-        content = self.memory.pop(lease.key)
-        assert content.scans == self.disk.get(lease.key, Content()).scans, (
-            "nothing is given up that is not saved"
-        )
-        assert lease.nbytes == content.nbytes
+    @rule(asked=st.integers(1, MOST))
+    def take_beside(self, asked: int) -> None:
+        """A list of voxels takes memory, of the part that lists may, when there is room."""
+        self.map.asked_bytes = 0
+        if self.map.beside_bytes + asked <= self.limits.budget_bytes // 4:
+            if self.map.fits(asked):
+                self.map.beside_bytes += asked
+            else:
+                self.map.asked_bytes = asked
 
-    @precondition(lambda self: self.map.leases.by_number)
-    @rule(data=st.data())
-    def release(self, data: st.DataObject) -> None:
-        self.map.leases.end(data.draw(st.sampled_from(list(self.map.leases.by_number.values()))))
+    @rule()
+    def release_beside(self) -> None:
+        self.map.beside_bytes = self.map.asked_bytes = 0
 
     # --- what always holds --------------------------------------------------------------------
 
@@ -205,8 +213,20 @@ class LiveMap(RuleBasedStateMachine):
         loading = {chunk.key: chunk.nbytes for chunk in self.loads}
         assert self.map.chunk_bytes == sum(sizes.values()) + sum(loading.values())
         assert self.map.active == sum(content.version % 4 for content in self.memory.values())
-        used = self.map.chunk_bytes + self.map.leases.nbytes
-        assert used <= self.limits.budget_bytes or self.map.chunk_bytes <= self.limits.reserve_bytes
+        assert self.map.chunk_bytes + self.map.beside_bytes <= self.limits.budget_bytes
+        assert list(self.map.index.part(None, EVERYWHERE, 10**9)[0]) == sorted(self.map.chunks)
+        held = len(sizes) + len(loading)
+        assert not self.limits.most_chunks or held <= self.limits.most_chunks
+        around = [center for one in (1, 2) if (center := self.map.windows.center(one)) is not None]
+        assert set(self.map.windows.near) == {
+            ChunkKey(*key)
+            for center in around
+            for key in product(
+                *(range(at - self.limits.radius, at + self.limits.radius + 1) for at in center)
+            )
+        }
+        for key in self.map.windows.near:
+            assert key in self.map.chunks or key in self.map._missing
         waiting = [scan for scan in self.scans if not scan.applied]
         assert self.map.waiting_bytes == 3 * len(waiting)
         assert self.map.waiting_bytes <= max(3, self.limits.waiting_bytes)
@@ -231,9 +251,8 @@ class LiveMap(RuleBasedStateMachine):
             at_rest = not self.loads and not self.saves and self.flushing is None
             if at_rest and all(scan.durable for scan in self.scans):
                 break
-            if not self.limits.reserve_bytes:  # else what readers keep does not matter
-                for lease in list(self.map.leases.by_number.values()):
-                    self.map.leases.end(lease)
+            if not self.limits.reserve_bytes:  # else what is beside the chunks does not matter
+                self.release_beside()
             self.begin_load()
             if self.loads:
                 self._end_load(self.loads.pop(), fails=False)

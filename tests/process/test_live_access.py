@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import mmap
 import os
 import sys
 import tempfile
@@ -20,10 +21,9 @@ from shmmap.client.live.live_map import ChunkInfo, LiveMap
 from tests.process.conftest import DaemonFactory
 from tests.support.accounts import ADMINS, DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
 from tests.support.attempts import ATTEMPTS
-from tests.support.daemon_process import DaemonProcess, stop
+from tests.support.daemon_process import DaemonProcess
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, mapped_around, reference
-from tests.support.mapping_process import MappingProcess
 from tests.support.other_account import SCANS, as_client
 from tests.support.patience import Patience
 
@@ -191,7 +191,7 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
     start = f"{one.shm_dir}/shmmap-live.{one.instance}.lidar"
     content = Path(chunks_of(one)[0]).read_bytes() if chunks_of(one) else b"x"
     one.kill()
-    theirs = [f"{start}.0_0_0.99999999999", f"{start}.1_1_1.5.gone", f"{start}.voxels.0123456789abcdef"]
+    theirs = [f"{start}.0_0_0.99999999999", f"{start}.1_1_1.5", f"{start}.voxels.0123456789abcdef"]
     for path in theirs:
         Path(path).write_bytes(content)
         os.chown(path, STRANGER, -1)
@@ -213,40 +213,35 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
     undo.unlink(missing_ok=True)
 
 
-def test_readers_that_keep_chunks_never_stop_mapping(service: LiveService) -> None:
-    """They stand still with everything mapped that there ever was: that counts, and there is a reserve."""
-    one = service("8M")
+def test_a_reader_that_lets_no_chunk_go_has_no_memory_of_them(service: LiveService) -> None:
+    """It has every chunk that there ever was open and mapped: all that it has is within the budget."""
+    budget = 4 << 20
+    one = service("4M")
     scans = drive()
-    readers: list[MappingProcess] = []
-    seen: set[str] = set()
+    kept: dict[str, tuple[int, mmap.mmap]] = {}
+    most = made = 0
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
-        try:
-            with live.mapper("front", FILTER) as mapper:
-                for number, (points, pose) in enumerate(scans):
-                    mapper.add(points, pose)
-                    mapper.wait_applied()
-                    if number % 4 == 0:
-                        new = set(chunks_of(one)) - seen
-                        seen |= new
-                        with opened(new) as there:
-                            readers.append(MappingProcess(there))
-                        stop(readers[-1].pid)
-                mapper.wait_durable()
-            live.move_to(1e4, 1e4, 1e4)
-            waiting = Patience()
-            while waiting(not (status := live.status()).evicting):
-                pass
-            assert status.evicting_bytes > 0
-            assert status.scans == len(scans)
-            assert held(live) == reference(scans)
-        finally:
-            for reader in readers:
-                reader.end()
-        waiting = Patience()
-        while waiting(live.status().evicting > 0):
-            pass
-        assert live.status().evicting_bytes == 0
+        with live.mapper("front", FILTER) as mapper:
+            for points, pose in scans:
+                mapper.add(points, pose)
+                mapper.wait_applied()
+                for path in chunks_of(one):
+                    if path not in kept:
+                        with contextlib.suppress(FileNotFoundError, ValueError):  # it was given up just then
+                            fd = os.open(path, os.O_RDONLY)
+                            kept[path] = fd, mmap.mmap(fd, 0, prot=mmap.PROT_READ)
+                            made += os.fstat(fd).st_size
+                most = max(most, sum(os.fstat(fd).st_blocks * 512 for fd, _ in kept.values()))
+            mapper.wait_durable()
+        assert live.status().bytes <= budget
+        assert held(live) == reference(scans)
+    assert most <= budget
+    assert made > 1.2 * budget, "else nothing had to be given up"
+    assert not any(name.endswith(".gone") for name in os.listdir(one.shm_dir))
+    for fd, data in kept.values():
+        data.close()
+        os.close(fd)
 
 
 def test_a_daemon_without_privileges_keeps_live_maps(service: LiveService) -> None:

@@ -120,7 +120,7 @@ def main() -> None:
             made.move("mapper", tuple(poses[number - 1][:3, 3].tolist()))
             made.add(1, number, marks, 1)
         made.turn(time.monotonic(), time.time_ns(), save_all=not waiting)
-        most = max(most, made.residency.chunk_bytes + made.residency.leases.nbytes)
+        most = max(most, made.residency.chunk_bytes + made.residency.beside_bytes)
         made.wait(0.05)
     made.files.write_manifest()
     made.close()

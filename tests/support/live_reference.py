@@ -43,8 +43,4 @@ def held(live: LiveMap, scope: str = "all", area: shmmap.Box | None = None) -> d
 
 def mapped_around(live: LiveMap, here: ChunkKey) -> list[ChunkInfo]:
     """Return the chunks in memory that touch this one, itself among them; 27 once all have been loaded."""
-    return [
-        one
-        for one in live.chunks()
-        if one.key.distance(here) <= 1 and one.state not in ("loading", "evicting")
-    ]
+    return [one for one in live.chunks() if one.key.distance(here) <= 1 and one.state != "loading"]

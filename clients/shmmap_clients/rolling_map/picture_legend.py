@@ -28,7 +28,6 @@ STATES: Final = {
     "loading": _Look("#111418", 0.30, "loading"),
     "saving": _Look("#0e9db8", 0.24, "saving"),
     "dirty": _Look("#2563eb", 0.17, "dirty: newer than on disk"),
-    "evicting": _Look("#e8890c", 0.24, "evicting"),
     "clean": _Look("#2f9e44", 0.17, "clean: as on disk"),
     "saved": _Look("#9aa5b1", 0.0, "on disk only"),
 }

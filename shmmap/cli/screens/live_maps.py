@@ -18,7 +18,6 @@ STATE_STYLES: Final = {
     "clean": "green",
     "dirty": "blue",
     "saving": "cyan",
-    "evicting": "yellow",
 }
 """Colours of chunks by state, as Rolling-Bonxai has them."""
 
@@ -26,9 +25,6 @@ STATE_STYLES: Final = {
 def live_problems(row: LiveRow) -> list[str]:
     """What is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
-    if row.evicting_bytes > row.budget_bytes // 4:
-        held = format_bytes(row.evicting_bytes)
-        found.append(f"readers hold {held} of chunks that were given up: `shmmap doctor` names them")
     if row.damaged:
         found.append(f"damaged files, missing chunks: {row.damaged:,}; `shmmap live ls` names them")
     return found
@@ -39,7 +35,7 @@ def status_lines(rows: Sequence[LiveRow], restarts: int) -> list[tuple[str, str]
     lines = []
     for row in rows:
         unsaved = f"{row.unsaved:,} not saved" if row.unsaved else "all saved"
-        memory = f"{format_bytes(row.bytes + row.evicting_bytes)} of {format_bytes(row.budget_bytes)}"
+        memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
         known = counted(row.active, "known voxel")
         lines.append((f"live {row.name}", f"{counted(row.chunks, 'chunk')}, {memory}, {known}, {unsaved}"))
         lines += [("", problem) for problem in live_problems(row)]

@@ -17,7 +17,6 @@ __all__ = ["LIVE_STATES", "chunk_squares"]
 LIVE_STATES: Final = {
     "saved": "on disk",
     "clean": "in memory, saved",
-    "evicting": "given up, and still mapped",
     "loading": "loading",
     "saving": "saving",
     "dirty": "not saved yet",

@@ -30,7 +30,6 @@ GLYPHS: Final = {
     "saved": (".", "bright_black"),
     "clean": ("#", "green"),
     "loading": ("l", "bright_black"),
-    "evicting": ("e", "yellow"),
     "saving": ("w", "cyan"),
     "dirty": ("d", "blue"),
     "window": ("o", "red"),

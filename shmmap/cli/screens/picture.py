@@ -36,7 +36,6 @@ _STYLE: Final = """
   .saved { stroke: #9aa5b1; stroke-opacity: .8; }
   .clean { fill: #2f9e44; fill-opacity: .22; stroke: #2f9e44; stroke-opacity: .8; }
   .dirty { fill: #2563eb; fill-opacity: .22; stroke: #2563eb; stroke-opacity: .8; }
-  .evicting { fill: #e8890c; fill-opacity: .26; stroke: #e8890c; stroke-opacity: .8; }
   .saving { fill: #0e9db8; fill-opacity: .26; stroke: #0e9db8; stroke-opacity: .8; }
   .loading { fill: #111418; fill-opacity: .30; stroke: #111418; stroke-opacity: .8; }
   .route { fill: none; stroke: #c92a2a; stroke-width: 2.4; stroke-linejoin: round; stroke-linecap: round; }
@@ -253,7 +252,6 @@ def _legend(states: set[str], with_route: bool, with_clients: bool) -> list[tupl
         "dirty": "not saved yet",
         "saving": "being saved",
         "loading": "being loaded",
-        "evicting": "given up, and still mapped",
     }
     entries = [(label, square.format(state)) for state, label in names.items() if state in states]
     if with_route:

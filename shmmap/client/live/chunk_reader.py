@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxels and rays, looked up in chunks that this process has mapped; the daemon says which there are."""
+"""Voxels and rays, looked up in copies of chunks; the daemon says which chunks there are.
+
+A chunk is opened, read and closed each time that it is looked at: nothing is held that its writer might wait
+for, or whose memory it could not free.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Final, NamedTuple, TypeAlias
 
@@ -10,18 +15,20 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.chunks.layout import ChunkView
+from shmmap.chunks.reading import read_chunk, sequence_of
 from shmmap.chunks.voxels import ChunkKey, in_chunk, voxel_indices
-from shmmap.client.live.attached_chunk import AttachedChunk
-from shmmap.errors import SegmentError, StaleHandle
+from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 
 __all__ = ["ChunkInfo", "ChunkReader", "Place"]
 
-MOST_ATTACHED: Final = 512
-"""Chunks that are kept mapped; the longest unused go first."""
+MOST_COPIES: Final = 512
+"""Chunks of which copies are kept; the longest unused go first."""
 VOXELS_AT_ONCE: Final = 1 << 20
 """Of rays, that are looked up at a time."""
-ROUNDS: Final = 4
-"""How often a chunk that is gone before it is mapped is looked for again."""
+ROUNDS: Final = 8
+"""How often a chunk that is gone before it is read is looked for again."""
+_FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 class ChunkInfo(msgspec.Struct, frozen=True):
@@ -32,8 +39,8 @@ class ChunkInfo(msgspec.Struct, frozen=True):
     key
         Which one.
     state
-        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, ``evicting`` (given up,
-        and still mapped by readers), or ``saved``: on disk alone.
+        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, or ``saved``:
+        on disk alone.
     active, occupied, free
         Known voxels, and of these occupied and free ones.
     bytes
@@ -55,20 +62,25 @@ class ChunkInfo(msgspec.Struct, frozen=True):
 
 
 class Place(NamedTuple):
-    """Where the chunks of a map are, and what they say.
-
-    ``prefix`` is what paths of chunks begin with, ``slot`` what is locked in each.
-    """
+    """Where the chunks of a map are, and what they say; ``prefix`` is what their paths begin with."""
 
     prefix: str
     map_id: bytes
-    slot: int
     resolution: float
     occupied_above: int
 
 
 Changed: TypeAlias = tuple[dict[ChunkKey, ChunkInfo], list[ChunkKey], int, bool]
 """Chunks that changed, and that left memory; number of the last change; whether the one before was known."""
+
+
+class _Copy(NamedTuple):
+    """A chunk as it was at one moment: ``view`` is of the file ``inode``, at its ``sequence``."""
+
+    generation: int
+    inode: int
+    sequence: int
+    view: ChunkView
 
 
 class ChunkReader:
@@ -85,7 +97,7 @@ class ChunkReader:
     def __init__(self, place: Callable[[], Place], changes: Callable[[int], Changed]) -> None:
         self._place = place
         self._changes = changes
-        self._chunks: dict[ChunkKey, AttachedChunk] = {}
+        self._copies: dict[ChunkKey, _Copy] = {}
         self._rows: dict[ChunkKey, ChunkInfo] = {}
         self._change = 0
 
@@ -118,20 +130,54 @@ class ChunkReader:
             self._rows.update(rows)
         self._change = change
 
-    def _attached(self, key: ChunkKey) -> AttachedChunk | None:
-        """A chunk in memory, mapped; None where there is none."""
+    def _read(self, key: ChunkKey) -> ChunkView | None:
+        """A chunk in memory, as it is now; None where there is none.
+
+        Raises
+        ------
+        StaleHandle
+            It is gone, or its writer died in the middle of a change: the next one mends it, or has another
+            chunk in its place.
+        SegmentError
+            This user may not read it.
+        SegmentCorrupt
+            It is not the chunk that it should be.
+        """
         row = self._rows.get(key)
-        mapped = self._chunks.pop(key, None)
+        copy = self._copies.pop(key, None)
         if row is None or row.generation == 0:
             return None
-        if mapped is None or mapped.generation != row.generation or not mapped.in_service:
-            place = self._place()
-            path = f"{place.prefix}{key.text}.{row.generation}"
-            mapped = AttachedChunk(path, key, row.generation, place.map_id, place.slot)
-        self._chunks[key] = mapped  # the last used comes last
-        while len(self._chunks) > MOST_ATTACHED:
-            self._chunks.pop(next(iter(self._chunks)))
-        return mapped
+        place = self._place()
+        path = f"{place.prefix}{key.text}.{row.generation}"
+        try:
+            fd = os.open(path, _FLAGS)
+        except FileNotFoundError as error:
+            raise StaleHandle(f"{path}: the chunk is gone") from error
+        except OSError as error:
+            raise SegmentError(f"{path}: {error.strerror}", hint="see `shmmap doctor`") from error
+        try:
+            inode = os.fstat(fd).st_ino
+            # not its version: what a writer had changed when it died is undone, and may come again otherwise
+            if copy is None or copy[:3] != (row.generation, inode, sequence_of(fd, path)):
+                view = read_chunk(fd, path)
+                if view is None:
+                    raise StaleHandle(f"{path}: it is being written")
+                identity = view.identity
+                if (identity.key, identity.generation, identity.map_id) != (
+                    key,
+                    row.generation,
+                    place.map_id,
+                ):
+                    raise SegmentCorrupt(f"{path}: it is another chunk than its name says")
+                copy = _Copy(row.generation, inode, int(view.state["sequence"]), view)
+        except OSError as error:
+            raise SegmentError(f"{path}: {error.strerror}") from error
+        finally:
+            os.close(fd)
+        self._copies[key] = copy  # the last used comes last
+        while len(self._copies) > MOST_COPIES:
+            self._copies.pop(next(iter(self._copies)))
+        return copy.view
 
     def _look_up(self, indices: NDArray[np.int32]) -> NDArray[np.int16]:
         found = np.zeros(len(indices), np.int16)
@@ -146,18 +192,17 @@ class ChunkReader:
         for key, end in zip(chunks.tolist(), ends.tolist(), strict=True):
             rows = order[begin:end]
             begin = end
-            dense = self._dense(ChunkKey(*key))
-            if dense is not None:
-                found[rows] = dense[places[rows]]
+            chunk = self._now(ChunkKey(*key))
+            if chunk is not None:
+                found[rows] = chunk.at(places[rows])
         return found
 
-    def _dense(self, key: ChunkKey) -> NDArray[np.int16] | None:
+    def _now(self, key: ChunkKey) -> ChunkView | None:
+        """A chunk in memory, wherever it is now; None where there is none."""
         for _ in range(ROUNDS):
             try:
-                chunk = self._attached(key)
-                return chunk.dense() if chunk is not None else None
+                return self._read(key)
             except StaleHandle:  # noqa: PERF203  asked again, a few times
-                self._chunks.pop(key, None)
                 self._refresh()
         raise SegmentError(f"chunk {key.text} is written and given up all the time", hint="ask again")
 

@@ -17,7 +17,7 @@ from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
 from shmmap.client.live.patience import until_served
-from shmmap.client.live.voxels import Voxels, open_voxels
+from shmmap.client.live.voxels import Voxels, read_voxels
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, StaleHandle
 from shmmap.optional_packages import needed_packages
@@ -35,6 +35,8 @@ R = TypeVar("R")
 LIST_S: Final = 60.0
 """How long putting voxels together may take, beside what any request may."""
 SAVE_S: Final = 300.0
+LISTS: Final = 4
+"""Lists of voxels that are asked for, one after the other, until one is there while it is read."""
 
 
 class Sphere(msgspec.Struct, frozen=True):
@@ -126,9 +128,8 @@ class LiveMap:
 
     def move_to(self, x: float, y: float, z: float) -> None:
         """Say where this process is, metres in the map's frame: chunks around it stay in memory."""
-        self._ask(
-            lambda n: messages.LiveMove(n, self.name, (float(x), float(y), float(z))), messages.LiveMoved
-        )
+        here = _metres(x, y, z)
+        self._ask(lambda n: messages.LiveMove(n, self.name, (here[0], here[1], here[2])), messages.LiveMoved)
 
     def save(self, *, timeout_s: float = SAVE_S) -> int:
         """Have everything that is applied by now saved; returns how many files there are.
@@ -194,10 +195,7 @@ class LiveMap:
 
     def _place(self) -> Place:
         opened = self._opened
-        return Place(
-            self._shm_dir + opened.prefix, self.map_id, self._session.welcome.session, self.resolution,
-            opened.occupied_above,
-        )  # fmt: skip
+        return Place(self._shm_dir + opened.prefix, self.map_id, self.resolution, opened.occupied_above)
 
     @property
     def _shm_dir(self) -> str:
@@ -213,7 +211,7 @@ class LiveMap:
         scope: str = "memory",
         since: int = 0,
     ) -> Voxels:
-        """Voxels of an area, which the daemon puts together in shared memory.
+        """Voxels of an area, which the daemon puts together.
 
         Parameters
         ----------
@@ -236,14 +234,15 @@ class LiveMap:
         def ask(request: int) -> messages.LiveRequest:
             return messages.LiveVoxels(request, self.name, kind, message, scope, since)
 
-        with contextlib.suppress(StaleHandle):  # the process that made it ended just then
-            return self._listed(ask)
+        for _ in range(LISTS - 1):
+            with contextlib.suppress(StaleHandle):  # its maker ended, or this process was stopped for long
+                return self._listed(ask)
         return self._listed(ask)
 
     def _listed(self, ask: Callable[[int], messages.LiveRequest]) -> Voxels:
         reply = self._ask(ask, messages.LiveVoxelsReply, quiet_s=LIST_S)
         try:
-            return open_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
+            return read_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
         finally:
             self._ask(lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased)
 
@@ -303,8 +302,19 @@ def _area(area: geometry.Box | Sphere | None) -> messages.LiveArea | None:
     if area is None:
         return None
     if isinstance(area, Sphere):
-        return messages.SphereMessage(area.x, area.y, area.z, area.radius)
+        x, y, z, radius = _metres(area.x, area.y, area.z, area.radius)
+        if not all(abs(value) < messages.FURTHEST_M for value in (x, y, z, radius)) or radius < 0.0:
+            raise BadRequest(f"{area}: it is not finite, or nothing can lie in it")
+        return messages.SphereMessage(x, y, z, radius)
     message = area_to_message(area)
     if not isinstance(message, BoxMessage):
         raise BadRequest("an area of a live map is a Box or a Sphere")
     return message
+
+
+def _metres(*values: float) -> tuple[float, ...]:
+    """Numbers as they can be sent; BadRequest where one is greater than any float."""
+    try:
+        return tuple(float(value) for value in values)
+    except OverflowError as error:
+        raise BadRequest(f"{values}: a number of metres is not finite") from error

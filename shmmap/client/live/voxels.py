@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from shmmap.chunks.voxels import voxel_centers
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 
-__all__ = ["Voxels", "open_voxels"]
+__all__ = ["Voxels", "read_voxels"]
 
 _VOXEL_BYTES = 14
 
@@ -25,7 +24,7 @@ class Voxels:
     Attributes
     ----------
     indices
-        (N, 3) int32, read-only, in shared memory: ``floor(x / resolution)`` along each axis.
+        (N, 3) int32: ``floor(x / resolution)`` along each axis.
     log_odds
         (N,) int16, thousandths.
     resolution
@@ -55,16 +54,19 @@ class Voxels:
         return chance
 
 
-def open_voxels(path: str, count: int, resolution: float, change: int) -> Voxels:
-    """Map a list of voxels.
+def read_voxels(path: str, count: int, resolution: float, change: int) -> Voxels:
+    """Read a list of voxels into memory of this process.
 
     Raises
     ------
-    StaleHandle, SegmentError, SegmentCorrupt
-        It is gone, may not be read, or has another size.
+    StaleHandle
+        It is gone, in part or whole: it is kept for some seconds only.
+    SegmentError, SegmentCorrupt
+        It may not be read, or has another size.
     """
     if not count:
         return Voxels(np.empty((0, 3), np.int32), np.empty(0, np.int16), resolution, change)
+    data = np.empty(count * _VOXEL_BYTES, np.uint8)
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError as error:
@@ -72,10 +74,17 @@ def open_voxels(path: str, count: int, resolution: float, change: int) -> Voxels
     except OSError as error:
         raise SegmentError(f"{path}: {error.strerror}", hint="see `shmmap doctor`") from error
     try:
-        if os.fstat(fd).st_size != count * _VOXEL_BYTES:
-            raise SegmentCorrupt(f"{path}: it is no list of {count} voxels")
-        data = mmap.mmap(fd, count * _VOXEL_BYTES, prot=mmap.PROT_READ)
+        at = 0
+        while at < len(data) and (some := os.preadv(fd, [data.data[at:]], at)):
+            at += some
+        size = os.fstat(fd).st_size  # after that: what was cut meanwhile has lost its end first
+    except OSError as error:
+        raise SegmentError(f"{path}: {error.strerror}") from error
     finally:
         os.close(fd)
-    indices = np.frombuffer(data, "<i4", 3 * count).reshape(count, 3)
-    return Voxels(indices, np.frombuffer(data, "<i2", count, 12 * count), resolution, change)
+    if not size:
+        raise StaleHandle(f"{path}: the list is gone")
+    if size != len(data) or at != size:
+        raise SegmentCorrupt(f"{path}: it is no list of {count} voxels")
+    indices = data[: 12 * count].view("<i4").reshape(count, 3)
+    return Voxels(indices, data[12 * count :].view("<i2"), resolution, change)

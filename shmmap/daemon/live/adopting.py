@@ -26,8 +26,6 @@ def adopt(live: LiveMap, now_s: float) -> int:
         One cannot be opened: it stays where it is, for the next try.
     """
     memory = live.memory
-    for key, given_up in memory.given_up():
-        live.keep(key, given_up)
     newest: dict[ChunkKey, tuple[int, str]] = {}
     for name, key, generation in list(memory.names()):
         if key not in newest or newest[key][0] < generation:
@@ -39,7 +37,7 @@ def adopt(live: LiveMap, now_s: float) -> int:
             memory.remove(name)
             continue
         if newest[key] != (generation, name) or int(chunk.view.state["state"]) == OUT_OF_SERVICE:
-            live.keep(key, memory.give_up(chunk))  # it was saved, and all but given up
+            memory.give_up(chunk)  # it was saved, and all but given up
             continue
         try:
             if undone == (key, generation):
@@ -49,7 +47,7 @@ def adopt(live: LiveMap, now_s: float) -> int:
                 raise SegmentCorrupt(f"{name}: older than its file")
         except SegmentCorrupt as error:
             log.warning("chunk not adopted", chunk=key.text, reason=error.message)
-            live.keep(key, memory.give_up(chunk))
+            memory.give_up(chunk)
             continue
         live.take_over(chunk, now_s)
     if undone is not None:
@@ -61,6 +59,8 @@ def adopt(live: LiveMap, now_s: float) -> int:
 
 def _opened(live: LiveMap, name: str) -> ChunkFile | None:
     """What has this name, if it is a chunk of this map; raises OSError if it cannot be opened now."""
+    if live.memory.is_given_up(name):
+        return None
     try:
         chunk = live.memory.open(name)
     except SegmentCorrupt as error:

@@ -3,7 +3,8 @@
 
 A chunk is a file on a tmpfs.  It is mapped once, as long as it can ever get; only as much of that as the file
 has may be touched.  Memory is taken from the kernel before it is touched: where there is none, that is an
-error here and not a signal later.  A file never gets shorter.
+error here and not a signal later.  A file grows until its chunk is given up, and is cut to nothing then: its
+memory is free at once, whatever others have open or mapped.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from shmmap.chunks.layout import (
     BRICK_BYTES,
@@ -29,12 +30,9 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.mapping import map_chunk, unmap_chunk, view_at
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, SegmentCorrupt
-from shmmap.segment.pins import in_use, keep_if_unused
 
-__all__ = ["ChunkFile", "ChunkMemory", "GivenUp", "live_prefix", "memory_bytes"]
+__all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "memory_bytes"]
 
-_GONE: Final = ".gone"
-"""What the name of a chunk out of service ends in."""
 _GROWTH_BRICKS: Final = 8
 """A page: memory comes in pages."""
 
@@ -49,23 +47,6 @@ def memory_bytes(bricks: int) -> int:
     return chunk_bytes(-(-bricks // _GROWTH_BRICKS) * _GROWTH_BRICKS)
 
 
-class GivenUp(NamedTuple):
-    """What is left of a chunk that is out of service: a name and a descriptor, for asking who maps it."""
-
-    name: str
-    fd: int
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that it takes."""
-        return os.fstat(self.fd).st_blocks * 512
-
-    @property
-    def is_mapped(self) -> bool:
-        """Whether anybody has it open or mapped, as the kernel says."""
-        return in_use(self.fd)
-
-
 @dataclass(eq=False)
 class ChunkFile:
     """One chunk in memory, mapped for writing.
@@ -74,11 +55,14 @@ class ChunkFile:
     ----------
     name
         Of the shared memory, slash included: prefix, key, generation.
+    generation
+        Which time the map had this chunk in memory.
     view
         Arrays over as much as there is.
     """
 
     name: str
+    generation: int
     _fd: int
     _address: int
     view: ChunkView
@@ -167,7 +151,7 @@ class ChunkMemory:
             if self._gid >= 0:
                 os.fchown(fd, -1, self._gid)
             os.fchmod(fd, self._mode)
-            chunk = self._mapped(name, fd, len(content))
+            chunk = self._mapped(name, identity.generation, fd, len(content))
         except BaseException:
             os.close(fd)
             raise
@@ -200,56 +184,38 @@ class ChunkMemory:
             identity = read_identity(os.pread(fd, HEADER_BYTES, 0), name)
             if name != self.name(identity.key, identity.generation):
                 raise SegmentCorrupt(f"{name}: it is chunk {identity.key.text} {identity.generation}")
-            return self._mapped(name, fd, size)
+            return self._mapped(name, identity.generation, fd, size)
         except BaseException:
             os.close(fd)
             raise
 
-    def _mapped(self, name: str, fd: int, size: int) -> ChunkFile:
+    def _mapped(self, name: str, generation: int, fd: int, size: int) -> ChunkFile:
         address = map_chunk(fd, name, writable=True)
-        return ChunkFile(name, fd, address, view_at(address, size))
+        return ChunkFile(name, generation, fd, address, view_at(address, size))
 
-    def give_up(self, chunk: ChunkFile) -> GivenUp:
-        """Take a chunk out of service: it gets another name, under which nobody looks for it.
+    def give_up(self, chunk: ChunkFile) -> None:
+        """Take a chunk out of service, and free its memory, whatever readers do with it.
 
-        Whoever has it mapped sees by its ``state`` that it does not change any more.
+        A reader in the middle of it finds another ``sequence``, or less than it needs, and begins again.
         """
-        chunk.view.state["state"] = OUT_OF_SERVICE
-        return self._put_away(chunk.name, chunk.unmap())
-
-    def free(self, chunk: ChunkFile) -> GivenUp | None:
-        """Take a chunk out of service, and its memory at once if nobody has it; else see `give_up`."""
-        chunk.view.state["state"] = OUT_OF_SERVICE
+        state = chunk.view.state
+        state["state"] = OUT_OF_SERVICE
+        state["sequence"] += 2
         fd = chunk.unmap()
-        if not keep_if_unused(fd):
-            return self._put_away(chunk.name, fd)
-        self.remove(chunk.name)
-        os.close(fd)
-        return None
-
-    def _put_away(self, name: str, fd: int) -> GivenUp:
-        gone = name + _GONE
-        os.rename(name.lstrip("/"), gone.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd)
-        return GivenUp(gone, fd)
-
-    def given_up(self) -> Iterator[tuple[ChunkKey, GivenUp]]:
-        """What an earlier writer gave up, and readers may still map."""
-        for name, key, _ in self._named(re.escape(_GONE)):
-            fd = os.open(name.lstrip("/"), os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=self._fd)
-            yield key, GivenUp(name, fd)
-
-    def forget(self, chunk: GivenUp) -> None:
-        """Remove what was given up: nobody maps it any more, or the map ends."""
-        os.close(chunk.fd)
+        try:
+            os.ftruncate(fd, 0)  # before its name goes: else a kill here would leave what nobody finds
+        finally:
+            os.close(fd)
         with contextlib.suppress(FileNotFoundError):
             self.remove(chunk.name)
 
+    def is_given_up(self, name: str) -> bool:
+        """Whether an earlier writer all but gave up what has this name: nothing is left in it."""
+        return os.stat(name.lstrip("/"), dir_fd=self._fd, follow_symlinks=False).st_size == 0
+
     def names(self) -> Iterator[tuple[str, ChunkKey, int]]:
         """Chunks that there are, with key and generation; what has no such name is left out."""
-        return self._named("")
-
-    def _named(self, end: str) -> Iterator[tuple[str, ChunkKey, int]]:
-        pattern = re.compile(re.escape(self.prefix.lstrip("/")) + r"(-?\d+_-?\d+_-?\d+)\.(\d+)" + end)
+        pattern = re.compile(re.escape(self.prefix.lstrip("/")) + r"(-?\d+_-?\d+_-?\d+)\.(\d+)")
         for name in sorted(os.listdir(self._fd)):
             if found := pattern.fullmatch(name):
                 try:

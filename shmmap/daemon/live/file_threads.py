@@ -30,10 +30,12 @@ class FileThreads:
     ----------
     on_done
         Called, in a thread, when there is something to be told.
+    threads
+        How many there are.
     """
 
-    def __init__(self, on_done: Callable[[], None]) -> None:
-        self._threads = ThreadPoolExecutor(THREADS, "live-files")
+    def __init__(self, on_done: Callable[[], None], threads: int = THREADS) -> None:
+        self._threads = ThreadPoolExecutor(threads, "live-files")
         self._running: dict[Future[list[Future[Any]]], list[Job]] = {}
         self._on_done = on_done
 

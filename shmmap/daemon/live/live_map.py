@@ -8,7 +8,6 @@ flushed in others.  After the death of this process the next one finds the chunk
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -25,10 +24,11 @@ from shmmap.chunks.layout import (
 )
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, GivenUp, memory_bytes
+from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
 from shmmap.daemon.live.file_threads import FileThreads, Job
 from shmmap.daemon.live.map_files import MapFiles
-from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan
+from shmmap.daemon.live.paging.key_index import KeyIndex
+from shmmap.daemon.live.paging.records import Chunk, Limits, Scan
 from shmmap.daemon.live.paging.residency import RETRY_S, Residency
 from shmmap.errors import MapDataError, PackageMissing
 from shmmap.logfmt import log
@@ -72,8 +72,8 @@ class LiveMap:
 
     Attributes
     ----------
-    kept : dict
-        What is out of service and may still be mapped, by number of its lease.
+    stored : KeyIndex
+        Chunks that have files, in order; one whose file was put aside is in it until it is loaded.
     problems : dict
         What keeps chunks from being loaded or saved just now.
     """
@@ -90,7 +90,7 @@ class LiveMap:
     on_work_done: Callable[[], None] = lambda: None
     residency: Residency = field(init=False)
     chunks: dict[ChunkKey, ChunkFile] = field(default_factory=dict)
-    kept: dict[int, GivenUp] = field(default_factory=dict)
+    stored: KeyIndex = field(init=False)
     problems: dict[str, str] = field(default_factory=dict)
     _parts: dict[Scan, _Part] = field(default_factory=dict)
     _generation: int = 0
@@ -100,12 +100,9 @@ class LiveMap:
         self._writer = ChunkWriter(self.files.settings.occupancy, self.undo)
         self._threads = FileThreads(lambda: self.on_work_done())
         self._generation = self.files.begin_life() << 32
+        self.stored = KeyIndex(self.files.rows)
         for key, row in self.files.rows.items():
             self.residency.note_size(key, memory_bytes(row.bricks))
-
-    def keep(self, key: ChunkKey, given_up: GivenUp) -> None:
-        """Count what is out of service until nobody maps it."""
-        self.kept[self.residency.leases.begin(key, given_up.nbytes).number] = given_up
 
     def take_over(self, chunk: ChunkFile, now_s: float) -> None:
         """A chunk is in memory since an earlier life of the writer, and whole."""
@@ -144,16 +141,6 @@ class LiveMap:
         side = 64 * self.files.settings.resolution
         self.residency.move(client, (xyz[0] / side, xyz[1] / side, xyz[2] / side))
 
-    def released(self, lease: Lease) -> None:
-        """Nobody maps what was given up any more."""
-        self.memory.forget(self.kept.pop(lease.number))
-        self.residency.leases.end(lease)
-
-    def look_at_leases(self) -> None:
-        """Free what nobody maps any more."""
-        for number in [number for number, kept in self.kept.items() if not kept.is_mapped]:
-            self.released(self.residency.leases.by_number[number])
-
     # --- a turn ---------------------------------------------------------------------------------
 
     @property
@@ -167,13 +154,9 @@ class LiveMap:
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_A_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
-        while (lease := residency.next_eviction(now_s)) is not None:  # there is room for others now
-            given_up = self.memory.free(self.chunks.pop(lease.key))
-            self.on_gone(lease.key)
-            if given_up is None:
-                residency.leases.end(lease)
-            else:
-                self.kept[lease.number] = given_up
+        while (gone := residency.next_eviction(now_s)) is not None:  # there is room for others now
+            self.memory.give_up(self.chunks.pop(gone.key))
+            self.on_gone(gone.key)
         jobs = []
         while (cold := residency.next_load(now_s)) is not None:
             self._generation += 1
@@ -254,6 +237,8 @@ class LiveMap:
             self.residency.load_failed(chunk, now_s)
             return
         self._succeeded("loaded")
+        if chunk.key not in self.files.rows:
+            self.stored.discard(chunk.key)
         self.chunks[chunk.key] = file
         state = file.view.state
         self.residency.loaded(
@@ -272,6 +257,7 @@ class LiveMap:
             self.residency.save_failed(chunk, now_s)
             return
         self._succeeded("saved")
+        self.stored.add(chunk.key)
         self.residency.saved(chunk, version, now_s)
         self.chunks[chunk.key].view.state["saved_version"] = version
 
@@ -310,13 +296,10 @@ class LiveMap:
             self.on_durable(scan)
 
     def remove_from_memory(self) -> None:
-        """Take all names away; what is mapped stays with whoever maps it."""
+        """Give all chunks up."""
         for file in self.chunks.values():
-            self.memory.forget(self.memory.give_up(file))
-        for kept in self.kept.values():
-            self.memory.forget(kept)
+            self.memory.give_up(file)
         self.chunks.clear()
-        self.kept.clear()
 
     def close(self) -> None:
         """Leave memory and files as they are."""
@@ -326,7 +309,4 @@ class LiveMap:
         self.files.remove_spare()
         for file in self.chunks.values():
             file.close()
-        for kept in self.kept.values():
-            os.close(kept.fd)
         self.chunks.clear()
-        self.kept.clear()

@@ -25,7 +25,7 @@ from tests.support.chunk_memory import MAP_ID, ChunkMemory
 
 IDENTITY = ChunkIdentity(MAP_ID, ChunkKey(-2, 0, 513), 0.25, -1992, 3476, 1386, -847, 7, "map")
 GOLDEN = (
-    "53484d4348554e4b0100000004030201"  # SHMCHUNK, 1.0, byte order
+    "53484d4348554e4b0200000004030201"  # SHMCHUNK, 2.0, byte order
     "000102030405060708090a0b0c0d0e0f"
     "feffffff000000000102000040000000"  # -2, 0, 513; 64 a side
     "000000000000d03f38f8940d6a05b1fc"  # 0.25 m; -1992, 3476, 1386, -847
@@ -105,11 +105,12 @@ def test_too_few_bytes_and_other_versions_are_refused() -> None:
     page = new_header(IDENTITY)
     with pytest.raises(SegmentCorrupt, match="127 bytes are too few"):
         read_identity(page[:127])
-    struct.pack_into("<HH", page, 8, 1, 9)
-    struct.pack_into("<I", page, 120, zlib.crc32(page[:120]))
-    assert read_identity(page) == IDENTITY
-    struct.pack_into("<HH", page, 8, 2, 0)
-    with pytest.raises(SegmentCorrupt, match=r"version 2\.0"):
+    for major, minor in ((1, 0), (2, 9)):  # an earlier daemon's chunks are adopted
+        struct.pack_into("<HH", page, 8, major, minor)
+        struct.pack_into("<I", page, 120, zlib.crc32(page[:120]))
+        assert read_identity(page) == IDENTITY
+    struct.pack_into("<HH", page, 8, 3, 0)
+    with pytest.raises(SegmentCorrupt, match=r"version 3\.0"):
         read_identity(page)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import socket
@@ -21,7 +20,7 @@ from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
-from shmmap.segment.pins import lock_slot
+from shmmap.protocol.live import LiveMapRow
 from shmmap.statistics.client_rows import ClientRow
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.live_rows import LiveRow
@@ -306,30 +305,63 @@ def test_where_mappers_put_their_scans(ward: Ward, monkeypatch: pytest.MonkeyPat
     assert (found.state, "has mode 777" in found.fact) == ("warn", True)
 
 
-def test_readers_that_hold_what_was_given_up_are_named(ward: Ward) -> None:
-    """By their locks: a lock of the open file description is held for as long as the file is mapped."""
+def process(
+    ward: Ward, pid: int, parent: int, name: str, mapped: Sequence[str], opened: Sequence[str]
+) -> None:
+    """A process that has files of chunks mapped and open."""
+    lines = "".join(f"7f0000000000-7f0000081000 r--s 00000000 00:19 77   /dev/shm/{one}\n" for one in mapped)
+    ward.file(f"/proc/{pid}/maps", "7ffd0000-7ffe0000 rw-p 00000000 00:00 0    [stack]\n" + lines)
+    ward.file(f"/proc/{pid}/comm", name + "\n")
+    ward.file(f"/proc/{pid}/stat", f"{pid} (a ) b) S {parent} 1 1 0 -1")
+    ward.file(f"/proc/{pid}/fd/0", "")
+    for number, one in enumerate(opened, 3):
+        (ward.root / f"proc/{pid}/fd/{number}").symlink_to(f"/dev/shm/{one}")
+
+
+def test_readers_that_keep_chunks_are_named(ward: Ward) -> None:
+    """Whatever became of the files: those that were given up have no name any more."""
     marks(ward)
-    shm = "/dev/shm/shmmap-live.default"
-    for name in ("lidar.0_0_0.7.gone", "lidar.-1_0_0.8.gone", "lidar.1_0_0.9", "radar.0_0_0.7.gone"):
-        ward.file(f"{shm}.{name}", "x" * 5000)
+    chunks = [f"shmmap-live.default.lidar.{x}_-1_0.7" for x in range(20)]
+    gone = [f"{name} (deleted)" for name in chunks]
+    seen = with_live(LIDAR)
+    process(ward, 4242, 1, "shmmapd", [], [])
+    process(ward, 101, 4242, "worker", chunks, chunks)
+    process(
+        ward,
+        102,
+        1,
+        "honest",
+        ["shmmap-live.default.marks/2f.17"],
+        [*chunks[:2], "shmmap-live.default.lidar.voxels.00"],
+    )
+    process(ward, 103, 1, "other", [name.replace("default", "night") for name in chunks], [])
+
+    def check() -> Finding:
+        return live.check_live_memory(ward.patient(seen))
+
+    assert check().state == "ok"
+    process(ward, 200, 1, "few", gone[:1], [])
+    process(ward, 201, 1, "opens", [], gone)
+    process(ward, 202, 1, "greedy", [*gone, *chunks[:3]], gone[:4])
+    found = check()
+    assert found.state == "warn"
+    assert "opens, pid 201: 20 chunks" in found.fact
+    assert "greedy, pid 202: 20 chunks" in found.fact
+    assert found.fact.endswith("few, pid 200: 1 chunk")
+    process(ward, 203, 1, "another", gone[:5], [])
+    assert check().fact.endswith("; and 1 more")
+
+
+def test_readers_whose_requests_take_much_time_are_named(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    marks(ward)
     clients = [ClientRow(3, 4242, 0, 0, 0, 0, 0, "perception", "python3")]
-    held = LIDAR._replace(evicting=2, evicting_bytes=5 << 20)
-    patient = ward.patient(with_live(held, clients=clients))
-    assert "nobody who says who it is" in live.check_live_memory(patient).fact
-    with contextlib.ExitStack() as stack:
-        for name, slot in (
-            ("lidar.0_0_0.7.gone", 3), ("lidar.-1_0_0.8.gone", 3), ("lidar.-1_0_0.8.gone", 9),
-            ("lidar.1_0_0.9", 11), ("radar.0_0_0.7.gone", 12),
-        ):  # fmt: skip
-            lock_slot(stack.enter_context(open(f"{ward.root}{shm}.{name}", "rb")).fileno(), slot)
-        found = live.check_live_memory(patient)
-        assert found.state == "warn"
-        assert found.fact.startswith(
-            "lidar: readers hold 5.0 MiB of chunks that were given up: perception, pid"
-        )
-        assert "perception, pid 4242: 16.0 KiB; session 9: 8.0 KiB" in found.fact
-        few = ward.patient(with_live(held._replace(evicting_bytes=4 << 20), clients=clients))
-        assert live.check_live_memory(few).state == "ok"
+    numbers = dict.fromkeys(LiveMapRow.__struct_fields__[4:18], 0)
+    busiest = ((3, 730), (9, 500), (5, 499))
+    row = LiveMapRow("lidar", "/maps/lidar", 0.1, "map", **numbers, readers=busiest)  # type: ignore[arg-type]
+    monkeypatch.setattr(live, "_told", lambda _patient: (row,))
+    found = live.check_live_memory(ward.patient(with_live(LIDAR, clients=clients)))
+    assert found.state == "warn"
+    assert found.fact.endswith("perception, pid 4242: 73 % for lidar; session 9: 50 % for lidar")
 
 
 def test_chunks_of_a_daemon_that_does_not_run_are_no_rubbish(ward: Ward) -> None:

@@ -121,7 +121,7 @@ def test_live_map() -> None:
     assert unpack_live(bytes.fromhex(GOLDEN_LIVE)) == LIVE
     assert unpack_live(bytes(512)) is None
     assert unpack_live(pack_live(LIVE._replace(problem="ä" * 200))) == LIVE._replace(problem="ä" * 128)
-    assert LIVE.states == {"loading": 4, "clean": 0, "dirty": 5, "saving": 6, "evicting": 7}
+    assert LIVE.states == {"loading": 4, "clean": 0, "dirty": 5, "saving": 6}
     for at in range(512):
         torn = bytearray.fromhex(GOLDEN_LIVE)
         torn[at] ^= 1

@@ -106,14 +106,14 @@ def test_live_maps(found: Snapshot) -> None:
     assert {key: samples[key] for key in before} == before
     told = {key[0].removeprefix("shmmap_live_"): n for key, n in samples.items() if key[1] == "lidar"}
     assert told == {
-        "bytes": 4096, "evicting_bytes": 512, "waiting_bytes": 9, "budget_bytes": 1 << 20,
+        "bytes": 4096, "waiting_bytes": 9, "budget_bytes": 1 << 20,
         "active_voxels": 100, "files": 3, "file_bytes": 777, "scans_applied_total": 11,
         "scans_durable_total": 7, "damaged_files": 0, "failing": 0,
     }  # fmt: skip
     assert {key[1]: n for key, n in samples.items() if key[0] == "shmmap_live_chunks"} == {
         f"{name} {state}": count
         for name in ("lidar", "radar")
-        for state, count in {"loading": 1, "clean": 2, "dirty": 2, "saving": 1, "evicting": 3}.items()
+        for state, count in {"loading": 1, "clean": 2, "dirty": 2, "saving": 1}.items()
     }
     assert samples["shmmap_live_failing", "radar"] == 1
     assert samples["shmmap_live_damaged_files", "radar"] == 2

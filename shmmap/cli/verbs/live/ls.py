@@ -17,7 +17,8 @@ __all__ = ["add_parser", "problems_of", "run"]
 _JSON = """\
   {"maps": [{"name", "path", "resolution": metres, "frame_id", "chunks": in memory, "active": known voxels
              in them, "bytes": their memory, "budget_bytes", "loading", "dirty": changed and not saved,
-             "saving", "evicting": given up, and still mapped by readers, "evicting_bytes",
+             "saving", "evicting": 0, "evicting_bytes": 0, "beside_bytes": of lists of voxels and marks,
+             "readers": [[session, thousandths of a processor]], the busiest,
              "waiting_bytes": of scans that wait, "files", "file_bytes", "scans": applied since the start,
              "durable": of these on the disk, "mappers": [uid/name], "damaged": [what], "problem",
              "change": number of the last change}]}
@@ -75,10 +76,6 @@ def run(args: argparse.Namespace) -> int:
 def problems_of(row: LiveMapRow) -> list[str]:
     """What is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
-    if row.evicting_bytes > row.budget_bytes // 4:
-        found.append(
-            f"readers hold {format_bytes(row.evicting_bytes)} in {row.evicting} chunks that were given up"
-        )
     return [*found, *row.damaged]
 
 
@@ -95,7 +92,7 @@ def _as_text(row: LiveMapRow) -> list[str]:
         f"{row.chunks:,}",
         f"{row.dirty + row.saving:,}",
         f"{row.active:,}",
-        format_bytes(row.bytes + row.evicting_bytes),
+        format_bytes(row.bytes + row.beside_bytes),
         format_bytes(row.budget_bytes),
         f"{row.files:,}",
         format_bytes(row.file_bytes),

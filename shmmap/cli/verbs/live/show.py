@@ -36,7 +36,6 @@ _COLOURS = {
     "dirty": "blue",
     "saving": "cyan",
     "loading": "bright_black",
-    "evicting": "yellow",
     "saved": "dim",
 }
 """Rolling-Bonxai's colours: clean green, dirty blue, not there yet dark."""
@@ -62,8 +61,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="one live map, chunk by chunk",
         description="Show a live map and its chunks, cubes of 64 voxels a side.\n"
-        "STATE: loading; clean; dirty when it was changed since it was saved; saving; evicting when it was "
-        "given up, and readers still map it; saved when it is on the disk alone.\n"
+        "STATE: loading; clean; dirty when it was changed since it was saved; saving; saved when it is on "
+        "the disk alone.\n"
         "X, Y, Z: lower corner, metres, map frame.  CHANGES: how many scans changed it.",
         json=_JSON,
     )
@@ -99,10 +98,10 @@ def _pairs(row: LiveMapRow) -> list[tuple[str, str]]:
     unsaved = row.dirty + row.saving
     memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
     waiting = f"; {format_bytes(row.waiting_bytes)} of scans wait" if row.waiting_bytes else ""
-    evicting = f", {format_bytes(row.evicting_bytes)} given up and still mapped" if row.evicting else ""
+    beside = f", {format_bytes(row.beside_bytes)} beside them" if row.beside_bytes else ""
     return [
         ("map", f"{row.name}, voxels of {row.resolution:g} m in frame {row.frame_id}"),
-        ("memory", f"{memory} in {row.chunks:,} chunks ({unsaved:,} unsaved){evicting}"),
+        ("memory", f"{memory} in {row.chunks:,} chunks ({unsaved:,} unsaved){beside}"),
         ("known", f"{row.active:,} voxels in memory"),
         ("disk", f"{format_bytes(row.file_bytes)} in {row.files:,} files in {row.path}"),
         ("scans", f"{row.scans:,} applied since the start, {row.durable:,} of them on the disk{waiting}"),

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 from shmmap.chunks.voxels import ChunkKey
 
-__all__ = ["Chunk", "Lease", "Limits", "Scan", "State"]
+__all__ = ["Chunk", "Limits", "Scan", "State"]
 
 
 class State(enum.Enum):
-    """Of a chunk in memory; one that is not there is free, one that readers still map is being evicted."""
+    """Of a chunk in memory, or on its way there."""
 
     LOADING = "loading"
     CLEAN = "clean"
@@ -29,9 +29,11 @@ class Limits:
     Attributes
     ----------
     budget_bytes
-        Memory of all chunks, those that readers still map included.
+        Memory of all chunks and of what is beside them: lists of voxels, marks of scans.
     reserve_bytes
-        Memory that chunks in service may take in any case: readers cannot keep a map from being written.
+        Memory that chunks may take whatever is beside them: it cannot keep a map from being written.
+    most_chunks
+        Chunks in memory; 0 for no limit.  Each takes a descriptor and a mapping.
     most_active
         Known voxels of all chunks in memory; 0 for no limit.
     waiting_bytes
@@ -41,7 +43,7 @@ class Limits:
     hysteresis
         How far a client has to be in another chunk until its window follows, as a part of a chunk.
     linger_s
-        How long a chunk outside all windows is kept after a scan changed it.
+        How long a chunk outside all windows counts as near after a scan changed it.
     checkpoint_s
         How long a change is in memory alone, at most.
     loads, saves
@@ -50,6 +52,7 @@ class Limits:
 
     budget_bytes: int
     reserve_bytes: int = 0
+    most_chunks: int = 0
     most_active: int = 0
     waiting_bytes: int = 64 << 20
     radius: int = 1
@@ -130,12 +133,3 @@ class Chunk:
     missing_bytes: int = 0
     waiting: deque[Scan] = field(default_factory=deque)
     unsaved: deque[tuple[int, Scan]] = field(default_factory=deque)
-
-
-@dataclass(frozen=True, slots=True)
-class Lease:
-    """Memory of a chunk that is out of service, until nobody maps it."""
-
-    key: ChunkKey
-    number: int
-    nbytes: int

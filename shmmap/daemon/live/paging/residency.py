@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which chunks of a live map are in memory: what is loaded, written, saved and given up, and in which order.
 
-Pure: clock and bytes are injected, and nothing is done here.  Whoever has the memory asks what is to be done
-next (`next_load`, `ready`, `next_save`, `next_eviction`) and tells when it was done.
+Pure: clock and bytes are injected, and nothing is done here.  The owner of the memory asks what is to be done
+next (`next_load`, `ready`, `next_save`, `next_eviction`) and reports when it was done.
 
-- A chunk is loaded because a scan waits for it, or because it is near a client; it is given up when neither
-  holds any more, or when memory is short: the furthest first.
+- A chunk is loaded because a scan waits for it, or because it is near a client.  It stays until its room is
+  needed: for a chunk near a client only what is near none is given up, for a scan anything, the furthest
+  first.
 - A scan is never dropped: for a chunk that is not in memory it waits, and scans are applied in the order in
   which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
 - A chunk that was written is saved before it is given up, and is durable after `Limits.checkpoint_s`;
@@ -14,22 +15,70 @@ next (`next_load`, `ready`, `next_save`, `next_eviction`) and tells when it was 
 
 from __future__ import annotations
 
+import enum
 import math
 from collections import deque
 from itertools import takewhile
 from typing import Final
 
+import numpy as np
+
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.paging.durability import TOGETHER_S, Durability
-from shmmap.daemon.live.paging.leases import Leases
-from shmmap.daemon.live.paging.records import Chunk, Lease, Limits, Scan, State
-from shmmap.daemon.live.paging.victims import REVIEW_S, Victims
+from shmmap.daemon.live.paging.key_index import KeyIndex
+from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
 from shmmap.daemon.live.paging.windows import Windows
 
-__all__ = ["Residency"]
+__all__ = ["REVIEW_S", "Residency"]
 
 RETRY_S: Final = 1.0
 """How long after a file could not be read or written it is tried again."""
+REVIEW_S: Final = 0.1
+"""How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
+IN_VAIN_S: Final = 1.0
+"""The same, where nothing was found the last time and no client has moved."""
+REVIEWED_OF_NEWS: Final = 32
+"""All are also gone over when one in so many came or changed since."""
+FOUND_AT_ONCE: Final = 64, 16
+"""Chunks that are found to be given up at once: so many, or one in so many; their order gets old."""
+
+
+class _Short(enum.IntEnum):
+    """What memory is short for, and so what may be given up: nothing, what is near no client, anything."""
+
+    NO = 0
+    NEAR = 1
+    SCANS = 2
+
+
+class _Missing:
+    """Chunks near a client that are not in memory, by the distance at which they came near."""
+
+    def __init__(self, radius: int) -> None:
+        self._levels: list[dict[ChunkKey, None]] = [{} for _ in range(radius + 1)]
+        self._level: dict[ChunkKey, int] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._level)
+
+    def __contains__(self, key: ChunkKey) -> bool:
+        return key in self._level
+
+    def add(self, key: ChunkKey, distance: int) -> None:
+        """Add a chunk, or have it in another place."""
+        self.discard(key)
+        self._level[key] = min(distance, len(self._levels) - 1)
+        self._levels[self._level[key]][key] = None
+
+    def discard(self, key: ChunkKey) -> None:
+        """Remove a chunk, if it is there."""
+        level = self._level.pop(key, None)
+        if level is not None:
+            del self._levels[level][key]
+
+    def nearest(self) -> ChunkKey:
+        """One of the nearest; there must be one."""
+        return next(reversed(next(level for level in self._levels if level)))
 
 
 class Residency:
@@ -44,12 +93,12 @@ class Residency:
 
     Attributes
     ----------
-    chunks
-        All that are in memory, or wanted there.
-    leases
-        What is out of service and may still be mapped.
+    chunks, index
+        All that are in memory, or wanted there, and their keys in order.
     chunk_bytes, waiting_bytes
         Memory of chunks, and what waiting scans take.
+    beside_bytes, asked_bytes
+        Memory that is taken beside the chunks, and that something waits for.
     active
         Known voxels in memory.
     windows, durability
@@ -59,44 +108,77 @@ class Residency:
     def __init__(self, limits: Limits, *, new_bytes: int = 4096) -> None:
         self.limits = limits
         self.chunks: dict[ChunkKey, Chunk] = {}
-        self.leases = Leases()
+        self.index = KeyIndex()
         self.chunk_bytes = self.waiting_bytes = self.active = 0
+        self.beside_bytes = self.asked_bytes = 0
         self.loading = self.saving = 0
+        self._held = 0  # chunks that take memory
         self._new_bytes = new_bytes
         self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # then it is flushed
         self._sizes: dict[ChunkKey, int] = {}
         self.windows = Windows(limits.radius, limits.hysteresis)
-        self._missing: list[ChunkKey] = []  # near, not in memory; the nearest last
+        self._missing = _Missing(limits.radius)
         self._needing: dict[ChunkKey, Chunk] = {}
         self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
-        self._victims = Victims(self.chunks, self._may_go, self._leaves_last)
+        self._found: dict[State, list[Chunk]] = {
+            State.CLEAN: [],
+            State.DIRTY: [],
+        }  # to give up, the first last
+        self._review_s = dict.fromkeys(self._found, -math.inf)  # not before, unless much happens
+        self._in_vain_s = dict.fromkeys(self._found, -math.inf)  # nor before that, unless a client moves
+        self._reviewed = dict.fromkeys(self._found, _Short.NO)
+        self._news = dict.fromkeys(self._found, 0)
         self._save_s = self._near_s = -math.inf  # not before: a file could not be written, or read
         self.durability = Durability()
 
-    def _fits(self, more_bytes: int) -> bool:
-        chunks = self.chunk_bytes + more_bytes
-        return chunks + self.leases.nbytes <= self.limits.budget_bytes or chunks <= self.limits.reserve_bytes
+    def fits(self, more_bytes: int) -> bool:
+        """Whether so much more memory may be taken now beside the chunks."""
+        return self.chunk_bytes + self.beside_bytes + more_bytes <= self.limits.budget_bytes
+
+    def _fits(self, more_bytes: int, more_chunks: int = 0) -> bool:
+        limits = self.limits
+        if limits.most_chunks and self._held + more_chunks > limits.most_chunks:
+            return False
+        return self.fits(more_bytes) or self.chunk_bytes + more_bytes <= limits.reserve_bytes
 
     def _resize(self, chunk: Chunk, nbytes: int, active: int) -> None:
         self.chunk_bytes += nbytes - chunk.nbytes
         self.active += active - chunk.active
+        self._held += bool(nbytes) - bool(chunk.nbytes)
         chunk.nbytes, chunk.active = nbytes, active
+
+    def _want(self, key: ChunkKey) -> Chunk:
+        """The chunk of this key, which is to be in memory."""
+        chunk = self.chunks.get(key)
+        if chunk is None:
+            chunk = self.chunks[key] = Chunk(key)
+            self.index.add(key)
+        return chunk
+
+    def _forget(self, key: ChunkKey) -> None:
+        del self.chunks[key]
+        self.index.discard(key)
 
     def move(self, client: object, position: tuple[float, float, float]) -> None:
         """A client is somewhere, in chunks; see `Windows.move`."""
-        if self.windows.move(client, position):
-            self._look_around()
+        entered, left = self.windows.move(client, position)
+        center = self.windows.center(client)
+        if not entered or center is None:
+            return
+        for key in left:
+            self._missing.discard(key)
+        for key in entered:
+            if key not in self.chunks:
+                self._missing.add(key, key.distance(center))
+        if center in self._missing:
+            self._missing.add(center, 0)
+        self._in_vain_s = dict.fromkeys(self._found, -math.inf)
 
     def leave(self, client: object) -> None:
         """A client has gone."""
-        if self.windows.leave(client):
-            self._look_around()
-
-    def _look_around(self) -> None:
-        near = self.windows.near
-        missing = (key for key in near if key not in self.chunks)
-        self._missing = sorted(missing, key=near.__getitem__, reverse=True)
-        self._victims.look_again()
+        for key in self.windows.leave(client):
+            self._missing.discard(key)
+        self._in_vain_s = dict.fromkeys(self._found, -math.inf)
 
     def is_wanted(self, chunk: Chunk, now_s: float) -> bool:
         """Whether a chunk is to stay: a scan waits for it, it is near a client, or was just changed."""
@@ -114,8 +196,9 @@ class Residency:
         if scan.to_apply:
             self.waiting_bytes += scan.nbytes
         for key in scan.to_apply:
-            chunk = self.chunks.get(key) or self.chunks.setdefault(key, Chunk(key))
+            chunk = self._want(key)
             chunk.waiting.append(scan)
+            self._missing.discard(key)
             self._needing[key] = chunk
 
     def ready(self) -> list[tuple[Chunk, Scan]]:
@@ -151,7 +234,7 @@ class Residency:
         if not chunk.waiting:
             del self._needing[chunk.key]
         self._resize(chunk, nbytes, active)
-        self._victims.news += 1
+        self._note_news()
         chunk.missing_bytes, chunk.changed_s = 0, now_s
         if version > chunk.version:
             chunk.version = version
@@ -170,7 +253,9 @@ class Residency:
         self, key: ChunkKey, *, version: int, saved: int, nbytes: int, active: int, now_s: float
     ) -> Chunk:
         """A chunk is in memory since an earlier life of the writer; its file has the version ``saved``."""
-        chunk = self.chunks[key] = Chunk(key, State.CLEAN, version=version, saved=saved, durable=saved)
+        chunk = self._want(key)
+        chunk.state, chunk.version, chunk.saved, chunk.durable = State.CLEAN, version, saved, saved
+        self._missing.discard(key)
         self._resize(chunk, nbytes, active)
         if version > saved:
             self._soil(chunk, now_s)
@@ -189,19 +274,13 @@ class Residency:
             return None
         kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # room was made for these
         for chunk in self._needing.values():
-            if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes):
+            if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes, 1):
                 return self._begin_load(chunk)
-        if self._is_short(now_s) or now_s < self._near_s:
-            return None
-        while self._missing:
-            key = self._missing[-1]
-            if key in self.chunks:
-                self._missing.pop()
-            elif self._fits(self._size(key) + kept_bytes):
-                self._missing.pop()
-                return self._begin_load(self.chunks.setdefault(key, Chunk(key)))
-            else:
-                break
+        if self._missing and now_s >= self._near_s and self._short(now_s) is not _Short.SCANS:
+            key = self._missing.nearest()
+            if self._fits(self._size(key) + kept_bytes, 1):
+                self._missing.discard(key)
+                return self._begin_load(self._want(key))
         return None
 
     def _can_load(self, chunk: Chunk, now_s: float) -> bool:
@@ -218,7 +297,7 @@ class Residency:
         self.loading -= 1
         chunk.under_way = False
         chunk.state = State.CLEAN
-        self._victims.news += 1
+        self._note_news()
         self._resize(chunk, nbytes, active)
         chunk.version = chunk.saved = version
         self.durability.note_loaded(chunk)
@@ -230,39 +309,90 @@ class Residency:
         self._resize(chunk, 0, 0)
         chunk.retry_s = now_s + RETRY_S
         if not chunk.waiting:
-            del self.chunks[chunk.key]
+            self._forget(chunk.key)
             self._near_s = chunk.retry_s
-            self._missing[:0] = [chunk.key] if chunk.key in self.windows.near else []
+            self._note_missing(chunk.key)
+
+    def _note_missing(self, key: ChunkKey) -> None:
+        """A chunk is not in memory; if it is near a client it is loaded again after the others."""
+        if key in self.windows.near:
+            self._missing.add(key, self.limits.radius)
 
     # --- saving ---------------------------------------------------------------------------------
 
-    def _is_short(self, now_s: float) -> bool:
-        """Whether a scan waits for memory, or there are more known voxels than there may be."""
-        if self.limits.most_active and self.active > self.limits.most_active:
-            return True
-        return any(
-            self._lacks_memory(chunk)
-            or (self._can_load(chunk, now_s) and not self._fits(self._size(chunk.key)))
-            for chunk in self._needing.values()
-        )
+    def _short(self, now_s: float) -> _Short:
+        """What memory is short for now."""
+        limits = self.limits
+        if (
+            (limits.most_active and self.active > limits.most_active)
+            or not self._fits(0)
+            or (self.asked_bytes and not self.fits(self.asked_bytes))
+            or any(
+                self._lacks_memory(chunk)
+                or (self._can_load(chunk, now_s) and not self._fits(self._size(chunk.key), 1))
+                for chunk in self._needing.values()
+            )
+        ):
+            return _Short.SCANS
+        if self._missing and now_s >= self._near_s and not self._fits(self._size(self._missing.nearest()), 1):
+            return _Short.NEAR
+        return _Short.NO
 
-    def _may_go(self, chunk: Chunk, now_s: float, *, short: bool) -> bool:
+    def _may_go(self, chunk: Chunk, now_s: float, short: _Short) -> bool:
         """Whether a chunk may be given up; one that can take in a scan now does that first."""
         if chunk.state is State.LOADING or (chunk.waiting and not self._lacks_memory(chunk)):
             return False
-        return short or not self.is_wanted(chunk, now_s)
-
-    def _leaves_last(self, chunk: Chunk, now_s: float) -> tuple[bool, bool, int, bool, int]:
-        """In which order chunks are given up, the first with the greatest: the furthest, the cleanest."""
-        return (
-            not chunk.waiting, not self.is_wanted(chunk, now_s), self.windows.distance(chunk.key),
-            chunk.state is State.CLEAN, -chunk.active,
-        )  # fmt: skip
+        return short is _Short.SCANS or (short is _Short.NEAR and not self.is_wanted(chunk, now_s))
 
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
-        """What to give up next: unwanted ones, and where memory is short others, the furthest first."""
+        """What to give up next, of the chunks that are clean, or dirty."""
+        short = self._short(now_s)
+        if short is _Short.NO:
+            return None
+        found = self._found[state]
+        if (not found or short < self._reviewed[state]) and self._is_review_due(now_s, state, short):
+            self._review(now_s, state, short)
+        while found:
+            chunk = found.pop()
+            if chunk.state is state and self.chunks.get(chunk.key) is chunk and chunk.retry_s <= now_s:
+                if self._may_go(chunk, now_s, short):
+                    return chunk
+                if short < self._reviewed[state]:  # its turn comes when memory is shorter again
+                    found.append(chunk)
+                    return None
+        return None
+
+    def _note_news(self) -> None:
+        """A chunk came, was changed or saved."""
+        for state in self._news:
+            self._news[state] += 1
+
+    def _is_review_due(self, now_s: float, state: State, short: _Short) -> bool:
+        """Whether all chunks are gone over again: seldom, or for a scan when much has happened."""
+        if now_s >= max(self._review_s[state], self._in_vain_s[state]) or short > self._reviewed[state]:
+            return True
         idle = not self.loading and not self.saving
-        return self._victims.next(state, now_s, short=self._is_short(now_s), idle=idle)
+        much = self._news[state] > 0 if idle else self._news[state] * REVIEWED_OF_NEWS >= len(self.chunks)
+        return much and short is _Short.SCANS and not self._found[state]
+
+    def _review(self, now_s: float, state: State, short: _Short) -> None:
+        """Find what may be given up: what is not wanted first, then the furthest."""
+        self._news[state], self._reviewed[state] = 0, short
+        every = self._dirty if state is State.DIRTY else self.chunks
+        found = [one for one in every.values() if one.state is state and self._may_go(one, now_s, short)]
+        self._review_s[state] = now_s + REVIEW_S
+        self._in_vain_s[state] = -math.inf if found else now_s + IN_VAIN_S
+        order = np.lexsort(
+            (
+                np.array([-one.active for one in found]),
+                self.windows.distances([one.key for one in found]),
+                np.array([not self.is_wanted(one, now_s) for one in found]),
+                np.array([not one.waiting for one in found]),
+            )
+        )
+        least, part = FOUND_AT_ONCE
+        most = max(least, len(found) // part)
+        self._found[state][:] = [found[at] for at in order[-most:].tolist()]
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
         """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
@@ -286,17 +416,22 @@ class Residency:
         self._sizes[chunk.key] = chunk.nbytes
         self.durability.note_written(chunk, version, now_s)
         chunk.state = State.CLEAN
-        self._victims.news += 1
+        self._note_news()
         if chunk.version > version:
             self._soil(chunk, now_s)
         elif chunk.leaving:
-            self._victims.saved(chunk)
+            self._found[State.CLEAN].append(chunk)
 
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
         """A file could not be written: the chunk stays in memory, and is tried again."""
         self.saving -= 1
         chunk.retry_s = self._save_s = now_s + RETRY_S  # others would fail as well
         self._soil(chunk, now_s)
+
+    @property
+    def dirty(self) -> int:
+        """Chunks that are changed and neither saved nor being saved."""
+        return len(self._dirty)
 
     @property
     def all_durable(self) -> bool:
@@ -313,21 +448,20 @@ class Residency:
 
     # --- giving up ------------------------------------------------------------------------------
 
-    def next_eviction(self, now_s: float) -> Lease | None:
-        """Give up a chunk that is as its file; its memory counts until its lease ends."""
+    def next_eviction(self, now_s: float) -> Chunk | None:
+        """Give up a chunk that is as its file; its memory is free when this has been done."""
         chunk = self._next_victim(now_s, State.CLEAN)
         if chunk is None:
             return None
-        lease = self.leases.begin(chunk.key, chunk.nbytes)
         self._resize(chunk, 0, 0)
-        del self.chunks[chunk.key]
+        self._forget(chunk.key)
         if chunk.waiting:  # for another that comes first it gave way: later it is loaded again
-            again = Chunk(chunk.key, changed_s=chunk.changed_s, waiting=chunk.waiting)
-            self.chunks[chunk.key] = self._needing[chunk.key] = again
+            again = self._needing[chunk.key] = self._want(chunk.key)
+            again.changed_s, again.waiting = chunk.changed_s, chunk.waiting
             chunk.waiting = deque()
-        elif chunk.key in self.windows.near:
-            self._missing.insert(0, chunk.key)
-        return lease
+        else:
+            self._note_missing(chunk.key)
+        return chunk
 
     def next_event_s(self, now_s: float) -> float:
         """When there is something to do although nothing happens; infinity for never."""
@@ -339,6 +473,6 @@ class Residency:
         if self._dirty and self.saving < self.limits.saves:  # else there is when one has been saved
             first = next(iter(self._dirty.values()))
             times.append(max(first.dirty_since_s + self._save_after_s, first.retry_s, self._save_s))
-        if self._needing or len(self.chunks) > sum(key in self.chunks for key in self.windows.near):
+        if self._short(now_s) is not _Short.NO:
             times.append(now_s + REVIEW_S)
         return max(now_s, min(times, default=math.inf))

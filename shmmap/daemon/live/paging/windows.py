@@ -4,7 +4,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.chunks.voxels import ChunkKey
 
@@ -45,33 +50,32 @@ class Windows:
     Attributes
     ----------
     near
-        Chunks that are near a client, with their distance to the nearest.
+        Chunks that are near a client, with the number of windows that they are in.
     """
 
     def __init__(self, radius: int, hysteresis: float) -> None:
         self._radius = radius
         self._hysteresis = hysteresis
         self._centers: dict[object, ChunkKey] = {}
-        self._distances: dict[ChunkKey, int] = {}  # what was asked for since a window moved
         self.near: dict[ChunkKey, int] = {}
 
-    def move(self, client: object, position: tuple[float, float, float]) -> bool:
-        """A client is somewhere, in chunks; whether its window follows.
+    def move(self, client: object, position: Place) -> tuple[list[ChunkKey], list[ChunkKey]]:
+        """A client is somewhere, in chunks; returns the chunks that came near, and that are near no more.
 
-        It does when the client is more than ``hysteresis`` beyond the border of the window's middle on each
-        axis that changes, or at once when it is more than a chunk away.
+        Its window follows when the client is more than ``hysteresis`` beyond the border of the window's
+        middle on each axis that changes, or at once when it is more than a chunk away.
         """
         key = ChunkKey(*(math.floor(value) for value in position))
         center = self._centers.get(client)
         if center is not None and (
             center == key or (key.distance(center) == 1 and not self._left(center, position))
         ):
-            return False
+            return [], []
         self._centers[client] = key
-        self._look_around()
-        return True
+        entered = [one for one in self._only_around(key, center) if self._enter(one)]
+        return entered, [] if center is None else self._leave(center, key)
 
-    def _left(self, center: ChunkKey, position: tuple[float, float, float]) -> bool:
+    def _left(self, center: ChunkKey, position: Place) -> bool:
         """Whether a position is far enough out of a chunk next to it."""
         into = [
             max(low - value, value - low - 1.0)
@@ -80,33 +84,53 @@ class Windows:
         ]
         return min(into) >= self._hysteresis
 
-    def leave(self, client: object) -> bool:
-        """A client has gone; whether it had a window."""
-        if self._centers.pop(client, None) is None:
-            return False
-        self._look_around()
-        return True
+    def leave(self, client: object) -> list[ChunkKey]:
+        """A client has gone; returns the chunks that are near no more."""
+        center = self._centers.pop(client, None)
+        return [] if center is None else self._leave(center, None)
 
     def center(self, client: object) -> ChunkKey | None:
         """The middle of a client's window."""
         return self._centers.get(client)
 
-    def _look_around(self) -> None:
-        reach = range(-self._radius, self._radius + 1)
-        self._distances.clear()
-        self.near = {}
-        for center in self._centers.values():
-            for x in reach:
-                for y in reach:
-                    for z in reach:
-                        key = ChunkKey(center.x + x, center.y + y, center.z + z)
-                        distance = max(abs(x), abs(y), abs(z))
-                        self.near[key] = min(self.near.get(key, distance), distance)
+    def _enter(self, key: ChunkKey) -> bool:
+        """Count one more window around a chunk; whether it is the first."""
+        count = self.near[key] = self.near.get(key, 0) + 1
+        return count == 1
 
-    def distance(self, key: ChunkKey) -> int:
-        """Chunks to the nearest client; 0 where there is none."""
-        found = self._distances.get(key)
-        if found is None:
-            found = min((key.distance(center) for center in self._centers.values()), default=0)
-            self._distances[key] = found
-        return found
+    def _leave(self, center: ChunkKey, now: ChunkKey | None) -> list[ChunkKey]:
+        """Count one window less around all that is not around another chunk; returns what is near no more."""
+        left = []
+        for key in self._only_around(center, now):
+            self.near[key] -= 1
+            if not self.near[key]:
+                del self.near[key]
+                left.append(key)
+        return left
+
+    def _only_around(self, center: ChunkKey, other: ChunkKey | None) -> Iterator[ChunkKey]:
+        """Chunks in the window around one chunk that are not in the window around another."""
+        reach = self._radius
+        ranges = [range(at - reach, at + reach + 1) for at in center]
+        if other is not None:
+            for axis, at in enumerate(other):
+                mine, theirs = ranges[axis], range(at - reach, at + reach + 1)
+                for alone in (
+                    range(mine.start, min(mine.stop, theirs.start)),
+                    range(max(mine.start, theirs.stop), mine.stop),
+                ):
+                    slab = [*ranges[:axis], alone, *ranges[axis + 1 :]]
+                    yield from (ChunkKey(*key) for key in product(*slab))
+                ranges[axis] = range(max(mine.start, theirs.start), min(mine.stop, theirs.stop))
+            return
+        yield from (ChunkKey(*key) for key in product(*ranges))
+
+    def distances(self, keys: Sequence[ChunkKey]) -> NDArray[np.int64]:
+        """Chunks from each of these to the nearest client, (N,); 0 where there is none."""
+        if not self._centers or not keys:
+            return np.zeros(len(keys), np.int64)
+        there = np.array(keys, np.int64)
+        nearest = np.full(len(keys), np.iinfo(np.int64).max)
+        for center in set(self._centers.values()):
+            np.minimum(nearest, np.abs(there - np.array(center)).max(axis=1), out=nearest)
+        return nearest

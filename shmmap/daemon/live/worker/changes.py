@@ -31,12 +31,13 @@ class Changes:
 
     def __init__(self, first: int) -> None:
         self.number = self._forgotten = first
-        self._changed: dict[ChunkKey, int] = {}
+        self._changed: dict[ChunkKey, int] = {}  # the last one last
         self._gone: deque[tuple[int, ChunkKey]] = deque()
 
     def changed(self, key: ChunkKey) -> None:
         """A chunk came into memory, or was changed there."""
         self.number += 1
+        self._changed.pop(key, None)
         self._changed[key] = self.number
 
     def gone(self, key: ChunkKey) -> None:
@@ -54,6 +55,17 @@ class Changes:
     def is_newer(self, key: ChunkKey, since: int) -> bool:
         """Whether a chunk in memory changed after ``since``."""
         return self._changed.get(key, 0) > since
+
+    def newer(self, since: int, most: int) -> list[ChunkKey] | None:
+        """Chunks in memory that changed after ``since``, the last one first; None for more than so many."""
+        found: list[ChunkKey] = []
+        for key, number in reversed(self._changed.items()):
+            if number <= since:
+                break
+            if len(found) == most:
+                return None
+            found.append(key)
+        return found
 
     def left(self, since: int) -> list[ChunkKey]:
         """What left memory after ``since`` and did not come back, each once."""

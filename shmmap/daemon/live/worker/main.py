@@ -10,12 +10,14 @@ import contextlib
 import gc
 import mmap
 import os
+import resource
 import select
 import signal
 import socket
 import stat
 import sys
 import time
+from pathlib import Path
 from typing import Any, Final
 
 from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
@@ -40,13 +42,15 @@ from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_request, encode, request_number
 from shmmap.protocol.live import LIVE_REQUESTS, LiveList, LiveListed
 from shmmap.protocol.messages import ErrorReply
-from shmmap.segment.pins import prepare_process
 
 __all__ = ["main"]
 
 STATUS_S: Final = 0.5
 HEARD_AT_ONCE: Final = 16
 END_S: Final = 0.2
+OTHERS: Final = 512
+"""Descriptors and mappings that are no chunks'."""
+LEAST_CHUNKS: Final = 64
 
 
 class _Worker:
@@ -91,7 +95,7 @@ class _Worker:
         self._closing.callback(_forget_records, wanted.shm_dir + prefix, memory)
         live = LiveMap(
             files, memory, UndoRecord(_record(wanted.shm_dir + prefix + "undo", UNDO_BYTES)),
-            _limits(settings, budget), usual_codec(), on_work_done=self._wake,
+            _limits(settings, budget, len(wanted.maps)), usual_codec(), on_work_done=self._wake,
         )  # fmt: skip
         lists = VoxelLists(live, wanted.shm_dir, mode, wanted.gid)
         lists.remove_all()
@@ -225,10 +229,14 @@ def _fixed(settings: LiveSettings) -> MapSettings:
     return MapSettings(settings.resolution, settings.occupancy, settings.frame_id)
 
 
-def _limits(settings: LiveSettings, budget_bytes: int) -> Limits:
-    """What a map may take of so much memory; readers cannot keep it from using a quarter of that."""
+def _limits(settings: LiveSettings, budget_bytes: int, maps: int) -> Limits:
+    """What one of so many maps may take; what is beside its chunks leaves them a quarter of the memory."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    with contextlib.suppress(OSError, ValueError):
+        limit = min(limit, int(Path("/proc/sys/vm/max_map_count").read_text()))
     return Limits(
-        budget_bytes, reserve_bytes=budget_bytes // 4, most_active=settings.most_active,
+        budget_bytes, reserve_bytes=budget_bytes // 4,
+        most_chunks=max(LEAST_CHUNKS, (limit - OTHERS) // maps), most_active=settings.most_active,
         radius=settings.radius, hysteresis=settings.hysteresis, linger_s=settings.linger_s,
         checkpoint_s=settings.checkpoint_s,
     )  # fmt: skip
@@ -263,7 +271,6 @@ def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID``; the first packet says which maps."""
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
-    prepare_process()
     set_up_logging()
     with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
         data, _ = receive_packet(channel, packet_buffer())

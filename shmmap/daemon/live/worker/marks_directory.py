@@ -56,7 +56,7 @@ class MarksDirectory:
             raise
 
     def take(self, name: str, nbytes: int, session: int, uid: int) -> bytes:
-        """Copy a file of marks.
+        """Take the content of a file of marks, and remove it: its memory is free for chunks.
 
         Parameters
         ----------
@@ -89,6 +89,7 @@ class MarksDirectory:
             data = os.pread(fd, nbytes, 0)
         finally:
             os.close(fd)
+        self._remove(name)
         if len(data) != nbytes:
             raise BadRequest(f"marks: {name} was cut to {len(data)} bytes")
         return data

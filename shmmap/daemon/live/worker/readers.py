@@ -1,23 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What readers of a live map ask: which chunks there are, and which voxels lie in an area."""
+"""What readers of a live map ask: which chunks there are, and which voxels lie in an area.
+
+A request is worked at in steps, each much shorter than a scan takes.  Sessions have a step each by turns, in
+a small part of the time between two scans; files are read in threads of their own.  So readers wait for each
+other and for the disk, and mapping for none of them.
+"""
 
 from __future__ import annotations
 
-import heapq
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from typing import Any, Final
 
 from shmmap.chunks.reading import KINDS
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.file_threads import FileThreads, Job
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import Row
 from shmmap.daemon.live.messages import Ask
-from shmmap.daemon.live.paging.records import State
+from shmmap.daemon.live.paging.key_index import KeyIndex, merged_part
+from shmmap.daemon.live.worker.areas import check_area, key_range, touches
 from shmmap.daemon.live.worker.changes import Changes
-from shmmap.daemon.live.worker.voxel_lists import VoxelLists, check_area, touches
-from shmmap.errors import BadRequest, CannotWrite, ShmmapError
+from shmmap.daemon.live.worker.voxel_lists import Later, Steps, VoxelLists
+from shmmap.errors import BadRequest, CannotWrite, InternalError, ShmmapError
+from shmmap.logfmt import log
 from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
 
@@ -25,11 +36,32 @@ __all__ = ["Readers"]
 
 NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
 """Of a chunk that has no file."""
+TURN_S: Final = 0.001
+"""What readers get of the worker's time between two of its turns, if there is something else to do."""
+KEYS_A_STEP: Final = 64
+FEW_CHANGES: Final = 1000
+"""More chunks than that are not sorted in one step."""
+THREADS: Final = 2
+"""They read the files that readers ask for; mapping has its own."""
+MEASURED_S: Final = 2.0
+NAMED: Final = 3
+"""Sessions that are named for the time that they take."""
 
 
 @dataclass(eq=False, slots=True)
+class _Work:
+    """A request at work; ``error`` or ``outcome`` is what came of the last thing that a thread did for it."""
+
+    ask: Ask
+    request: int
+    steps: Steps
+    outcome: Any = None
+    error: BaseException | None = None
+    is_over: bool = False
+
+
 class Readers:
-    """Answers those who read one map.
+    """Answers the readers of one map.
 
     Parameters
     ----------
@@ -37,113 +69,234 @@ class Readers:
         The map, what changed in it, and lists of its voxels.
     answer
         Takes a ticket and the reply to it.
+
+    Attributes
+    ----------
+    busiest
+        Sessions whose requests took most of the time, and how much of one processor, in thousandths.
     """
 
-    live: LiveMap
-    changes: Changes
-    lists: VoxelLists
-    answer: Callable[[int, Any], None]
-    _begun: deque[tuple[Ask, int, Iterator[messages.LiveVoxelsReply | None]]] = field(default_factory=deque)
+    def __init__(
+        self, live: LiveMap, changes: Changes, lists: VoxelLists, answer: Callable[[int, Any], None]
+    ) -> None:
+        self.live, self.changes, self.lists, self._answer = live, changes, lists, answer
+        self._ready: dict[int, deque[_Work]] = {}  # by session, the one whose turn it is first
+        self._later: list[tuple[float, _Work]] = []
+        self._in_thread: dict[int, deque[tuple[_Work, Callable[[], Any]]]] = {}  # by session, one at a time
+        self._threads = FileThreads(lambda: live.on_work_done(), THREADS)
+        self._spent_s: dict[int, float] = {}  # by session, since the measurement began
+        self._measured_s = time.monotonic()
+        self.busiest: tuple[tuple[int, int], ...] = ()
+
+    def next_turn_s(self, now_s: float) -> float:
+        """When there is something to do; infinity for when something comes."""
+        if self._ready:
+            return now_s
+        return min([self.lists.next_expiry_s, *(due_s for due_s, _ in self._later)])
 
     @property
     def are_waiting(self) -> bool:
-        """Whether a list of voxels is being made."""
-        return bool(self._begun)
+        """Whether a request is at work."""
+        return bool(self._ready or self._later or self._in_thread)
 
     def left(self, session: int) -> None:
         """A session has ended."""
+        works = [*self._ready.pop(session, ()), *(work for work, _ in self._in_thread.get(session, ()))]
+        works += [work for _, work in self._later if work.ask.session == session]
+        self._later = [row for row in self._later if row[1].ask.session != session]
+        for work in works:
+            work.is_over = True
+            work.steps.close()
         self.lists.left(session)
-        self._begun = deque(row for row in self._begun if row[0].session != session)
 
-    def page(self, message: messages.LiveChunks) -> messages.LiveChunkPage:
-        """Which chunks there are."""
-        live, resolution = self.live, self.live.files.settings.resolution
+    def close(self) -> None:
+        """Wait for what is in threads."""
+        self._threads.close()
+
+    def begin(self, ask: Ask, message: messages.LiveChunks | messages.LiveVoxels) -> None:
+        """Begin with a request, which is answered in later turns; raises `BadRequest`."""
         if message.area is not None:
             check_area(message.area)
+        if isinstance(message, messages.LiveChunks):
+            steps = self._page(message)
+        elif message.scope not in ("memory", "disk", "all"):
+            raise BadRequest(f"scope {message.scope!r}", hint="ask for memory, disk or all")
+        elif message.kind not in KINDS:
+            raise BadRequest(f"voxels are not {message.kind!r}", hint=f"ask for one of {', '.join(KINDS)}")
+        else:
+            steps = self._voxels(ask, message)
+        self._put(_Work(ask, message.request, steps))
+
+    # --- turns ----------------------------------------------------------------------------------
+
+    def turn(self, now_s: float) -> None:
+        """Go on with requests for a short time."""
+        self._threads.tell(now_s)
+        due = [work for due_s, work in self._later if due_s <= now_s]
+        self._later = [row for row in self._later if row[0] > now_s]
+        for work in due:
+            self._put(work)
+        begun_s = before_s = time.perf_counter()
+        while self._ready:
+            session = next(iter(self._ready))
+            works = self._ready.pop(session)
+            work = works.popleft()
+            if self._step(work, now_s):
+                works.append(work)
+            if works:  # after all others
+                self._ready[session] = works
+            after_s = time.perf_counter()
+            self._spent_s[session] = self._spent_s.get(session, 0.0) + after_s - before_s
+            if after_s >= begun_s + TURN_S:
+                break
+            before_s = after_s
+
+    def measure(self, now_s: float) -> None:
+        """Note which sessions are the busiest, from time to time."""
+        passed_s = now_s - self._measured_s
+        if passed_s >= MEASURED_S:
+            busiest = sorted(self._spent_s.items(), key=lambda item: -item[1])[:NAMED]
+            self.busiest = tuple((session, round(1000 * took_s / passed_s)) for session, took_s in busiest)
+            self._measured_s = now_s
+            self._spent_s.clear()
+
+    def _put(self, work: _Work) -> None:
+        self._ready.setdefault(work.ask.session, deque()).append(work)
+
+    def _step(self, work: _Work, now_s: float) -> bool:
+        """Do a step of a request; whether the next one may follow."""
+        outcome, error = work.outcome, work.error
+        work.outcome = work.error = None
+        try:
+            step = work.steps.send(outcome) if error is None else work.steps.throw(error)
+        except StopIteration as done:
+            self._answer(work.ask.ticket, done.value)
+        except ShmmapError as failed:
+            self._refuse(work, failed)
+        except OSError as failed:
+            self._refuse(work, CannotWrite(f"the list of voxels: {failed.strerror}"))
+        except Exception:  # noqa: BLE001  a defect met by one request must not end the map for all
+            log.exception("request of a reader failed")
+            self._refuse(work, InternalError("the daemon failed on this request"))
+        else:
+            if step is None:
+                return True
+            if isinstance(step, Later):
+                self._later.append((now_s + step.seconds, work))
+            else:
+                self._read(work, step)
+        return False
+
+    def _refuse(self, work: _Work, error: ShmmapError) -> None:
+        reply = ErrorReply(work.request, error.code, error.message, error.hint)
+        self._answer(work.ask.ticket, reply)
+
+    def _read(self, work: _Work, what: Callable[[], Any]) -> None:
+        """Have a thread do something for a request, after what it does for others of the same session."""
+        waiting = self._in_thread.setdefault(work.ask.session, deque())
+        waiting.append((work, what))
+        if len(waiting) == 1:
+            self._threads.start([Job(what, partial(self._done, work.ask.session))])
+
+    def _done(self, session: int, future: Future[Any], now_s: float) -> None:
+        del now_s
+        waiting = self._in_thread[session]
+        work, _ = waiting.popleft()
+        if not work.is_over:
+            work.error = future.exception()
+            work.outcome = None if work.error is not None else future.result()
+            self._put(work)
+        while waiting and waiting[0][0].is_over:
+            waiting.popleft()
+        if waiting:
+            self._threads.start([Job(waiting[0][1], partial(self._done, session))])
+        else:
+            del self._in_thread[session]
+
+    # --- what is asked --------------------------------------------------------------------------
+
+    def _keys(
+        self, area: messages.LiveArea | None, indexes: list[KeyIndex], since: int, after: ChunkKey | None
+    ) -> Iterator[list[ChunkKey]]:
+        """Chunks that touch an area, in order, a step's at a time; those in memory that changed since."""
+        resolution = self.live.files.settings.resolution
+        few = (
+            self.changes.newer(since, FEW_CHANGES)
+            if since and indexes == [self.live.residency.index]
+            else None
+        )
+        if few is not None:
+            sorted_few = iter(sorted(key for key in few if after is None or key > after))
+            while some := list(islice(sorted_few, KEYS_A_STEP)):
+                yield [key for key in some if touches(area, key, resolution)]
+            return
+        within, last = key_range(area, resolution), after
+        while True:
+            keys, last = merged_part(indexes, last, within, KEYS_A_STEP)
+            yield [
+                key
+                for key in keys
+                if (not since or key not in self.live.chunks or self.changes.is_newer(key, since))
+                and touches(area, key, resolution)
+            ]
+            if last is None:
+                return
+
+    def _page(self, message: messages.LiveChunks) -> Steps:
+        """Which chunks there are."""
+        live, area, change = self.live, message.area, self.changes.number
         known = not message.since or self.changes.known(message.since)
         since = message.since if known else 0
-        keys = (key for key in live.chunks if not since or self.changes.is_newer(key, since))
-        wanted: list[ChunkKey] = [key for key in keys if touches(message.area, key, resolution)]
-        others = set(list(live.files.rows) if message.saved else ())  # a copy: other threads save
-        if not since:
-            others |= self._given_up.keys()
-            others |= {key for key, one in live.residency.chunks.items() if one.state is State.LOADING}
-        wanted += [key for key in others if key not in live.chunks and touches(message.area, key, resolution)]
-        if message.after is not None:
-            wanted = [key for key in wanted if key > message.after]
-        page = heapq.nsmallest(messages.MOST_CHUNK_ROWS, wanted)
-        first = since and message.after is None
-        gone = (
-            [key for key in self.changes.left(since) if touches(message.area, key, resolution)]
-            if first
-            else []
-        )
+        gone = []
+        if since and message.after is None:
+            resolution = live.files.settings.resolution
+            for number, key in enumerate(self.changes.left(since), 1):
+                if touches(area, key, resolution):
+                    gone.append(key)
+                if number % KEYS_A_STEP == 0:
+                    yield None
+        indexes = [live.residency.index, *([live.stored] if message.saved else [])]
+        after = ChunkKey(*message.after) if message.after is not None else None
+        rows: list[messages.LiveChunkRow] = []
+        for keys in self._keys(area, indexes, since, after):
+            for key in keys:
+                row = self._row(key)
+                if row is not None and (not since or row.generation or message.saved):
+                    rows.append(row)
+            if len(rows) > messages.MOST_CHUNK_ROWS:
+                break
+            yield None
+        page = tuple(rows[: messages.MOST_CHUNK_ROWS])
         return messages.LiveChunkPage(
-            message.request, self.changes.number, tuple(self._row(key) for key in page),
-            len(wanted) > len(page), tuple(gone), known,
-        )  # fmt: skip
+            message.request, change, page, len(rows) > len(page), tuple(gone), known
+        )
 
-    def _row(self, key: ChunkKey) -> messages.LiveChunkRow:
-        there = self.live.chunks.get(key)
-        known = self.live.residency.chunks.get(key)
+    def _row(self, key: ChunkKey) -> messages.LiveChunkRow | None:
+        there, known = self.live.chunks.get(key), self.live.residency.chunks.get(key)
         if there is None or known is None:
-            row = self.live.files.rows.get(key, NOTHING)
-            state_now, nbytes = "saved", row.bytes
-            if known is not None and known.state is State.LOADING:
-                state_now, nbytes = known.state.value, known.nbytes
-            elif (given_up := self._given_up.get(key)) is not None:
-                state_now, nbytes = "evicting", given_up
+            row = self.live.files.rows.get(key)
+            if known is None and row is None:
+                return None
+            row = row or NOTHING
+            state_now, nbytes = ("saved", row.bytes) if known is None else (known.state.value, known.nbytes)
             return messages.LiveChunkRow(
                 key, 0, row.version, state_now, row.active, row.occupied, row.free, nbytes
             )
         state = there.view.state
         return messages.LiveChunkRow(
-            key, there.view.identity.generation, int(state["version"]), known.state.value,
-            int(state["active"]), int(state["occupied"]), int(state["free"]), known.nbytes,
+            key, there.generation, int(state["version"]), known.state.value, int(state["active"]),
+            int(state["occupied"]), int(state["free"]), known.nbytes,
         )  # fmt: skip
 
-    @property
-    def _given_up(self) -> dict[ChunkKey, int]:
-        """Bytes of chunks that are out of service, and that somebody still maps."""
-        found: dict[ChunkKey, int] = {}
-        for lease in self.live.residency.leases.by_number.values():
-            found[lease.key] = found.get(lease.key, 0) + lease.nbytes
-        return found
-
-    def begin_list(self, ask: Ask, message: messages.LiveVoxels) -> None:
-        """Begin a list of voxels; `go_on` answers it."""
-        if message.scope not in ("memory", "disk", "all"):
-            raise BadRequest(f"scope {message.scope!r}", hint="ask for memory, disk or all")
-        if message.area is not None:
-            check_area(message.area)
-        if message.kind not in KINDS:
-            raise BadRequest(f"voxels are not {message.kind!r}", hint=f"ask for one of {', '.join(KINDS)}")
-        resolution, since = self.live.files.settings.resolution, message.since
-        since = since if self.changes.known(since) else 0
-        keys = set() if message.scope == "disk" else {
-            key for key in self.live.chunks if not since or self.changes.is_newer(key, since)
-        }  # fmt: skip
+    def _voxels(self, ask: Ask, message: messages.LiveVoxels) -> Steps:
+        """Which voxels there are."""
+        change = self.changes.number
+        since = message.since if self.changes.known(message.since) else 0
+        indexes = []
+        if message.scope != "disk":
+            indexes.append(self.live.residency.index)
         if message.scope != "memory" and not since:
-            keys |= set(self.live.files.rows)
-        chosen = sorted(key for key in keys if touches(message.area, key, resolution))
-        work = self.lists.collect(message, chosen, ask.session, self.changes.number)
-        self._begun.append((ask, message.request, work))
-
-    def go_on(self) -> None:
-        """Make another part of a list."""
-        ask, request, work = self._begun[0]
-        try:
-            reply = next(work)
-        except ShmmapError as error:
-            self._refuse(ask, request, error)
-        except OSError as error:
-            self._refuse(ask, request, CannotWrite(f"the list of voxels: {error.strerror}"))
-        else:
-            if reply is None:
-                self._begun.rotate(-1)
-                return
-            self.answer(ask.ticket, reply)
-        self._begun.popleft()
-
-    def _refuse(self, ask: Ask, request: int, error: ShmmapError) -> None:
-        self.answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))
+            indexes.append(self.live.stored)
+        keys = self._keys(message.area, indexes, since, None) if indexes else iter(())
+        reply = yield from self.lists.collect(message, keys, ask.session, change)
+        return reply

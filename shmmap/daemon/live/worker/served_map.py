@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain, islice
 from typing import Final, Protocol, TypeVar
 
 import msgspec
@@ -16,7 +18,7 @@ from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import MOST_OF_A_SESSION, Ask
-from shmmap.daemon.live.paging.records import Chunk, Scan, State
+from shmmap.daemon.live.paging.records import Chunk, Scan
 from shmmap.daemon.live.paging.windows import place_ahead
 from shmmap.daemon.live.worker.applied_scans import AppliedScans
 from shmmap.daemon.live.worker.changes import Changes
@@ -36,9 +38,11 @@ _T = TypeVar("_T")
 AHEAD_S: Final = 2.0
 """Chunks are loaded for where a mapper will be then, if it goes on as it does."""
 MOST_AHEAD_CHUNKS: Final = 4.0
+MARKS_PART: Final = 2
+"""Marks of one scan may take this part of the budget: they are in shared memory until they are taken in."""
 MANIFEST_S: Final = 60.0
-LEASES_S: Final = 0.25
-"""How often the kernel is asked whether what was given up is still mapped."""
+FILES_S: Final = 0.5
+"""How often files are added up."""
 
 
 class _Reply(Protocol):
@@ -87,7 +91,9 @@ class ServedMap:
         durability, chunks = live.residency.durability, live.residency.chunks
         self._earlier = durability.missing(chunks.values())  # what an earlier life applied, and did not save
         self._scans = self._durable = 0
-        self._leases_s = self._manifest_s = 0.0
+        self._marks_bytes = 0  # of those in shared memory, as it was counted last
+        self._file_bytes, self._files_s = 0, -math.inf
+        self._manifest_s = 0.0
         self._listed = -1
         live.on_applied, live.on_durable = self._on_applied, self._on_durable
         live.on_changed, live.on_gone = self.changes.changed, self.changes.gone
@@ -110,10 +116,8 @@ class ServedMap:
         elif isinstance(message, messages.LiveSave):
             residency = self.live.residency
             self._saves.append((ask, message, residency.durability.missing(residency.chunks.values())))
-        elif isinstance(message, messages.LiveChunks):
-            self._answer(ask.ticket, self.readers.page(message))
-        elif isinstance(message, messages.LiveVoxels):
-            self.readers.begin_list(ask, message)
+        elif isinstance(message, messages.LiveChunks | messages.LiveVoxels):
+            self.readers.begin(ask, message)
         elif isinstance(message, messages.LiveRelease):
             self.readers.lists.release(ask.session, message.segment)
             self._answer(ask.ticket, messages.LiveReleased(message.request))
@@ -137,7 +141,8 @@ class ServedMap:
             active = self._on_disk(lambda: self.mappers.open(ask.uid, message.mapper, ask.session))
             reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
             reply.applied = active.applied
-            reply.marks_dir, reply.most_marks_bytes = self._marks.path, MOST_MARKS_BYTES
+            reply.marks_dir = self._marks.path
+            reply.most_marks_bytes = min(MOST_MARKS_BYTES, live.limits.budget_bytes // MARKS_PART)
         return reply
 
     def _on_disk(self, work: Callable[[], _T]) -> _T:
@@ -260,14 +265,16 @@ class ServedMap:
     def turn(self, now_s: float, *, save_all: bool) -> None:
         """Do what can be done now."""
         self._take_scans()
+        self.readers.lists.expire(now_s)
+        residency = self.live.residency
+        marks_bytes = sum(min(message.bytes, MOST_MARKS_BYTES) for _, message in self._waiting)
+        residency.beside_bytes += marks_bytes - self._marks_bytes
+        self._marks_bytes = marks_bytes
+        residency.asked_bytes = self.readers.lists.asked_bytes
         self.live.turn(now_s, time.time_ns(), save_all=save_all or bool(self._saves))
         if self._saves:
             self._answer_saves()
-        if self.readers.are_waiting:
-            self.readers.go_on()
-        if self.live.kept and now_s >= self._leases_s:
-            self.live.look_at_leases()
-            self._leases_s = now_s + LEASES_S
+        self.readers.turn(now_s)
         if now_s >= self._manifest_s and self.changes.number != self._listed:
             self._manifest_s, self._listed = now_s + MANIFEST_S, self.changes.number
             self.live.list_files(self._durable_scans())
@@ -276,31 +283,30 @@ class ServedMap:
         """When the next turn is due, if nothing happens before."""
         residency = self.live.residency
         first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][1].bytes)
-        if self.readers.are_waiting or first_fits or residency.is_ready:
+        if first_fits or residency.is_ready:
             return now_s
-        times = [residency.next_event_s(now_s)]
-        if self.live.kept:
-            times.append(self._leases_s)
-        return min(times)
+        return min(residency.next_event_s(now_s), self.readers.next_turn_s(now_s))
 
     def status(self) -> messages.LiveMapRow:
         """How the map is."""
-        live, residency = self.live, self.live.residency
-        states = [chunk.state for chunk in residency.chunks.values()]
-        missing = [f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items()]
-        damaged = [f"{name}: {why}" for name, why in list(live.files.damaged.items())]  # other threads load
+        live, residency, now_s = self.live, self.live.residency, time.monotonic()
+        self.readers.measure(now_s)
+        if now_s >= self._files_s:
+            self._files_s = now_s + FILES_S
+            self._file_bytes = sum(row.bytes for row in list(live.files.rows.values()))  # other threads save
+        missing = (f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items())
+        damaged = (f"{name}: {why}" for name, why in list(live.files.damaged.items()))
         return messages.LiveMapRow(
             self.settings.name, self.settings.path, live.files.settings.resolution,
             live.files.settings.frame_id, chunks=len(live.chunks), active=residency.active,
-            bytes=residency.chunk_bytes, loading=states.count(State.LOADING),
-            dirty=states.count(State.DIRTY), saving=states.count(State.SAVING),
-            evicting=len(residency.leases.by_number), evicting_bytes=residency.leases.nbytes,
-            waiting_bytes=residency.waiting_bytes, files=len(live.files.rows),
-            file_bytes=sum(row.bytes for row in list(live.files.rows.values())), scans=self._scans,
-            durable=self._durable, budget_bytes=live.limits.budget_bytes,
-            damaged=tuple([*missing, *damaged][:64]),
+            bytes=residency.chunk_bytes, loading=len(residency.chunks) - len(live.chunks),
+            dirty=residency.dirty, saving=residency.saving, evicting=0, evicting_bytes=0,
+            waiting_bytes=residency.waiting_bytes, files=len(live.files.rows), file_bytes=self._file_bytes,
+            scans=self._scans, durable=self._durable, budget_bytes=live.limits.budget_bytes,
+            damaged=tuple(islice(chain(missing, damaged), 64)),
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
-            problem=live.problem, change=self.changes.number,
+            problem=live.problem, change=self.changes.number, beside_bytes=residency.beside_bytes,
+            readers=self.readers.busiest,
         )  # fmt: skip
 
     # --- the end --------------------------------------------------------------------------------
@@ -316,6 +322,7 @@ class ServedMap:
 
     def end(self, *, keep: bool) -> int:
         """End it; returns how many chunks stay in memory because they are nowhere else."""
+        self.readers.close()
         self.readers.lists.remove_all()
         unsaved = sum(chunk.version > chunk.saved for chunk in self.live.residency.chunks.values())
         if not keep and not unsaved:

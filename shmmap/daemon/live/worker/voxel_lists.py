@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxels of an area, put together into a file in shared memory: the answer to whoever asks for many.
+"""Voxels of an area, put together into a file in shared memory: the answer to a request for many.
 
-A list is N x 3 int32, the voxels' indices, and behind them N int16, their log-odds in thousandths.  Its name
-goes when the reader has opened it, asks for more lists than a session may have, or leaves.
+A list is N x 3 int32, the voxels' indices, and behind them N int16, their log-odds in thousandths.  It takes
+memory within the map's budget, and is there for as long as reading it takes: until its reader releases it,
+asks for more lists than a session may have, or leaves, and for `KEPT_S` at most.  Then it is cut to nothing,
+whatever its reader has open or mapped.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import math
+import mmap
 import os
 import secrets
+import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,67 +30,48 @@ from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.reading import select_voxels
 from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.daemon.live.live_map import LiveMap
-from shmmap.errors import BadRequest, MapDataError, OverBudget
-from shmmap.protocol.live import LiveArea, LiveVoxels, LiveVoxelsReply, SphereMessage
+from shmmap.daemon.live.worker.areas import inside
+from shmmap.errors import MapDataError, OverBudget
+from shmmap.protocol.live import LiveVoxels, LiveVoxelsReply
 
-__all__ = ["VoxelLists", "check_area", "touches"]
+__all__ = ["Later", "Steps", "VoxelLists"]
 
 LISTS_OF_A_SESSION: Final = 4
 VOXEL_BYTES: Final = 14
 PART_OF_BUDGET: Final = 4
 """All lists together may take this part of the map's budget."""
-CHUNKS_A_STEP: Final = 8
+KEPT_S: Final = 10.0
+"""How long a list is there for its reader."""
+ROOM_S: Final = 10.0
+"""How long a list waits until chunks have made room for it."""
+ASK_AGAIN_S: Final = 0.005
+FILES_TOGETHER: Final = 8
+"""Chunks that a thread reads for a list before others have their turn."""
+BYTES_A_STEP: Final = 256 << 10
 NAME: Final = "voxels."
 
-
-def check_area(area: LiveArea) -> None:
-    """Refuse an area that makes no sense; `BadRequest`."""
-    if isinstance(area, SphereMessage):
-        good = bool(np.isfinite([area.x, area.y, area.z, area.radius]).all()) and area.radius >= 0.0
-    else:
-        low, high = (area.min_x, area.min_y), (area.max_x, area.max_y)
-        if (area.z_min is None) != (area.z_max is None):
-            raise BadRequest("area: a z range has two ends")
-        if area.z_min is not None and area.z_max is not None:
-            low, high = (*low, area.z_min), (*high, area.z_max)  # type: ignore[assignment]
-        good = bool(np.isfinite([*low, *high]).all()) and all(a <= b for a, b in zip(low, high, strict=True))
-    if not good:
-        raise BadRequest("area: it is not finite, or nothing can lie in it")
+_Part = tuple[NDArray[np.int32], NDArray[np.int16]]
 
 
-def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
-    """Whether a chunk and an area have anything in common."""
-    if area is None:
-        return True
-    low_x, low_y, low_z, high_x, high_y, high_z = key.box(resolution)
-    if isinstance(area, SphereMessage):
-        gaps = (
-            max(low - value, 0.0, value - high)
-            for value, low, high in (
-                (area.x, low_x, high_x), (area.y, low_y, high_y), (area.z, low_z, high_z),
-            )
-        )  # fmt: skip
-        return sum(gap * gap for gap in gaps) <= area.radius**2
-    flat = low_x <= area.max_x and high_x >= area.min_x and low_y <= area.max_y and high_y >= area.min_y
-    if area.z_min is None or area.z_max is None:
-        return flat
-    return flat and low_z <= area.z_max and high_z >= area.z_min
+@dataclass(frozen=True, slots=True)
+class Later:
+    """A request goes on after so many seconds."""
+
+    seconds: float
 
 
-def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of these places, (N, 3) metres, lie in an area."""
-    if area is None:
-        return np.ones(len(centers), np.bool_)
-    found: NDArray[np.bool_]
-    if isinstance(area, SphereMessage):
-        away = centers - np.array([area.x, area.y, area.z])
-        found = (away * away).sum(axis=1) <= area.radius**2
-        return found
-    x, y, z = centers.T
-    found = (x >= area.min_x) & (x <= area.max_x) & (y >= area.min_y) & (y <= area.max_y)
-    if area.z_min is not None and area.z_max is not None:
-        found &= (z >= area.z_min) & (z <= area.z_max)
-    return found
+Steps = Generator[Callable[[], Any] | Later | None, Any, Any]
+"""A request at work: it yields None after a step, `Later`, or what a thread is to do, and gets the outcome.
+
+What it returns is the reply.
+"""
+
+
+@dataclass(eq=False, slots=True)
+class _List:
+    name: str
+    nbytes: int
+    until_s: float
 
 
 @dataclass(eq=False)
@@ -102,112 +90,202 @@ class VoxelLists:
     path: str
     mode: int
     gid: int
-    _names: dict[int, deque[tuple[str, int]]] = field(default_factory=dict)
+    _lists: dict[int, deque[_List]] = field(default_factory=dict)
     _making: int = 0
+    _asked: dict[int, int] = field(default_factory=dict)
 
     @property
     def nbytes(self) -> int:
-        """Memory of all lists that have names, and of those that are being made."""
-        return self._making + sum(nbytes for names in self._names.values() for _, nbytes in names)
+        """Memory of all lists that are there."""
+        return sum(one.nbytes for lists in self._lists.values() for one in lists)
+
+    @property
+    def asked_bytes(self) -> int:
+        """The least that a list waits for; 0 where none does."""
+        return min(self._asked.values(), default=0)
+
+    @property
+    def next_expiry_s(self) -> float:
+        """When the next list has been there for long enough; infinity for never."""
+        return min((one.until_s for lists in self._lists.values() for one in lists), default=math.inf)
 
     def collect(
-        self, message: LiveVoxels, keys: Iterable[ChunkKey], session: int, change: int
-    ) -> Iterator[LiveVoxelsReply | None]:
-        """Make a list, of these chunks; the last thing that this gives is the reply.
+        self, message: LiveVoxels, keys: Iterator[list[ChunkKey]], session: int, change: int
+    ) -> Steps:
+        """Make a list of the voxels of these chunks; returns the reply.
 
         Raises
         ------
         OverBudget
-            There are more voxels than lists may take memory.
-        BadRequest
-            The request makes no sense.
+            There are more voxels than lists may take memory, or there is no room for them just now.
+        MapDataError
+            A file cannot be read.
+        OSError
+            The list cannot be written.
         """
-        parts: list[tuple[NDArray[np.int32], NDArray[np.int16]]] = []
-        most = self.live.limits.budget_bytes // PART_OF_BUDGET
-        count = 0
+        parts: list[_Part] = []
+        made = 0
+        pick = partial(self._picked, message)
+
+        def keep(part: _Part) -> None:
+            nonlocal made
+            if len(part[1]):
+                parts.append(part)
+                made += len(part[1]) * VOXEL_BYTES
+                self._making += len(part[1]) * VOXEL_BYTES
+                self._check(made, message.kind)
+
         try:
-            for number, key in enumerate(keys):
-                there = self.live.chunks.get(key) if message.scope != "disk" else None
-                if number % CHUNKS_A_STEP == CHUNKS_A_STEP - 1 or there is None:
-                    yield None
-                view = self._view(key, message.scope)
-                if view is None:
-                    continue
-                indices, log_odds = select_voxels(view, message.kind)
-                wanted = inside(message.area, voxel_centers(indices, self.live.files.settings.resolution))
-                parts.append((indices[wanted], log_odds[wanted]))
-                more = len(parts[-1][1])
-                count += more
-                self._making += more * VOXEL_BYTES
-                if self.nbytes > most:
-                    raise OverBudget(
-                        f"{count} voxels and more are {message.kind} there: all lists together may take"
-                        f" {most} bytes",
-                        hint="ask for a smaller area, or raise --live-budget",
-                    )
-            name = self._write(parts, session)
+            for some in keys:
+                cold: list[ChunkKey] = []
+                for key in some:
+                    there = self.live.chunks.get(key)
+                    if message.scope != "disk" and there is not None:
+                        keep(pick(there.view))
+                        yield None
+                    elif message.scope != "memory" and key in self.live.files.rows:
+                        cold.append(key)
+                for first in range(0, len(cold), FILES_TOGETHER):
+                    for part in (yield partial(self._read, cold[first : first + FILES_TOGETHER], pick)):
+                        keep(part)
+                yield None
+            yield from self._room(_pages(made))
+            name = yield from self._write(parts, made, session)
         finally:
-            self._making -= count * VOXEL_BYTES
-        yield LiveVoxelsReply(message.request, change, name, count, count * VOXEL_BYTES)
+            self._making -= made
+        return LiveVoxelsReply(message.request, change, name, made // VOXEL_BYTES, made)
 
-    def _view(self, key: ChunkKey, scope: str) -> ChunkView | None:
-        """A chunk as it is in memory, or on disk; None where it is not there."""
-        there = self.live.chunks.get(key)
-        if scope != "disk" and there is not None:
-            return there.view
-        data = self.live.files.load(key) if scope != "memory" else None
-        if data is None:
-            return None
-        try:
-            return ChunkView(decode_chunk(data, self.live.identity(key, 0), key.text))
-        except MapDataError:
-            return None  # it is put aside when it is loaded
+    def _check(self, made: int, kind: str) -> None:
+        most = self.live.limits.budget_bytes // PART_OF_BUDGET
+        if self.nbytes + self._making > most:
+            raise OverBudget(
+                f"{made // VOXEL_BYTES} voxels and more are {kind} there: all lists together may take {most}"
+                " bytes",
+                hint="ask for a smaller area, or raise --live-budget",
+            )
 
-    def _write(self, parts: list[tuple[NDArray[np.int32], NDArray[np.int16]]], session: int) -> str:
-        name = f"{self.live.memory.prefix}{NAME}{secrets.token_hex(8)}"
-        fd = os.open(
-            self.path + name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
-        )
+    def _picked(self, message: LiveVoxels, view: ChunkView) -> _Part:
+        indices, log_odds = select_voxels(view, message.kind)
+        if message.area is None:
+            return indices, log_odds
+        wanted = inside(message.area, voxel_centers(indices, self.live.files.settings.resolution))
+        return indices[wanted], log_odds[wanted]
+
+    def _read(self, keys: list[ChunkKey], pick: Callable[[ChunkView], _Part]) -> list[_Part]:
+        """Voxels of chunks as they were last saved; done by a thread."""
+        found = []
+        for key in keys:
+            try:
+                data = self.live.files.load(key)
+                if data is not None:
+                    found.append(pick(ChunkView(decode_chunk(data, self.live.identity(key, 0), key.text))))
+            except (FileNotFoundError, MapDataError):  # noqa: PERF203  it is put aside when it is loaded
+                continue
+            except OSError as error:
+                raise MapDataError(
+                    f"it cannot be read: {error.strerror}", path=key.text, cause="unreadable"
+                ) from error
+        return found
+
+    def _room(self, nbytes: int) -> Steps:
+        """Wait until chunks have made room, if there is none."""
+        number = secrets.randbits(62)
+        until_s = time.monotonic() + ROOM_S
         try:
-            with open(fd, "wb") as file:
-                for column in (0, 1):
-                    for part in parts:
-                        file.write(np.ascontiguousarray(part[column]).data)
-                file.flush()
-                if self.gid >= 0:
-                    os.fchown(fd, -1, self.gid)
-                os.fchmod(fd, self.mode)
-                nbytes = os.fstat(fd).st_blocks * 512
-        except OSError:
-            self._remove(name)
+            while nbytes and not self.live.residency.fits(nbytes):
+                if time.monotonic() >= until_s:
+                    raise OverBudget(
+                        f"a list of {nbytes} bytes has no room: chunks that cannot be saved take all of it",
+                        hint="see what `shmmap live ls` says, or raise --live-budget",
+                    )
+                self._asked[number] = nbytes
+                yield Later(ASK_AGAIN_S)
+        finally:
+            self._asked.pop(number, None)
+
+    def _write(
+        self, parts: list[_Part], nbytes: int, session: int
+    ) -> Generator[Callable[[], Any] | Later | None, Any, str]:
+        one = _List(f"{self.live.memory.prefix}{NAME}{secrets.token_hex(8)}", _pages(nbytes), math.inf)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+        fd = os.open(self.path + one.name, flags, 0o600)
+        lists = self._lists.setdefault(session, deque())
+        lists.append(one)
+        self.live.residency.beside_bytes += one.nbytes
+        try:
+            for column in (0, 1):
+                for part in parts:
+                    left = np.ascontiguousarray(part[column]).data.cast("B")
+                    while left:
+                        done = os.write(fd, left[:BYTES_A_STEP])
+                        left = left[done:]
+                        if done == BYTES_A_STEP:
+                            yield None
+            if self.gid >= 0:
+                os.fchown(fd, -1, self.gid)
+            os.fchmod(fd, self.mode)
+        except BaseException:
+            if one in lists:
+                lists.remove(one)
+                self._remove(one)
             raise
-        names = self._names.setdefault(session, deque())
-        names.append((name, nbytes))
-        if len(names) > LISTS_OF_A_SESSION:
-            self._remove(names.popleft()[0])
-        return name
+        finally:
+            os.close(fd)
+        one.until_s = time.monotonic() + KEPT_S
+        if len(lists) > LISTS_OF_A_SESSION:
+            oldest = min(lists, key=lambda other: other.until_s)
+            lists.remove(oldest)
+            self._remove(oldest)
+        return one.name
 
     def release(self, session: int, name: str) -> None:
-        """Take a list's name away, of those that this session was given."""
-        names = self._names.get(session, deque())
-        for row in list(names):
-            if row[0] == name:
-                names.remove(row)
-                self._remove(name)
+        """Remove a list, of those that this session was given."""
+        lists = self._lists.get(session, deque())
+        for one in [one for one in lists if one.name == name]:
+            lists.remove(one)
+            self._remove(one)
+
+    def expire(self, now_s: float) -> None:
+        """Remove what has been there for long enough."""
+        for lists in self._lists.values():
+            for one in [one for one in lists if one.until_s <= now_s]:
+                lists.remove(one)
+                self._remove(one)
 
     def left(self, session: int) -> None:
         """A session has ended."""
-        for name, _ in self._names.pop(session, ()):
-            self._remove(name)
+        for one in self._lists.pop(session, ()):
+            self._remove(one)
 
     def remove_all(self) -> None:
-        """Take all names away, those of an earlier life too."""
-        self._names.clear()
+        """Remove all lists, those of an earlier life too."""
+        for session in list(self._lists):
+            self.left(session)
         start = self.live.memory.prefix.lstrip("/") + NAME
         for name in os.listdir(self.path):
             if name.startswith(start):
-                self._remove("/" + name)
+                self._cut("/" + name)
 
-    def _remove(self, name: str) -> None:
-        with contextlib.suppress(FileNotFoundError, PermissionError):  # somebody else's is not one of ours
+    def _remove(self, one: _List) -> None:
+        self.live.residency.beside_bytes -= one.nbytes
+        self._cut(one.name)
+
+    def _cut(self, name: str) -> None:
+        """Free a file's memory, whatever readers do with it, and take its name away."""
+        with contextlib.suppress(FileNotFoundError, PermissionError):  # another account's is not one of ours
+            try:
+                fd = os.open(self.path + name, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            except OSError as error:
+                if error.errno not in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
+                    raise
+            else:
+                try:
+                    os.ftruncate(fd, 0)
+                finally:
+                    os.close(fd)
             os.unlink(self.path + name)
+
+
+def _pages(nbytes: int) -> int:
+    """Memory that so many bytes of a file take."""
+    return -(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE

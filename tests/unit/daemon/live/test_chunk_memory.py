@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks in shared memory: they grow in place, readers keep what is given up, the next writer finds them."""
+"""Chunks in shared memory: they grow in place, readers keep nothing of them, the next writer finds them."""
 
 from __future__ import annotations
 
 import errno
-import mmap
 import os
 import resource
+import signal
 import stat
 import subprocess
 import sys
@@ -21,9 +21,7 @@ from msgspec.structs import replace
 from shmmap.chunks.layout import (
     HEADER_BYTES,
     MOST_BYTES,
-    OUT_OF_SERVICE,
     ChunkIdentity,
-    ChunkView,
     chunk_bytes,
     new_header,
 )
@@ -83,43 +81,46 @@ def test_a_chunk_is_made_grows_and_is_found_again(memory: ChunkMemory, directory
     assert (directory / NAME[1:]).stat().st_size == MOST_BYTES
 
 
-def test_a_reader_sees_it_grow_and_keeps_what_is_given_up(memory: ChunkMemory, directory: Path) -> None:
+def test_what_is_given_up_is_free_at_once_whatever_others_have_of_it(
+    memory: ChunkMemory, directory: Path
+) -> None:
+    """Open, mapped, or looked at: its memory is free, and who looks gets a signal, not a zero."""
     chunk = memory.create(new_header(IDENTITY))
-    fill(chunk, 1)
-    with (directory / NAME[1:]).open("rb") as file:
-        seen = ChunkView(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
-        assert int(seen.bricks[0, 0]) == 1
-        chunk.view.bricks[0] = 9
-        assert int(seen.bricks[0, 0]) == 9
-        kept = memory.give_up(chunk)
-        assert list(memory.names()) == []
-        assert int(seen.state["state"]) == OUT_OF_SERVICE
-        assert int(seen.bricks[0, 0]) == 9
-        (again,) = memory.given_up()
-        assert again[0] == IDENTITY.key
-        os.close(again[1].fd)
-        seen_by_kernel = kept.is_mapped
-        memory.forget(kept)
-        assert seen_by_kernel
+    fill(chunk, BRICKS)
+    program = f"""
+import mmap, os, sys
+fd = os.open({str(directory / NAME[1:])!r}, os.O_RDONLY)
+data = mmap.mmap(fd, 0, prot=mmap.PROT_READ)
+assert data[4096] == 1
+print("mapped", flush=True)
+sys.stdin.readline()
+assert os.fstat(fd).st_size == 0 and not os.pread(fd, 8, 0)
+print(data[4096], flush=True)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as reader:
+        assert reader.stdin is not None
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "mapped\n"
+        status = (directory / NAME[1:]).stat()
+        assert status.st_blocks * 512 == MOST_BYTES
+        fd = os.open(directory / NAME[1:], os.O_RDONLY)
+        memory.give_up(chunk)
         assert not list(directory.iterdir())
+        assert os.fstat(fd).st_blocks == 0
+        os.close(fd)
+        out, _ = reader.communicate("go on\n", timeout=60)
+        assert (out, reader.returncode) == ("", -signal.SIGBUS)
 
 
-@pytest.mark.parametrize("mapped", [True, False])
-def test_what_nobody_maps_is_freed_at_once(memory: ChunkMemory, directory: Path, *, mapped: bool) -> None:
-    chunk = memory.create(new_header(IDENTITY))
-    with (directory / NAME[1:]).open("rb") as file:
-        seen = ChunkView(mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ))
-        file.close()
-        if not mapped:
-            seen = ChunkView(bytes(seen.data))
-        kept = memory.free(chunk)
-        assert (kept is not None) == mapped
-        if kept is not None:
-            assert int(seen.state["state"]) == OUT_OF_SERVICE
-            assert list(memory.names()) == []
-            assert kept.is_mapped
-            memory.forget(kept)
-    assert not list(directory.iterdir())
+def test_a_writer_that_died_while_it_gave_a_chunk_up_leaves_nothing_to_adopt(
+    memory: ChunkMemory, directory: Path
+) -> None:
+    memory.create(new_header(IDENTITY)).close()
+    assert not memory.is_given_up(NAME)
+    os.truncate(directory / NAME[1:], 0)
+    assert memory.is_given_up(NAME)
 
 
 def test_who_may_read_it(directory: Path) -> None:
@@ -176,12 +177,11 @@ def test_where_nothing_more_can_be_mapped_no_name_stays(
 @pytest.mark.root
 def test_what_is_somebody_else_s_is_not_ours_to_take_over(memory: ChunkMemory, directory: Path) -> None:
     memory.create(new_header(IDENTITY)).close()
-    theirs = [directory / f"{PREFIX[1:]}0_0_0.3", directory / f"{PREFIX[1:]}0_0_0.3.gone"]
+    theirs = [directory / f"{PREFIX[1:]}0_0_0.3"]
     for path in theirs:
         path.write_bytes(new_header(replace(IDENTITY, key=ChunkKey(0, 0, 0), generation=3)))
         os.chown(path, MEMBER, -1)
     assert [name for name, _, _ in memory.names()] == [NAME]
-    assert list(memory.given_up()) == []
     assert memory.foreign == {path.name for path in theirs}
     for path in theirs:
         path.unlink()

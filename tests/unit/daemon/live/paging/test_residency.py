@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.paging.durability import TOGETHER_S
 from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.paging.residency import RETRY_S, Residency
-from shmmap.daemon.live.paging.victims import REVIEW_S
+from shmmap.daemon.live.paging.residency import RETRY_S, REVIEW_S, Residency
+from shmmap.daemon.live.paging.windows import Windows
 
 HERE = ChunkKey(0, 0, 0)
 PLENTY = Limits(budget_bytes=10**9, radius=0, loads=100, saves=100)
@@ -49,6 +50,11 @@ def written(one: Residency, key: ChunkKey, now_s: float = 0.0) -> Chunk:
     chunk = load(one, now_s)
     apply(one, chunk, now_s)
     return chunk
+
+
+def ask_for_room(one: Residency) -> None:
+    """Something waits for more memory than there is: anything may be given up."""
+    one.asked_bytes = one.limits.budget_bytes + 1
 
 
 def flush(one: Residency) -> list[Scan]:
@@ -112,10 +118,27 @@ def test_several_clients_have_all_their_windows() -> None:
     for chunk in one.chunks.values():
         one.loaded(chunk, version=0, nbytes=10, active=0)
     one.leave("b")
-    gone = 0
-    while one.next_eviction(1.0) is not None:
-        gone += 1
-    assert gone == 9
+    assert len(one.windows.near) == 27
+    assert one.next_eviction(1.0) is None, "there is room: what nobody is near stays, too"
+
+
+def test_only_what_is_near_nobody_makes_room_for_what_is_near() -> None:
+    one = Residency(Limits(27 * 10, radius=1, hysteresis=0.0, loads=100), new_bytes=10)
+    one.move("a", (0.5, 0.5, 0.5))
+    while (chunk := one.next_load(0.0)) is not None:
+        one.loaded(chunk, version=0, nbytes=10, active=0)
+    one.move("a", (1.5, 0.5, 0.5))
+    gone, come = set(), set()
+    for _ in range(9):
+        assert one.next_load(1.0) is None
+        victim = one.next_eviction(1.0)
+        assert victim is not None
+        assert one.next_eviction(1.0) is None, "no more than is needed"
+        gone.add(victim.key)
+        come.add(load(one, 1.0).key)
+    assert ({key.x for key in gone}, {key.x for key in come}) == ({-1}, {2})
+    assert one.next_eviction(2.0) is None
+    assert one.next_load(2.0) is None
 
 
 # --- scans --------------------------------------------------------------------------------------
@@ -215,9 +238,10 @@ def test_what_was_given_up_before_it_was_durable_is_not_durable_when_it_comes_ba
     chunk = written(one, HERE)
     assert one.next_save(50.0) is chunk
     one.saved(chunk, 1, 50.0)
-    lease = one.next_eviction(50.0)
-    assert lease is not None
+    ask_for_room(one)
+    assert one.next_eviction(50.0) is chunk
     again = scan_of(HERE)
+    one.asked_bytes = 0
     one.add(again)
     back = load(one, version=1)
     one.applied(back, again, version=1, nbytes=10, active=1, now_s=50.0)
@@ -251,29 +275,38 @@ def test_a_file_that_cannot_be_read_just_now_is_tried_again() -> None:
 # --- giving up ----------------------------------------------------------------------------------
 
 
-def test_what_nobody_wants_is_given_up_the_furthest_first() -> None:
+def test_clean_chunks_stay_until_their_room_is_needed() -> None:
+    one = Residency(PLENTY)
+    chunk = written(one, HERE)
+    assert one.next_save(20.0) is chunk
+    one.saved(chunk, 1, 20.0)
+    flush(one)
+    for now_s in (20.0, 25.0, 1e6):
+        assert one.next_eviction(now_s) is None
+        assert one.next_event_s(now_s) == math.inf, "and nobody looks for what may go"
+
+
+def test_what_nobody_wants_is_given_up_first_the_furthest_of_it() -> None:
     one = Residency(Limits(10**9, radius=1, loads=100))
     one.move("a", (0.5, 0.5, 0.5))
     for x in (0, 1, 2, 9, 4):
         one.add(scan_of(ChunkKey(x, 0, 0)))
         chunk = load(one, version=3)
         one.applied(chunk, chunk.waiting[0], version=3, nbytes=10, active=1, now_s=0.0)
-    assert one.next_eviction(1.0) is None, "it was just changed"
-    gone = [lease.key.x for _ in range(5) if (lease := one.next_eviction(2.0)) is not None]
-    assert gone == [9, 4, 2]
+    ask_for_room(one)
+    gone = [victim.key.x for _ in range(6) if (victim := one.next_eviction(2.0)) is not None]
+    assert gone == [9, 4, 2, 1, 0]
 
 
 def test_a_dirty_chunk_is_saved_before_it_is_given_up() -> None:
     one = Residency(PLENTY)
     chunk = written(one, HERE)
+    ask_for_room(one)
     assert one.next_eviction(5.0) is None
     assert one.next_save(5.0) is chunk, "before its time"
     one.saved(chunk, 1, 5.0)
-    lease = one.next_eviction(5.0)
-    assert lease is not None
-    assert (lease.key, lease.nbytes, one.chunk_bytes, one.leases.nbytes) == (HERE, 10, 0, 10)
-    one.leases.end(lease)
-    assert (one.leases.nbytes, one.leases.by_number) == (0, {})
+    assert one.next_eviction(5.0) is chunk
+    assert (one.chunk_bytes, one.active, len(one.chunks), len(one.index)) == (0, 0, 0, 0)
 
 
 def test_too_many_known_voxels_are_too_many() -> None:
@@ -303,23 +336,56 @@ def test_room_that_was_made_for_one_is_not_another_s() -> None:
         load(one)
     assert not one.may_grow(chunk, 15)
     for number in range(2):
-        lease = one.next_eviction(5.0)
-        assert lease is not None
-        one.leases.end(lease)
+        assert one.next_eviction(5.0) is not None
         assert one.next_load(5.0) is None, number
     assert one.may_grow(chunk, 15)
     apply(one, chunk, 5.0, grows=15)
     assert one.chunk_bytes == 35
 
 
-def test_readers_cannot_keep_a_map_from_being_written() -> None:
-    one = Residency(Limits(20, reserve_bytes=20, radius=0, loads=100), new_bytes=10)
+def test_what_is_beside_the_chunks_is_in_the_budget() -> None:
+    one = Residency(Limits(100, reserve_bytes=20, radius=0, loads=100), new_bytes=10)
+    for number in range(8):
+        one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=1, now_s=0.0)
+    assert not one.fits(25)
+    one.asked_bytes = 25
+    assert one.next_eviction(5.0) is not None
+    assert one.next_eviction(5.0) is None, "no more than is needed"
+    one.beside_bytes, one.asked_bytes = 25, 0
+    one.add(scan_of(HERE, number=1))
+    chunk = one.chunks[HERE]
+    assert not one.may_grow(chunk, 10)
+    assert one.next_eviction(5.0) is not None
+    assert one.may_grow(chunk, 10)
+
+
+def test_what_is_beside_the_chunks_keeps_no_map_from_being_written() -> None:
+    one = Residency(Limits(80, reserve_bytes=20, radius=0, loads=100), new_bytes=10)
+    one.beside_bytes = 75
     for number in range(1, 5):
-        chunk = written(one, ChunkKey(number, 0, 0), 10.0 * number)
-        assert one.next_save(10.0 * number + 5.0) is chunk
-        one.saved(chunk, 1, 10.0 * number + 5.0)
-        assert one.next_eviction(10.0 * number + 5.0) is not None
-    assert one.leases.nbytes == 40
+        one.add(scan_of(ChunkKey(number, 0, 0), number=number))
+        for now_s in (10.0 * number, 10.0 * number + 1):
+            if (chunk := one.next_save(now_s)) is not None:
+                one.saved(chunk, chunk.version, now_s)
+            one.next_eviction(now_s)
+        apply(one, load(one, 10.0 * number + 1), 10.0 * number)
+        assert one.chunk_bytes <= 20
+
+
+def test_there_are_no_more_chunks_than_may_be_mapped() -> None:
+    one = Residency(Limits(10**9, most_chunks=2, radius=0, loads=100), new_bytes=10)
+    for number in range(4):
+        one.add(scan_of(ChunkKey(number, 0, 0), number=number + 1))
+    for _ in range(2):
+        apply(one, load(one))
+    assert one.next_load(0.0) is None
+    for number in range(2):
+        dirty = one.next_save(5.0)
+        assert dirty is not None
+        one.saved(dirty, 1, 5.0)
+        assert one.next_eviction(5.0) is dirty
+        apply(one, load(one, 5.0), 5.0)
+        assert len([chunk for chunk in one.chunks.values() if chunk.nbytes]) == 2, number
 
 
 def test_where_all_chunks_wait_for_room_some_give_way() -> None:
@@ -332,10 +398,9 @@ def test_where_all_chunks_wait_for_room_some_give_way() -> None:
     assert not any(one.may_grow(chunk, 20) for chunk in chunks)
     gone = []
     for _ in range(2):
-        lease = one.next_eviction(5.0)
-        assert lease is not None
-        one.leases.end(lease)
-        gone.append(lease.key)
+        victim = one.next_eviction(5.0)
+        assert victim is not None
+        gone.append(victim.key)
     stays = next(chunk for chunk in chunks if chunk.key not in gone)
     assert one.may_grow(stays, 20)
     assert all(one.chunks[key].state is State.LOADING and one.chunks[key].waiting for key in gone)
@@ -348,9 +413,9 @@ def test_nothing_is_due_while_a_chunk_is_loaded_or_has_no_room() -> None:
     one = Residency(Limits(20, radius=0), new_bytes=10)
     one.add(scan_of(HERE))
     assert one.next_load(5.0) is not None
-    assert one.next_event_s(5.0) == 5.0 + REVIEW_S
+    assert one.next_event_s(5.0) == math.inf
     full = Residency(Limits(20, radius=0), new_bytes=10)
-    full.leases.begin(ChunkKey(9, 9, 9), 20)
+    full.beside_bytes = 20
     full.add(scan_of(HERE))
     assert full.next_load(5.0) is None
     assert full.next_event_s(5.0) == 5.0 + REVIEW_S
@@ -396,9 +461,7 @@ def test_what_has_no_memory_keeps_nobody_from_what_has() -> None:
     seen = [one.is_ready]
     apply(one, chunks[2])
     seen.append(one.is_ready)
-    gone = one.next_eviction(9.0)
-    assert gone is not None
-    one.leases.end(gone)
+    assert one.next_eviction(9.0) is not None
     seen.append(one.is_ready)
     assert seen == [True, False, True], "there is room now"
 
@@ -410,6 +473,7 @@ def test_what_was_given_up_is_missing_until_it_is_flushed() -> None:
     assert durability.missing(one.chunks.values()) == [(chunk, 1)]
     assert one.next_save(50.0) is chunk
     one.saved(chunk, 1, 50.0)
+    ask_for_room(one)
     assert one.next_eviction(50.0) is not None
     assert not one.chunks
     assert durability.missing(one.chunks.values()) == [(chunk, 1)]
@@ -446,8 +510,8 @@ def test_where_memory_is_short_nobody_waits_for_the_next_review() -> None:
         for _ in range(20):
             while (dirty := one.next_save(0.0)) is not None:
                 one.saved(dirty, dirty.version, 0.0)
-            while (lease := one.next_eviction(0.0)) is not None:
-                one.leases.end(lease)
+            while one.next_eviction(0.0) is not None:
+                pass
             while (chunk := one.next_load(0.0)) is not None:
                 one.loaded(chunk, version=0, nbytes=10, active=0)
             for ready, _ in one.ready():
@@ -455,20 +519,52 @@ def test_where_memory_is_short_nobody_waits_for_the_next_review() -> None:
         assert scan.applied, "at the same moment as all others"
 
 
-def test_giving_up_is_not_a_search_each_time() -> None:
-    """Of so many chunks each is looked at a few times, not once for every other one."""
+def test_giving_up_is_not_a_search_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of so many chunks each is looked at some times, not once for every other one."""
     one = Residency(Limits(10**9, radius=0, loads=10**6, linger_s=0.0))
     for number in range(2000):
         one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)
-    looked = [0]
+    ask_for_room(one)
+    looked = 0
+    may_go = Residency._may_go
 
-    def counted(chunk: Chunk, now_s: float, *, short: bool) -> bool:
-        looked[0] += 1
-        return one._may_go(chunk, now_s, short=short)
+    def counted(self: Residency, *arguments: Any) -> bool:
+        nonlocal looked
+        looked += 1
+        return may_go(self, *arguments)
 
-    one._victims._may_go = counted
+    monkeypatch.setattr(Residency, "_may_go", counted)
     gone = 0
-    while one.next_eviction(1.0) is not None:
-        gone += 1
+    for now_s in range(1, 100):
+        while one.next_eviction(float(now_s)) is not None:
+            gone += 1
     assert gone == 2000
-    assert looked[0] <= 3 * 2000
+    assert looked <= 20 * 2000
+
+
+@pytest.mark.parametrize("clients", [1, 20])
+def test_a_client_that_moves_costs_no_look_at_all_chunks(
+    monkeypatch: pytest.MonkeyPatch, clients: int
+) -> None:
+    """Windows are counted by key, changed by the difference; nothing is looked for while there is room."""
+    one = Residency(Limits(10**9, radius=1, hysteresis=0.0, loads=10**6))
+    for number in range(2000):
+        one.adopt(ChunkKey(number % 50, number // 50, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)
+    counted: list[ChunkKey] = []
+    enter = Windows._enter
+
+    def entered(self: Windows, key: ChunkKey) -> bool:
+        counted.append(key)
+        return enter(self, key)
+
+    monkeypatch.setattr(Windows, "_enter", entered)
+    monkeypatch.setattr(Residency, "_review", lambda *_: pytest.fail("there is room"))
+    for client in range(clients):
+        one.move(client, (2.5, client + 0.5, 0.5))
+    counted.clear()
+    for client in range(clients):
+        one.move(client, (3.5, client + 0.5, 0.5))
+        one.next_load(1.0)
+        one.next_save(1.0)
+        one.next_eviction(1.0)
+    assert len(counted) == 9 * clients, "a side of each window"

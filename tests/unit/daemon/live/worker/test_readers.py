@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -11,12 +14,12 @@ from shmmap.chunks.layout import HEADER_BYTES, new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.map_files import Row
 from shmmap.daemon.live.paging.records import Scan
-from shmmap.daemon.live.worker import readers
+from shmmap.daemon.live.worker import areas, readers
 from shmmap.errors import BadRequest
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage
 from shmmap.protocol.codec import decode_reply, encode
-from shmmap.protocol.live import MOST_CHUNK_ROWS, LiveChunkPage, LiveChunks
+from shmmap.protocol.live import MOST_CHUNK_ROWS, LiveChunkPage, LiveChunks, SphereMessage
 from shmmap.protocol.messages import ErrorReply
 from tests.support.served_map import Served
 
@@ -33,7 +36,18 @@ def bring(served: Served, key: ChunkKey, generation: int = 1) -> None:
 
 
 def page(served: Served, **asked: object) -> LiveChunkPage:
-    return served.map.readers.page(LiveChunks(7, "lidar", **asked))  # type: ignore[arg-type]
+    """Ask for a page, and have readers go on until it is there."""
+    ticket = served.ask(lambda n: LiveChunks(n, "lidar", **asked))  # type: ignore[arg-type]
+    while ticket not in served.answers:
+        served.map.readers.turn(served.now_s)
+    found: LiveChunkPage = served.answers[ticket]
+    return found
+
+
+def on_disk(served: Served, key: ChunkKey, row: Row) -> None:
+    """As if a chunk had a file."""
+    served.live.files.rows[key] = row
+    served.live.stored.add(key)
 
 
 def keys_of(found: LiveChunkPage) -> list[ChunkKey]:
@@ -43,7 +57,7 @@ def keys_of(found: LiveChunkPage) -> list[ChunkKey]:
 def test_more_chunks_than_go_into_one_answer(served: Served) -> None:
     there = [ChunkKey(x, -x % 7, 0) for x in range(-1300, 1300)]
     for key in there:
-        served.live.files.rows[key] = Row(1, 100, 5, 3, 2, 1)
+        on_disk(served, key, Row(1, 100, 5, 3, 2, 1))
     bring(served, there[5])
     found: list[ChunkKey] = []
     after, pages = None, 0
@@ -71,6 +85,7 @@ def test_what_changed_and_what_left(served: Served) -> None:
     assert keys_of(page(served, since=everything.change)) == []
     served.map.changes.changed(b)
     chunk = served.live.chunks.pop(c)
+    served.live.residency._forget(c)
     served.map.changes.gone(c)
     later = page(served, since=everything.change)
     assert (keys_of(later), later.gone, later.since_known) == ([b], (c,), True)
@@ -90,7 +105,7 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
         served.map.changes.gone(ChunkKey(-(1 << 24) + x, -(1 << 24), -(1 << 24)))
     row = Row(1 << 62, 1 << 40, 1 << 18, 1 << 18, 1 << 18, 1)
     for x in range(MOST_CHUNK_ROWS):
-        served.live.files.rows[ChunkKey(-(1 << 24) + x, 0, -(1 << 24))] = row
+        on_disk(served, ChunkKey(-(1 << 24) + x, 0, -(1 << 24)), row)
     assert not page(served, since=since).since_known
     first = served.map.changes._gone[0][0]
     found = page(served, since=first, saved=True)
@@ -99,31 +114,17 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
     assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes where nobody has raised that"
 
 
-def test_chunks_on_their_way_in_and_out_are_listed(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Out: readers still map them; who asks what changed does not need to know, nor who maps chunks."""
-    out, back, coming = ChunkKey(1, 0, 0), ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
+def test_chunks_on_their_way_in_are_listed(served: Served) -> None:
+    """But not to a client that asks what changed: it cannot read them yet."""
+    there, coming = ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
     live = served.live
-    readers_of = []
-    for key in (out, back):
-        bring(served, key)
-        readers_of.append(open(f"{served.shm}{live.chunks[key].name}", "rb"))  # noqa: SIM115
-        live.keep(key, live.memory.give_up(live.chunks.pop(key)))
-        del live.residency.chunks[key]
-    bring(served, back, 2)
+    bring(served, there, 2)
     before = served.map.changes.number
     live.residency.add(Scan(1, 1, 10, {coming}))
     assert live.residency.next_load(0.0) is not None
     found = {ChunkKey(*row.key): (row.state, row.generation, row.bytes) for row in page(served).rows}
-    assert found == {
-        out: ("evicting", 0, HEADER_BYTES),
-        back: ("clean", 2, HEADER_BYTES),
-        coming: ("loading", 0, HEADER_BYTES),
-    }
+    assert found == {there: ("clean", 2, HEADER_BYTES), coming: ("loading", 0, HEADER_BYTES)}
     assert not page(served, since=before).rows
-    for reader in readers_of:
-        reader.close()
-    live.look_at_leases()
-    assert keys_of(page(served)) == [back, coming]
 
 
 def test_areas_and_kinds_that_make_no_sense(served: Served) -> None:
@@ -141,16 +142,24 @@ def test_areas_and_kinds_that_make_no_sense(served: Served) -> None:
 
 def test_chunks_are_listed_while_others_are_saved(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are written in other threads."""
-    rows, row = served.live.files.rows, Row(1, 100, 0, 0, 0, 1)
+    row = Row(1, 100, 0, 0, 0, 1)
     for x in range(3):
-        rows[ChunkKey(x, 0, 0)] = row
+        on_disk(served, ChunkKey(x, 0, 0), row)
 
     def touch_and_save(_area: object, key: ChunkKey, _resolution: float) -> bool:
-        rows[ChunkKey(key.x, 50, 50)] = row
+        served.live.files.rows[ChunkKey(key.x, 50, 50)] = row
         return True
 
     monkeypatch.setattr(readers, "touches", touch_and_save)
     assert keys_of(page(served, saved=True)) == [ChunkKey(x, 0, 0) for x in range(3)]
+
+
+def test_a_file_that_was_put_aside_is_listed_no_more(served: Served) -> None:
+    keys = [ChunkKey(x, 0, 0) for x in range(3)]
+    for key in keys:
+        on_disk(served, key, Row(1, 100, 0, 0, 0, 1))
+    del served.live.files.rows[keys[1]]
+    assert keys_of(page(served, saved=True)) == [keys[0], keys[2]]
 
 
 def test_lists_of_several_readers_are_made_by_turns(served: Served) -> None:
@@ -163,7 +172,131 @@ def test_lists_of_several_readers_are_made_by_turns(served: Served) -> None:
     assert served.map.next_turn_s(served.now_s) == served.now_s
     served.map.left(3)
     while served.map.readers.are_waiting:
-        served.map.readers.go_on()
+        served.map.readers.turn(served.now_s)
     assert list(served.answers) == [short, long]
     assert gone not in served.answers
     assert not isinstance(served.answers[long], ErrorReply)
+
+
+def test_a_session_that_asks_for_much_waits_for_one_that_asks_for_little(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step each by turns, however many requests one of them has."""
+    monkeypatch.setattr(readers, "TURN_S", 0.0)  # a step a turn
+    for x in range(1000):
+        on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
+    for _ in range(64):
+        served.ask(lambda n: LiveChunks(n, "lidar", saved=True), session=1)
+    few = served.ask(lambda n: LiveChunks(n, "lidar"), session=2)
+    turns = 0
+    while few not in served.answers:
+        served.map.readers.turn(served.now_s)
+        turns += 1
+    assert turns <= 4
+    assert list(served.answers) == [few]
+
+
+@pytest.mark.parametrize("area", [None, BoxMessage(10.0, 0.0, 20.0, 5.0), SphereMessage(15.0, 0.0, 0.0, 5.0)])
+@pytest.mark.parametrize("saved", [True, False])
+def test_a_step_looks_at_few_chunks_however_many_there_are(
+    served: Served, monkeypatch: pytest.MonkeyPatch, area: messages.LiveArea | None, *, saved: bool
+) -> None:
+    monkeypatch.setattr(readers, "TURN_S", 0.0)
+    for x in range(20):
+        for y in range(100):
+            on_disk(served, ChunkKey(x, y, 0), Row(1, 100, 0, 0, 0, 1))
+    bring(served, ChunkKey(1, 0, 0))
+    looked = 0
+
+    def counted(area: messages.LiveArea | None, key: ChunkKey, resolution: float) -> bool:
+        nonlocal looked
+        looked += 1
+        return areas.touches(area, key, resolution)
+
+    monkeypatch.setattr(readers, "touches", counted)
+    ticket = served.ask(lambda n: LiveChunks(n, "lidar", area, saved=saved))
+    most = 0
+    while ticket not in served.answers:
+        before = looked
+        served.map.readers.turn(served.now_s)
+        most = max(most, looked - before)
+    assert most <= 2 * readers.KEYS_A_STEP
+    if area is not None:
+        assert looked < 60, "an area is found by the index"
+
+
+def test_the_next_page_begins_where_the_last_one_ended(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not look at those before again."""
+    for x in range(3000):
+        on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
+    looked: list[ChunkKey] = []
+
+    def touched(_area: object, key: ChunkKey, _resolution: float) -> bool:
+        looked.append(key)
+        return True
+
+    monkeypatch.setattr(readers, "touches", touched)
+    page(served, saved=True, after=(1990, 0, 0))
+    assert looked[0] == (1991, 0, 0)
+    assert len(looked) <= MOST_CHUNK_ROWS + readers.KEYS_A_STEP + 9
+
+
+def test_what_changed_is_found_without_a_look_at_what_did_not(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Readers ask that with each look at voxels."""
+    keys = [ChunkKey(x, 0, 0) for x in range(300)]
+    for key in keys:
+        bring(served, key)
+    since = served.map.changes.number
+    for key in (keys[7], keys[3], keys[7]):
+        served.map.changes.changed(key)
+    monkeypatch.setattr(readers, "merged_part", lambda *_: pytest.fail("all are looked at"))
+    assert keys_of(page(served, since=since)) == [keys[3], keys[7]]
+    assert keys_of(page(served, since=since, after=tuple(keys[3]))) == [keys[7]]
+
+
+def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path: Path) -> None:
+    """Not those of its own session in memory, not other sessions, not the map."""
+    for x in range(3):
+        on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
+    bring(served, ChunkKey(9, 0, 0))
+    goes_on = threading.Event()
+
+    def slow(_key: ChunkKey) -> None:
+        goes_on.wait()
+
+    served.live.files.load = slow  # type: ignore[method-assign, assignment]
+    try:
+        waits = [served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk")) for _ in range(3)]
+        left = served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk"), session=3)
+        for session in (1, 2):
+            assert served.answer(served.ask(lambda n: messages.LiveVoxels(n, "lidar"), session)).count == 0
+        served.map.left(3)
+        assert not served.answers.keys() & {*waits, left}
+        assert served.map.readers.next_turn_s(served.now_s) > served.now_s, "nobody turns in vain"
+    finally:
+        goes_on.set()
+    for ticket in waits:
+        assert served.answer(ticket).count == 0
+    served.turn()
+    assert left not in served.answers
+
+
+def test_the_busiest_readers_are_named(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    for x in range(500):
+        on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
+    for _ in range(20):
+        page(served, saved=True)
+    served.ask(lambda n: LiveChunks(n, "lidar"), session=2)
+    served.turn()
+    end_s = time.monotonic() + readers.MEASURED_S
+    served.map.readers.measure(end_s)
+    (first, much), (second, little) = served.map.readers.busiest
+    assert (first, second) == (1, 2)
+    assert much > little
+    assert served.map.status().readers == served.map.readers.busiest
+    served.map.readers.measure(end_s + readers.MEASURED_S)
+    assert served.map.readers.busiest == ()

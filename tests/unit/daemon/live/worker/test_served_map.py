@@ -209,7 +209,7 @@ def test_saved_means_that_what_was_given_up_is_on_the_disk_too(
     serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A file has its name, and a power cut may take that away, until the directory was flushed."""
-    one = serve(linger_s=0.0, checkpoint_s=1e9)
+    one = serve(linger_s=0.0, checkpoint_s=1e9, most_active=1)
     (marks,) = marked(1)
     mapper = one.open().mapper
     blocked = Blocked(monkeypatch, one.live.files, "flush")

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
-from collections.abc import Callable, Iterator
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,8 @@ import pytest
 from shmmap.chunks.layout import new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.worker import voxel_lists
-from shmmap.daemon.live.worker.voxel_lists import VOXEL_BYTES, VoxelLists, check_area, inside, touches
+from shmmap.daemon.live.worker.areas import check_area, inside, key_range, touches
+from shmmap.daemon.live.worker.voxel_lists import KEPT_S, VOXEL_BYTES, Later, VoxelLists
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.protocol.areas import BoxMessage
 from shmmap.protocol.live import LiveArea, LiveVoxels, LiveVoxelsReply, SphereMessage
@@ -54,18 +58,24 @@ def collect(
     lists: VoxelLists, keys: list[ChunkKey], session: int = 1, kind: str = "occupied", scope: str = "memory",
     area: LiveArea | None = None,
 ) -> LiveVoxelsReply:  # fmt: skip
-    """Make a list, all steps at once."""
-    work: Iterator[LiveVoxelsReply | None] = lists.collect(
-        LiveVoxels(1, "lidar", kind, area, scope), keys, session, 5
-    )
-    (reply,) = [reply for reply in work if reply is not None]
-    return reply
+    """Make a list, all steps at once; what a thread is to do is done here."""
+    steps = lists.collect(LiveVoxels(1, "lidar", kind, area, scope), iter([keys]), session, 5)
+    outcome = None
+    while True:
+        try:
+            step = steps.send(outcome)
+        except StopIteration as done:
+            reply: LiveVoxelsReply = done.value
+            return reply
+        outcome = step() if callable(step) else None
 
 
 @pytest.mark.parametrize(
     "area",
     [
         SphereMessage(NAN, 0, 0, 1), SphereMessage(0, 0, 0, INF), SphereMessage(0, 0, 0, -1),
+        SphereMessage(0, 0, 0, 1.4e154), SphereMessage(0, 0, 0, 1.7e308), SphereMessage(0, 0, 0, NAN),
+        SphereMessage(1e155, 0, 0, 1), SphereMessage(0, 0, -1.7e308, 1), SphereMessage(-INF, 0, 0, 1),
         BoxMessage(1, 0, 0, 1), BoxMessage(0, 1, 1, 0), BoxMessage(0, 0, INF, 1), BoxMessage(0, NAN, 1, 1),
         BoxMessage(0, 0, 1, 1, 2.0, 1.0), BoxMessage(0, 0, 1, 1, 2.0, None),
         BoxMessage(0, 0, 1, 1, None, 2.0),
@@ -75,6 +85,25 @@ def collect(
 def test_areas_that_make_no_sense(area: LiveArea) -> None:
     with pytest.raises(BadRequest, match="area"):
         check_area(area)
+
+
+@pytest.mark.parametrize("resolution", [1e-4, 0.2, 1e3])
+@pytest.mark.parametrize(
+    "area",
+    [
+        BoxMessage(-1.7e308, -1.7e308, 1.7e308, 1.7e308), BoxMessage(0, 0, 1, 1, -1.7e308, 1.7e308),
+        SphereMessage(0, 0, 0, 9e149), SphereMessage(9e149, -9e149, 9e149, 9e149),
+        SphereMessage(5e-324, 0, 0, 5e-324),
+    ],
+)  # fmt: skip
+def test_the_largest_areas_that_make_sense(area: LiveArea, resolution: float) -> None:
+    """Whatever their numbers come to, squared or divided by a small voxel."""
+    check_area(area)
+    low, high = key_range(area, resolution)
+    assert all(a < b for a, b in zip(low, high, strict=True))
+    with np.errstate(all="raise", under="ignore"):
+        touches(area, ChunkKey(3, -1, 0), resolution)
+        inside(area, np.array([[1.0, 2.0, 3.0]]))
 
 
 AREAS: list[LiveArea] = [
@@ -96,6 +125,8 @@ def test_a_chunk_is_looked_into_if_any_of_its_voxels_lies_in_the_area(area: Live
                 grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3) + low
                 if inside(area, grid).any():
                     assert touches(area, key, RESOLUTION), key
+                    low_key, high_key = key_range(area, RESOLUTION)
+                    assert all(a <= b <= c for a, b, c in zip(low_key, key, high_key, strict=True)), key
     far = ChunkKey(1000, -1000, 0)
     assert not touches(area, far, RESOLUTION)
     assert touches(None, far, RESOLUTION)
@@ -127,25 +158,58 @@ def test_more_than_fits_is_refused_and_what_was_made_is_forgotten(lists: VoxelLi
 
 
 def test_lists_that_are_being_made_count_as_well(lists: VoxelLists) -> None:
-    """Else a reader who asks for many at a time has as much memory taken as it likes."""
+    """Else a reader that asks for many at a time has as much memory taken as it likes."""
     message = LiveVoxels(1, "lidar")
-    half = [KEYS[0]] * 40
-    works = [lists.collect(message, half, session, 0) for session in (1, 2)]
-    for work in works:
-        for _ in range(4):
-            assert next(work) is None
-    assert lists.nbytes > 2 * 20 * VOXELS * VOXEL_BYTES
+    works = [lists.collect(message, iter([[KEYS[0]] * 40]), session, 0) for session in (1, 2)]
 
     def go_on() -> None:
         while True:
             for work in works:
-                next(work)
+                assert next(work) is None
 
     with pytest.raises(OverBudget):
         go_on()
     for work in works:
-        work.close()  # type: ignore[attr-defined]
-    assert lists.nbytes == 0
+        work.close()
+    collect(lists, [KEYS[0]] * 60)
+
+
+def test_a_list_waits_until_chunks_have_made_room(served: Served, lists: VoxelLists) -> None:
+    """And takes no byte before: it is within the budget as they are."""
+    residency = served.live.residency
+    residency.beside_bytes = residency.limits.budget_bytes - residency.chunk_bytes
+    steps = lists.collect(LiveVoxels(1, "lidar"), iter([KEYS[:1]]), 1, 0)
+    while not isinstance(next(steps), Later):
+        pass
+    assert (lists.asked_bytes, lists.nbytes) == (4096, 0)
+    residency.beside_bytes -= 4096
+    with pytest.raises(StopIteration):
+        next(steps)
+    assert (lists.asked_bytes, lists.nbytes) == (0, 4096)
+    assert residency.beside_bytes + residency.chunk_bytes == residency.limits.budget_bytes
+    lists.left(1)
+    assert residency.beside_bytes + residency.chunk_bytes == residency.limits.budget_bytes - 4096
+
+
+@pytest.mark.parametrize("how", ["released", "expired", "left"])
+def test_a_list_is_cut_when_it_was_read_or_was_there_for_long(lists: VoxelLists, shm: Path, how: str) -> None:
+    """Whatever its reader has open: else it could keep as much memory as it likes."""
+    reply = collect(lists, KEYS)
+    with (shm / reply.segment[1:]).open("rb") as file:
+        assert os.fstat(file.fileno()).st_blocks * 512 == lists.nbytes > reply.bytes
+        begun_s = time.monotonic()
+        lists.expire(begun_s)
+        assert begun_s < lists.next_expiry_s <= time.monotonic() + KEPT_S
+        if how == "released":
+            lists.release(1, reply.segment)
+        elif how == "expired":
+            lists.expire(time.monotonic() + KEPT_S)
+        else:
+            lists.left(1)
+        assert os.fstat(file.fileno()).st_blocks == 0
+        assert file.read() == b""
+    assert (lists.nbytes, lists.live.residency.beside_bytes, names(shm)) == (0, 0, [])
+    assert lists.next_expiry_s == math.inf
 
 
 def test_a_session_s_oldest_lists_give_way(lists: VoxelLists, shm: Path) -> None:
@@ -185,11 +249,30 @@ def test_lists_of_an_earlier_life_are_removed(lists: VoxelLists, shm: Path) -> N
     (shm / other).unlink()
 
 
-def test_the_disk_is_asked_one_chunk_a_step(served: Served, lists: VoxelLists) -> None:
-    """Between two, mappers have their turn."""
+@pytest.mark.parametrize("scope", ["disk", "all"])
+def test_the_disk_is_read_in_threads(served: Served, lists: VoxelLists, scope: str) -> None:
+    """Some files at a time, and never by the worker itself."""
     served.until(lambda: served.map.is_saved, save_all=True)
-    message = LiveVoxels(1, "lidar", scope="disk")
-    steps = list(lists.collect(message, KEYS, 1, 0))
-    assert steps[:-1] == [None] * len(KEYS)
-    assert steps[-1] is not None
-    assert steps[-1].count == VOXELS * len(KEYS)
+    if scope == "all":
+        for key in KEYS[5:]:
+            del served.live.residency.chunks[key]
+            served.live.memory.give_up(served.live.chunks.pop(key))
+    load, where = served.live.files.load, []
+    served.live.files.load = lambda key: where.append(threading.get_ident()) or load(key)  # type: ignore[method-assign, func-returns-value]
+    ticket = served.ask(lambda n: LiveVoxels(n, "lidar", scope=scope))
+    reply = served.answer(ticket)
+    assert reply.count == VOXELS * len(KEYS)
+    assert len(where) == len(KEYS[5:] if scope == "all" else KEYS)
+    assert threading.get_ident() not in where
+
+
+def test_a_file_that_cannot_be_read_is_an_error_of_the_one_request(served: Served) -> None:
+    served.until(lambda: served.map.is_saved, save_all=True)
+
+    def broken(_key: ChunkKey) -> bytes:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    served.live.files.load = broken  # type: ignore[method-assign, assignment]
+    failed = served.answer(served.ask(lambda n: LiveVoxels(n, "lidar", scope="disk")))
+    assert (failed.code, "Input/output error" in failed.message) == ("bad_map_data", True)
+    assert served.answer(served.ask(lambda n: LiveVoxels(n, "lidar"))).count == VOXELS * len(KEYS)

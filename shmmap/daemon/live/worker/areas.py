@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Areas that readers ask for: whether they make sense, and which chunks and voxels lie in them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX, ChunkKey
+from shmmap.daemon.live.paging.key_index import EVERYWHERE, KeyRange
+from shmmap.errors import BadRequest
+from shmmap.protocol.live import FURTHEST_M, LiveArea, SphereMessage
+
+__all__ = ["check_area", "inside", "key_range", "touches"]
+
+
+def check_area(area: LiveArea) -> None:
+    """Refuse an area that makes no sense; `BadRequest`."""
+    if isinstance(area, SphereMessage):
+        numbers = (area.x, area.y, area.z, area.radius)
+        good = all(abs(number) < FURTHEST_M for number in numbers) and area.radius >= 0.0
+    else:
+        low, high = (area.min_x, area.min_y), (area.max_x, area.max_y)
+        if (area.z_min is None) != (area.z_max is None):
+            raise BadRequest("area: a z range has two ends")
+        if area.z_min is not None and area.z_max is not None:
+            low, high = (*low, area.z_min), (*high, area.z_max)  # type: ignore[assignment]
+        good = bool(np.isfinite([*low, *high]).all()) and all(a <= b for a, b in zip(low, high, strict=True))
+    if not good:
+        raise BadRequest("area: it is not finite, or nothing can lie in it")
+
+
+def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
+    """Whether a chunk and an area have anything in common."""
+    if area is None:
+        return True
+    low_x, low_y, low_z, high_x, high_y, high_z = key.box(resolution)
+    if isinstance(area, SphereMessage):
+        gaps = (
+            max(low - value, 0.0, value - high)
+            for value, low, high in (
+                (area.x, low_x, high_x), (area.y, low_y, high_y), (area.z, low_z, high_z),
+            )
+        )  # fmt: skip
+        return sum(gap * gap for gap in gaps) <= area.radius * area.radius
+    flat = low_x <= area.max_x and high_x >= area.min_x and low_y <= area.max_y and high_y >= area.min_y
+    if area.z_min is None or area.z_max is None:
+        return flat
+    return flat and low_z <= area.z_max and high_z >= area.z_min
+
+
+def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of these places, (N, 3) metres, lie in an area."""
+    if area is None:
+        return np.ones(len(centers), np.bool_)
+    found: NDArray[np.bool_]
+    if isinstance(area, SphereMessage):
+        away = centers - np.array([area.x, area.y, area.z])
+        found = (away * away).sum(axis=1) <= area.radius * area.radius
+        return found
+    x, y, z = centers.T
+    found = (x >= area.min_x) & (x <= area.max_x) & (y >= area.min_y) & (y <= area.max_y)
+    if area.z_min is not None and area.z_max is not None:
+        found &= (z >= area.z_min) & (z <= area.z_max)
+    return found
+
+
+def key_range(area: LiveArea | None, resolution: float) -> KeyRange:
+    """Chunks among which are all that touch an area, whatever is lost in rounding."""
+    if area is None:
+        return EVERYWHERE
+    if isinstance(area, SphereMessage):
+        middle, reach = (area.x, area.y, area.z), area.radius
+        low, high = [at - reach for at in middle], [at + reach for at in middle]
+    else:
+        low = [area.min_x, area.min_y, -math.inf if area.z_min is None else area.z_min]
+        high = [area.max_x, area.max_y, math.inf if area.z_max is None else area.z_max]
+    side, furthest = CHUNK_SIDE * resolution, FURTHEST_INDEX // CHUNK_SIDE + 1
+
+    def key(place: list[float], beyond: int) -> ChunkKey:
+        chunks = (min(max(value / side, -furthest), furthest) for value in place)
+        return ChunkKey(*(math.floor(value) + beyond for value in chunks))
+
+    return key(low, -1), key(high, 1)
