@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,13 @@ from tests.support.town_drive import TownDrive, make_town_drive
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
     return make_town_drive(tmp_path_factory.mktemp("town"), blocks=(3, 3), density=5.0, frames=5, step=15.0)
+
+
+@pytest.fixture
+def initializer(town: TownDrive, daemon: DaemonFactory) -> Iterator[PoseInitializer]:
+    one = daemon(town.map_dir)
+    with PoseInitializer(one.endpoint, InitializerRules(map_radius=60.0, height=1.8)) as initializer:
+        yield initializer
 
 
 def rough(town: TownDrive, index: int, seed: int) -> RoughPose:
@@ -58,7 +66,7 @@ def test_the_ground_is_that_of_the_pose(
     x, y, z, _, _, yaw = town.poses[2]
     rng = np.random.default_rng(1)
     edge = 4.0 if below == "reflections" else 1.5
-    deep = np.column_stack([rng.uniform(-edge / 2, edge / 2, (200, 2)) + (x, y), np.full(200, z - 5.0)])
+    deep = rng.uniform(-edge / 2, edge / 2, (200, 3)) * (1.0, 1.0, 0.0) + np.array([x, y, z - 5.0])
     keep = np.ones(len(town.points), np.bool_)
     if below == "a pit":
         keep = (np.abs(town.points[:, :2] - (x, y)) > edge / 2).any(axis=1)
@@ -69,9 +77,37 @@ def test_the_ground_is_that_of_the_pose(
     with PoseInitializer(one.endpoint, InitializerRules(map_radius=60.0, height=1.8)) as initializer:
         # the rough pose is on the spot, where Autoware's rule finds what lies below the street
         found = initializer.initialize(scan, RoughPose(x, y, yaw=yaw + 0.1))
-    assert found.reliable
     np.testing.assert_allclose(found.T_map_base[:3, 3], [x, y, z], atol=0.3)
     assert found.ground_z == pytest.approx(z - 1.8, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("part", "failed"),
+    [
+        ("one point", "points"),
+        ("twenty points", "points"),
+        ("all in one place", "spread"),
+        ("within 6 m", "distance"),
+        ("a sector of 10 degrees", "angle"),
+        ("the ground", "sharpness"),
+    ],
+)
+def test_a_pose_that_rests_on_little_is_not_reliable(
+    initializer: PoseInitializer, town: TownDrive, part: str, failed: str
+) -> None:
+    scan = read_scan(town.scans / "scan_0002.npz")
+    heading = np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))
+    chosen = {
+        "one point": scan[:1],
+        "twenty points": scan[:: len(scan) // 20],
+        "all in one place": np.repeat(scan[:1], 500, axis=0),
+        "within 6 m": scan[np.linalg.norm(scan, axis=1) < 6.0],
+        "a sector of 10 degrees": scan[np.abs(heading) < 5.0],
+        "the ground": scan[(np.abs(scan[:, 2] + 1.8) < 0.1) & (np.linalg.norm(scan, axis=1) < 15.0)],
+    }[part]
+    found = initializer.initialize(chosen, rough(town, 2, 0))
+    assert not found.reliable
+    assert failed in found.result.failed_limits, (found.result.failed_limits, found.result.evidence)
 
 
 def test_a_place_without_map_is_no_answer(town: TownDrive, daemon: DaemonFactory) -> None:
@@ -127,6 +163,16 @@ def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> 
     # the first is the pose as --pose-format says, the last has times
     assert again.stdout.splitlines()[1:-1] == done.stdout.splitlines()[1:-1]
     assert again.stdout.splitlines()[0].count(",") == 2
+    points = read_scan(town.scans / "scan_0002.npz")
+    np.savez(tmp_path / "near.npz", xyz=points[np.linalg.norm(points, axis=1) < 6.0])
+    near = [*program, "--scan", str(tmp_path / "near.npz"), *words[2:]]
+    done = subprocess.run([*near, "--json"], capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    document = json.loads(done.stdout)
+    assert not document["reliable"]
+    assert "distance" in document["failed_limits"]
+    done = subprocess.run(near, capture_output=True, text=True)
+    assert re.search(r"NOT reliable \(.*fewer than 20 points beyond 10 m", done.stdout)
     missing = [*program, "--scan", str(tmp_path / "none.npz"), "--pose", "0,0,0,0,0,0"]
     assert subprocess.run(missing, capture_output=True).returncode == 66
     assert subprocess.run([*program, "--scan", "x"], capture_output=True).returncode == 2

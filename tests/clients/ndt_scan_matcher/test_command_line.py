@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shmmap_clients.ndt_scan_matcher import TrustLimits
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 
@@ -69,6 +70,49 @@ def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture
     )
     assert again == 0, "what is printed is what options take"
     assert "trusted                 yes" in out
+
+
+@pytest.mark.parametrize(
+    ("rows", "failed"),
+    [
+        (slice(0, 1), {"points", "angle", "spread"}),
+        (slice(0, 40), {"points"}),
+        ("near", {"distance"}),
+    ],
+)
+def test_a_pose_that_rests_on_little_is_not_trusted(
+    files: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    rows: slice | str,
+    failed: set[str],
+) -> None:
+    scan = np.load(files["scan.npz"])["xyz"]
+    chosen = scan[np.linalg.norm(scan, axis=1) < 6.0] if isinstance(rows, str) else scan[rows]
+    np.savez(tmp_path / "part.npz", xyz=chosen)
+    words = ["align", "--map", str(files["map.npz"]), "--scan", str(tmp_path / "part.npz"), "--guess", GUESS]
+    main([*words, "--steady", "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert not document["trustworthy"]
+    assert failed <= set(document["failed_limits"])
+    assert set(document["evidence"]) == {"points", "distance", "angle", "sharpness", "spread"}
+    assert document["evidence"]["points"] <= len(chosen)
+    main([*words, "--steady"])
+    assert re.search(
+        r"^trusted +no: .*fewer than (80 points matched|20 points beyond 10 m)", capsys.readouterr().out, re.M
+    )
+    lifted = [f"--trust-{name}=0" for name in ("points", "distance", "angle", "sharpness", "spread", "nvtl")]
+    main([*words, "--steady", *lifted, "--json"])
+    assert set(json.loads(capsys.readouterr().out)["failed_limits"]) <= {"converged"}
+
+
+def test_the_help_has_the_limits_of_trust(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["align", "--help"])
+    said = dict(re.findall(r"--trust-(\w+) \w+\s[^(]*\(default:\s+([\d.]+)", capsys.readouterr().out))
+    limits = TrustLimits().for_leaf(2.0)
+    for name in ("points", "distance", "angle", "sharpness", "spread", "oscillations"):
+        assert float(said[name]) == getattr(limits, name)
 
 
 def test_the_help_has_the_limits_that_hold(capsys: pytest.CaptureFixture[str]) -> None:

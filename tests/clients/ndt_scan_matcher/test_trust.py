@@ -18,7 +18,8 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
 )
 from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
-from shmmap_clients.ndt_scan_matcher.matching.trust import default_nvtl
+from shmmap_clients.ndt_scan_matcher.matching.evidence import Evidence
+from shmmap_clients.ndt_scan_matcher.matching.trust import default_nvtl, default_sharpness
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street
@@ -26,7 +27,16 @@ from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street
 TRUTH = np.array([1.0, -0.5, 1.8, 0.0, 0.0, 0.2])
 BESIDE = np.array([1.2, -0.6, 1.85, 0.0, 0.0, 0.21])
 FAR = np.array([5001.0, -0.5, 1.8, 0.0, 0.0, 0.2])
-GOOD = {"no_map": False, "converged": True, "nvtl": 3.0, "transform_probability": 5.0, "oscillations": 0}
+EVIDENCE = Evidence(points=1000, distance=40.0, angle=280.0, sharpness=8.0, spread=0.2)
+REST = ("points", "distance", "angle", "sharpness", "spread")
+GOOD = {
+    "no_map": False,
+    "converged": True,
+    "nvtl": 3.0,
+    "transform_probability": 5.0,
+    "oscillations": 0,
+    "evidence": EVIDENCE,
+}
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +58,13 @@ def test_the_default_grows_with_the_leaf(leaf: float, nvtl: float) -> None:
     assert default_nvtl(leaf) == pytest.approx(nvtl, abs=0.01)
     assert TrustLimits().for_leaf(leaf).nvtl == default_nvtl(leaf)
     assert TrustLimits(nvtl=0.7).for_leaf(leaf).nvtl == 0.7
+
+
+def test_limits_can_be_lifted() -> None:
+    none = TrustLimits(0.0, 0.0, points=0, distance=0.0, angle=0.0, sharpness=0.0, spread=0.0)
+    nothing: dict[str, Any] = GOOD | {"evidence": Evidence(1, 0.0, 0.0, 0.0, 0.0)}
+    assert none.for_leaf(2.0).failed(**nothing) == ()
+    assert TrustLimits().for_leaf(2.0, fine=True).sharpness == default_sharpness(fine=True)
 
 
 def test_true_covariances_score_lower_at_a_small_leaf() -> None:
@@ -92,10 +109,17 @@ def test_a_place_without_map_is_said(points: NDArray[np.float64]) -> None:
         ({"oscillations": 11}, ("oscillations",)),
         ({"oscillations": 10, "nvtl": 2.3, "transform_probability": 4.0}, ()),
         ({"no_map": True, "converged": False, "nvtl": 0.0}, ("no_map",)),
+        ({"evidence": replace(EVIDENCE, points=79)}, ("points",)),
+        ({"evidence": replace(EVIDENCE, distance=9.9)}, ("distance",)),
+        ({"evidence": replace(EVIDENCE, sharpness=2.6)}, ("sharpness",)),
+        ({"evidence": replace(EVIDENCE, spread=0.02)}, ("spread",)),
+        ({"evidence": Evidence(80, 10.0, 35.0, 2.7, 0.03)}, ()),
+        ({"evidence": replace(EVIDENCE, angle=34.0)}, ("angle",)),
+        ({"evidence": Evidence(1, 0.0, 0.0, np.nan, np.nan)}, REST),
     ],
 )
-def test_every_limit_counts(change: dict[str, float], failed: tuple[str, ...]) -> None:
-    limits = TrustLimits(nvtl=2.3, transform_probability=4.0)
+def test_every_limit_counts(change: dict[str, Any], failed: tuple[str, ...]) -> None:
+    limits = TrustLimits(nvtl=2.3, transform_probability=4.0).for_leaf(2.0)
     result: dict[str, Any] = GOOD | change
     assert limits.failed(**result) == failed
     assert all(limits.describe(name) for name in failed)
@@ -106,6 +130,11 @@ def test_limits_that_make_no_sense_are_refused() -> None:
         {"nvtl": -1.0},
         {"transform_probability": float("nan")},
         {"oscillations": -1},
+        {"points": -1},
+        {"distance": float("nan")},
+        {"sharpness": -0.1},
+        {"spread": -0.1},
+        {"angle": -1.0},
     ]
     for wrong in refused:
         with pytest.raises(shmmap.BadRequest, match="limit of trust"):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from typing import Any
 
 from shmmap_clients.command_line import (
@@ -17,23 +18,25 @@ from shmmap_clients.command_line import (
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options, matcher_from
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 from shmmap_clients.shared_options import add_leaf_option, add_scan_option, add_thin_option, reader_from
+from shmmap_clients.trust_options import FAILED_LIMITS
 
 __all__ = ["add_parser", "run"]
 
-_JSON = """\
+_JSON = f"""\
 JSON (fields may be added, none is removed):
-  {"T_map_base": 4x4 in metres, "iterations", "converged",
+  {{"T_map_base": 4x4 in metres, "iterations", "converged",
    "transform_probability", "nvtl", "oscillations", "evaluations",
    "trustworthy": bool, "no_map": bool, "failed_limits": [name],
    "covariance": 6x6 of x y z roll pitch yaw, or null,
-   "cut": {"points", "neighbor_points", "neighbors", "voxels", "map_bytes"}:
+   "evidence": {{"points": matched, "distance": metres, "angle": degrees,
+     "sharpness", "spread"}},
+   "cut": {{"points", "neighbor_points", "neighbors", "voxels", "map_bytes"}}:
      left out by limits, and "deadline": whether time was up,
    "worst_case_ms": for the largest scan that the limits allow, estimated on
      this machine,
    "align_ms": measured, "points", "too_near", "not_finite": points left out,
-   "voxels", "variant", "convention": the same, "neighbors", "backend"}
-  failed_limits names what did not hold: no_map, converged (it did not
-  converge), nvtl, transform_probability, oscillations.
+   "voxels", "variant", "convention": the same, "neighbors", "backend"}}
+{FAILED_LIMITS}
 Exit code: 0; 1 when the alignment did not converge, or no point of the scan has
 a voxel of the map near.  One that converged and is not trusted: 0; trustworthy
 and the line "trusted" say so."""
@@ -101,6 +104,7 @@ def run(args: argparse.Namespace) -> int:
             "no_map": result.no_map,
             "failed_limits": list(result.failed_limits),
             "covariance": None if result.covariance is None else result.covariance.tolist(),
+            "evidence": asdict(result.evidence),
             "cut": {
                 "points": result.cut.points,
                 "neighbor_points": result.cut.neighbor_points,

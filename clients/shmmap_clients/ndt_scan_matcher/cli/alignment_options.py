@@ -7,13 +7,13 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from shmmap_clients.backend_options import add_scoring_options, scoring_settings
-from shmmap_clients.command_line import at_least, not_negative, positive
+from shmmap_clients.command_line import at_least, positive
+from shmmap_clients.trust_options import add_trust_options, trust_from
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
-    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
 
-__all__ = ["add_alignment_options", "matcher_from", "trust_from"]
+__all__ = ["add_alignment_options", "matcher_from"]
 
 
 def add_alignment_options(parser: argparse.ArgumentParser) -> None:
@@ -89,24 +89,7 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         help="for one alignment: it ends then, not converged; a device that has not answered is not waited"
         " for (default: none)",
     )
-    trust = parser.add_argument_group("trust (a result beyond one of these limits is not trusted)")
-    trust.add_argument(
-        "--trust-nvtl",
-        type=not_negative,
-        metavar="N",
-        help="lowest nearest-voxel transformation likelihood (default by --leaf: 1.22 at 1 m, 2.30 at 2 m,"
-        " 2.96 at 3 m; with --fine 0.91 at 1 m)",
-    )
-    trust.add_argument(
-        "--trust-tp", type=not_negative, metavar="N", help="lowest transform probability (default: any)"
-    )
-    trust.add_argument(
-        "--trust-oscillations",
-        type=at_least(0),
-        default=10,
-        metavar="N",
-        help="most reversals of the step (default: 10)",
-    )
+    add_trust_options(parser)
 
 
 def matcher_from(args: argparse.Namespace) -> NdtMatcher:
@@ -135,10 +118,3 @@ def matcher_from(args: argparse.Namespace) -> NdtMatcher:
     }
     limits = Limits(**{name: value for name, value in given.items() if value is not None})
     return NdtMatcher(settings, limits=limits, trust=trust_from(args), threads=args.threads)
-
-
-def trust_from(args: argparse.Namespace) -> TrustLimits:
-    """Return the limits of trust that the options ask for."""
-    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
-
-    return TrustLimits(args.trust_nvtl, args.trust_tp, args.trust_oscillations)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from shmmap_clients.backend_options import scoring_settings
 from shmmap_clients.command_line import add_verb, announce_scans, connect, print_json, write_text
-from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, trust_from
+from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.pose_option import pose_from
 from shmmap_clients.shared_options import reader_from
+from shmmap_clients.trust_options import trust_from
 
 if TYPE_CHECKING:
     import numpy as np

@@ -27,10 +27,11 @@ from shmmap_clients.shared_options import (
     add_sigma_options,
     add_thin_option,
 )
+from shmmap_clients.trust_options import FAILED_LIMITS
 
 __all__ = ["EPILOG", "add_options"]
 
-EPILOG: Final = """\
+EPILOG: Final = f"""\
 A scan's result is trusted when it is within all limits of trust.  A vehicle is
   tracking   when its last result was trusted,
   uncertain  at the beginning, and when its last result was not trusted,
@@ -42,32 +43,32 @@ says nothing of motion: without odometry none is predicted there.
 
 JSON (fields may be added, none is removed).
 --json prints one document at the end:
-  {"frames", "converged", "trustworthy", "no_map": scans, "lost": scans,
+  {{"frames", "converged", "trustworthy", "no_map": scans, "lost": scans,
    "relocalized": times, "clock_jumps": scans, "too_near", "not_finite": points
-   of the scans left out, "failed_limits": {name: scans},
-   "trust": {"nvtl", "transform_probability", "oscillations"}: limits in force,
+   of the scans left out, "failed_limits": {{name: scans}},
+   "trust": {{"nvtl", "transform_probability", "oscillations", "points",
+     "distance", "angle", "sharpness", "spread"}}: limits in force,
    "waited": for the map, "too_slow": times that the map did not keep up,
-   "cut_frames": cut by limits, "cut_by": {limit: scans}: points, neighbors,
+   "cut_frames": cut by limits, "cut_by": {{limit: scans}}: points, neighbors,
      voxels, map_bytes, deadline,
    "backend": that computed last, "fault": why it is the fallback, or null,
-   "errors": null without a truth, else {"ate_rmse_m", "ate_m": spread,
-     "ate_deg": spread, "rte": {metres: metres per 100 m}},
+   "errors": null without a truth, else {{"ate_rmse_m", "ate_m": spread,
+     "ate_deg": spread, "rte": {{metres: metres per 100 m}}}},
    "transform_probability", "nvtl", "iterations", "latency_ms", "align_ms",
    "thin_ms", "map_ms", "map_request_ms", "map_build_ms",
    "map_prepare_ms": its part of the backend: spread each,
    "map_updates", "cells_added", "cells_removed", "map_private_bytes",
    "map_written_bytes", "map_writes": to a device,
-   "map_laid_out_anew": maps that did not fit beside the one in use}
-  A spread is {"mean", "variance", "p50", "p99", "max"}; ate is the distance
+   "map_laid_out_anew": maps that did not fit beside the one in use}}
+  A spread is {{"mean", "variance", "p50", "p99", "max"}}; ate is the distance
   of the poses to the true ones in metres, or degrees.
 --json-lines writes a line for each scan, as soon as it is localized:
-  {"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged",
+  {{"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged",
    "trustworthy", "failed_limits": [name], "no_map",
    "state": tracking, uncertain or lost, "relocalized", "clock_jumped": bool,
    "iterations", "transform_probability", "nvtl", "waited", "latency_ms",
-   "error_m", "error_deg": to the true pose, null without a truth}
-failed_limits names what did not hold: no_map, converged (the alignment did not
-converge), nvtl, transform_probability, oscillations.
+   "error_m", "error_deg": to the true pose, null without a truth}}
+{FAILED_LIMITS}
 
 Exit code: 0; 1 when a scan was not trusted (with --allow-empty: for another
 reason than no map), the map did not keep up, or there was no scan."""

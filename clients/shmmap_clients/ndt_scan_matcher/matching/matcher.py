@@ -19,7 +19,8 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, gauss_for
+from shmmap_clients.ndt_scan_matcher.matching.evidence import Extent, evidence_of, extent_of
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS
 from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, climb, started
@@ -85,7 +86,7 @@ class NdtMatcher:
         )
         if self._backend.most_map_bytes < self.limits.most_map_bytes:
             self.limits = replace(self.limits, map_bytes=self._backend.most_map_bytes)
-        self._map = VoxelMap({})
+        self.set_map(VoxelMap({}))
 
     def __enter__(self) -> NdtMatcher:
         return self
@@ -141,7 +142,7 @@ class NdtMatcher:
     @property
     def trust(self) -> TrustLimits:
         """What a result has to reach to be trusted, with the map's leaf."""
-        return self._trust.for_leaf(self._map.leaf, fine=self.settings.mode == "coarse_fine")
+        return self._trust_in_force
 
     @property
     def map(self) -> VoxelMap:
@@ -151,6 +152,7 @@ class NdtMatcher:
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on; takes microseconds where its tables are prepared."""
         self._map = voxel_map
+        self._trust_in_force = self._trust.for_leaf(voxel_map.leaf, fine=self.settings.mode == "coarse_fine")
         self._backend.set_map(voxel_map)
 
     def prepare(self, voxel_map: VoxelMap) -> VoxelMap:
@@ -219,7 +221,8 @@ class NdtMatcher:
             arrived = [coarse[number].transforms[-1] for number in on]
             for number, way in zip(on, self._climb(arrived, fine, regularization, deadline_s), strict=True):
                 ways[number].append(way)
-        return [self._result(way, used, dropped) for way in ways]
+        extent = extent_of(points)
+        return [self._result(way, used, dropped, extent) for way in ways]
 
     def evaluate(self, points: NDArray[np.floating], poses: NDArray[np.float64]) -> list[Evaluation]:
         """Score a scan at several pose vectors, (k, 6), without moving them; in batches of the limit."""
@@ -294,7 +297,7 @@ class NdtMatcher:
     def _step(self, at: Evaluation, steady: bool) -> NDArray[np.float64]:
         return self._backend.step(at, steady=steady)
 
-    def _result(self, ways: Sequence[Ascent], used: int, dropped: int) -> Result:
+    def _result(self, ways: Sequence[Ascent], used: int, dropped: int, extent: Extent) -> Result:
         last = ways[-1].last
         transforms = np.array(
             [T for index, way in enumerate(ways) for T in way.transforms[1 if index else 0 :]]
@@ -303,6 +306,15 @@ class NdtMatcher:
         points = max(used, 1)
         converged, probability, swings = ways[-1].converged, last.score / points, oscillations(transforms)
         no_map = used > 0 and not last.found
+        covariance, leaf = covariance_of(last.hessian), self._map.leaf
+        evidence = evidence_of(
+            last.hessian,
+            covariance,
+            extent,
+            points=last.found,
+            leaf=leaf,
+            highest=-gauss_for(leaf).d1,
+        )
         return Result(
             T_map_base=transforms[-1],
             iterations=sum(way.iterations for way in ways),
@@ -313,9 +325,10 @@ class NdtMatcher:
             transform_probabilities=np.array([at.score / points for at in evaluations]),
             nvtls=np.array([at.nvtl for at in evaluations]),
             hessian=last.hessian,
-            covariance=covariance_of(last.hessian),
+            covariance=covariance,
             oscillations=swings,
             evaluations=len(evaluations),
+            evidence=evidence,
             cut=Cut(
                 points=dropped,
                 neighbor_points=last.cut_points,
@@ -331,5 +344,6 @@ class NdtMatcher:
                 nvtl=last.nvtl,
                 transform_probability=probability,
                 oscillations=swings,
+                evidence=evidence,
             ),
         )

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap_clients.ndt_scan_matcher.matching.evidence import Evidence
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut
 
 __all__ = ["Result", "covariance_of", "oscillations"]
@@ -46,6 +47,8 @@ class Result:
         Longest run of steps each of which goes back on the one before.
     evaluations
         Passes over the scan.
+    evidence
+        What the pose rests on.
     cut
         What the limits left out.
     no_map
@@ -67,6 +70,7 @@ class Result:
     covariance: NDArray[np.float64] | None
     oscillations: int
     evaluations: int
+    evidence: Evidence
     cut: Cut
     no_map: bool
     failed_limits: tuple[str, ...]

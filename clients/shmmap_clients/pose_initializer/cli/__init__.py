@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.backend_options import add_scoring_options, scoring_settings
@@ -29,6 +30,7 @@ from shmmap_clients.shared_options import (
     add_thin_option,
     reader_from,
 )
+from shmmap_clients.trust_options import FAILED_LIMITS, add_trust_options, trust_from
 
 if TYPE_CHECKING:
     from shmmap_clients.pose_initializer import InitialPose
@@ -36,18 +38,20 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 _NAME: Final = "shmmap-pose-init"
-_JSON: Final = """\
+_JSON: Final = f"""\
 JSON (fields may be added, none is removed):
-  {"T_map_base": 4x4 in metres, "score": transform probability, "nvtl",
+  {{"T_map_base": 4x4 in metres, "score": transform probability, "nvtl",
    "reliable", "converged", "no_map": bool, "failed_limits": [name],
    "ground_z": height of the map's ground there, or null,
+   "evidence": {{"points": matched, "distance": metres, "angle": degrees,
+     "sharpness", "spread"}},
    "covariance": 6x6 of x y z roll pitch yaw, or null,
-   "alternatives": [{"T_map_base", "score", "nvtl"}] other poses, best first,
+   "alternatives": [{{"T_map_base", "score", "nvtl"}}] other poses, best first,
    "candidates", "map_ms", "search_ms",
-   "too_near", "not_finite": points of the scan left out}
+   "too_near", "not_finite": points of the scan left out}}
   Where there is no map, "no_map" is true and the others are null, false, 0 or
-  empty.  failed_limits names what did not hold where a pose is not reliable
-  (converged: the alignment did not converge).
+  empty.
+{FAILED_LIMITS}
 Exit code: 0; 1 when the pose is not reliable, or there is no map around it."""
 
 
@@ -85,6 +89,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_leaf_option(parser)
     add_radius_option(parser)
     add_scoring_options(parser, all_processors=True)
+    add_trust_options(parser)
     add_allow_empty(parser)
     add_json_option(parser)
     add_daemon_options(parser, json=False)
@@ -109,7 +114,9 @@ def _run(args: argparse.Namespace) -> int:
     scan = thinned(reader.points(args.scan), args.thin or None)
     with (
         connect(args, _NAME) as client,
-        PoseInitializer(client, rules, threads=args.threads, **scoring_settings(args)) as initializer,
+        PoseInitializer(
+            client, rules, trust=trust_from(args), threads=args.threads, **scoring_settings(args)
+        ) as initializer,
     ):
         try:
             found = initializer.initialize(scan, rough)
@@ -140,6 +147,7 @@ def _document(found: InitialPose | None, left_out: dict[str, int]) -> dict[str, 
         "no_map": result is None or result.no_map,
         "failed_limits": ["no_map"] if result is None else list(result.failed_limits),
         "ground_z": None if found is None else found.ground_z,
+        "evidence": None if result is None else asdict(result.evidence),
         "covariance": None if covariance is None else covariance.tolist(),
         "alternatives": [
             {"T_map_base": one.T_map_base.tolist(), "score": one.score, "nvtl": one.nvtl}
