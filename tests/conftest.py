@@ -31,8 +31,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         # a shell's background job ignores SIGINT, and so would the programs it starts for the tests
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    # how long an example takes is for the machine to say
-    hypothesis.settings.register_profile("shmmap", deadline=None)
+    # how long an example takes, to make and to run, is for the machine to say
+    hypothesis.settings.register_profile(
+        "shmmap", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+    )
     hypothesis.settings.load_profile("shmmap")
     if "NUMBA_CACHE_DIR" not in os.environ:
         cache = getattr(config, "cache", None)

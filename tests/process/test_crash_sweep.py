@@ -135,7 +135,7 @@ def test_daemon_and_worker(
         before = reader.checksums()
         with (
             Keeper(one) as keeper,
-            shmmap.connect(one.endpoint, timeout=60.0, connect_timeout=30.0) as client,
+            shmmap.connect(one.endpoint, timeout=240.0, connect_timeout=240.0) as client,
         ):
             live(client, divided_map)
             assert reader.checksums() == before
