@@ -277,12 +277,13 @@ def test_threads_unpickle_at_once(client: shmmap.Client) -> None:
 
 @pytest.mark.parametrize("what", ["client", "window", "events", "session"])
 def test_what_cannot_be_pickled_says_what_to_do(client: shmmap.Client, what: str) -> None:
-    made: Any = {
+    makers: dict[str, Callable[[], Any]] = {
         "client": lambda: client,
         "window": lambda: shmmap.MapWindow(client, 20.0),
         "events": lambda: shmmap.EventStream(client.endpoint),
         "session": lambda: client.session,
-    }[what]()
+    }
+    made = makers[what]()
     acts: tuple[Any, ...] = (pickle.dumps, copy.copy, copy.deepcopy)
     for act in acts:
         with pytest.raises(TypeError, match=r"cannot be pickled: .*in each process"):
