@@ -140,6 +140,7 @@ def use(cell: shmmap.Cell) -> float:
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_gone_is_an_error_of_its_user_and_nobody_waits(client: shmmap.Client, method: str) -> None:
     data = evicted(client)
+    gone: Any = [_Pickled(data)]
     with pytest.raises(StaleHandle, match=r"0_0\.pcd \(points\): the segment .* is gone .*cell\.copy\(\)"):
         pickle.loads(data)
     context = multiprocessing.get_context(method)
@@ -147,7 +148,7 @@ def test_what_is_gone_is_an_error_of_its_user_and_nobody_waits(client: shmmap.Cl
         with pytest.raises(StaleHandle, match=r"cell\.copy\(\)"):
             pool.map(pickle.loads, [data])
         with pytest.raises(StaleHandle, match=r"cell\.copy\(\)"):
-            pool.map(use, [_Pickled(data)])
+            pool.map(use, gone)
         assert pool.map(abs, [-1]) == [1], "the pool works"
 
 
@@ -276,13 +277,15 @@ def test_threads_unpickle_at_once(client: shmmap.Client) -> None:
 
 @pytest.mark.parametrize("what", ["client", "window", "events", "session"])
 def test_what_cannot_be_pickled_says_what_to_do(client: shmmap.Client, what: str) -> None:
-    made: Any = {
+    makers: dict[str, Callable[[], Any]] = {
         "client": lambda: client,
         "window": lambda: shmmap.MapWindow(client, 20.0),
         "events": lambda: shmmap.EventStream(client.endpoint),
         "session": lambda: client.session,
-    }[what]()
-    for act in (pickle.dumps, copy.copy, copy.deepcopy):
+    }
+    made = makers[what]()
+    acts: tuple[Any, ...] = (pickle.dumps, copy.copy, copy.deepcopy)
+    for act in acts:
         with pytest.raises(TypeError, match=r"cannot be pickled: .*in each process"):
             act(made)
     if what in ("window", "events"):

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
 from shmmap.client.cell import Cell
 from shmmap.segment.owned import Owned
@@ -116,3 +118,25 @@ def test_dropping_cells_in_many_threads_while_the_thread_ends_loses_none(segment
         threads.clear()
         del thread
         assert mappings_under(segments.path) == 0
+
+
+@pytest.mark.parametrize("deferred", [False, True])
+def test_nothing_written_in_python_runs_when_a_cell_ends(segments: Segments, deferred: bool) -> None:
+    """There a signal handler's exception would be ignored, and Ctrl-C lost."""
+    queue: SimpleQueue[Owned | None] = SimpleQueue()
+    if deferred:
+        segments.attacher.unmap_in(queue)
+    cells = [segments.cell("/a", XYZ, version=5)]
+    views = [cells[0].xyz]
+    entered: list[str] = []
+    before = sys.getprofile()
+    sys.setprofile(lambda frame, event, _: entered.append(frame.f_code.co_name) if event == "call" else None)
+    try:
+        cells.clear()
+        views.clear()
+    finally:
+        sys.setprofile(before)
+    assert entered == []
+    assert queue.qsize() == deferred
+    segments.attacher.stop_unmapping_in(queue)
+    assert segments.attacher.unmapped() == [5]
