@@ -21,6 +21,7 @@ from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import take_away
+from shmmap.daemon.host.runtime_dir import make_runtime_dir
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
     KEEP_SIGNAL,
@@ -34,7 +35,6 @@ from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
-from shmmap.daemon.prerequisites import make_runtime_dir
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.handshake import Handshake

@@ -40,6 +40,7 @@ from shmmap.daemon.events.publisher import events_path
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
+from shmmap.daemon.host.runtime_dir import make_runtime_dir
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
 from shmmap.daemon.live.place import place_live_maps
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
@@ -52,7 +53,6 @@ from shmmap.daemon.prerequisites import (
     choose_pins,
     give_back_large_tables,
     import_ahead,
-    make_runtime_dir,
     raise_descriptor_limit,
 )
 from shmmap.daemon.requests.operators.authorization import Authorization

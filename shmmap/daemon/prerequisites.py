@@ -3,22 +3,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import importlib
-import os
 import resource
-from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.groups import account_name, group_id
 from shmmap.daemon.pins.probe import PinSource, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.errors import CannotStart, ConfigError
+from shmmap.errors import ConfigError
 from shmmap.logfmt import log
 from shmmap.processes.limits import file_size_limit
-from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = [
@@ -27,7 +23,6 @@ __all__ = [
     "choose_pins",
     "give_back_large_tables",
     "import_ahead",
-    "make_runtime_dir",
     "raise_descriptor_limit",
 ]
 
@@ -85,41 +80,6 @@ def check_file_size_limit(budget_bytes: int) -> None:
             "files are limited in size", RLIMIT_FSIZE=limit, budget_bytes=budget_bytes,
             hint="larger segments will be refused: ulimit -f, LimitFSIZE=",
         )  # fmt: skip
-
-
-def make_runtime_dir(path: Path, gid: int) -> None:
-    """Make the directory of the socket, for the owner and, where there is one, the group.
-
-    Raises
-    ------
-    CannotStart
-        It cannot be made, or in /tmp somebody else has made it.
-    """
-    if str(path) == fallback_runtime_dir():
-        _make_private(path)
-        return
-    if path.is_dir():
-        return
-    try:
-        path.mkdir(mode=0o750 if gid >= 0 else 0o700, parents=True, exist_ok=True)
-        if gid >= 0:
-            os.chown(path, -1, gid)
-    except OSError as error:
-        raise CannotStart(
-            f"runtime directory {path}: {error.strerror}", hint="make it, or give another --runtime-dir"
-        ) from error
-
-
-def _make_private(path: Path) -> None:
-    """Make the directory in /tmp that is used without ``XDG_RUNTIME_DIR``, for the owner alone."""
-    with contextlib.suppress(FileExistsError):
-        path.mkdir(mode=0o700)
-    if why := why_not_private(str(path)):
-        raise CannotStart(
-            f"runtime directory {path}: {why}",
-            hint="see whose it is and remove it, or set XDG_RUNTIME_DIR, or give --runtime-dir",
-        )
-    log.info("runtime directory", path=path, reason="XDG_RUNTIME_DIR is not set")
 
 
 def choose_pins(directory: ShmDirectory) -> PinWatch:

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -18,15 +16,7 @@ from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
-
-PATIENCE_S = 60.0
-
-
-def until(done: Callable[[], object], why: Callable[[], str]) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < end_s, why()
-        time.sleep(0.02)
+from tests.support.waiting import PATIENCE_S, counters, until
 
 
 def remove_segments(one: DaemonProcess) -> int:
@@ -35,10 +25,6 @@ def remove_segments(one: DaemonProcess) -> int:
     for name in names:
         os.unlink(f"{one.shm_dir}/{name}")
     return len(names)
-
-
-def counters(one: DaemonProcess) -> dict[str, int]:
-    return dict(read_statistics(one.instance, one.shm_dir).counters)
 
 
 def tight(daemon: DaemonFactory, divided_map: DividedMap) -> tuple[DaemonProcess, int]:

@@ -14,10 +14,9 @@ import pytest
 
 from shmmap import EventStream
 from tests.process.conftest import DaemonFactory
-from tests.process.test_cleaners import until
-from tests.process.test_watching import next_reload
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
+from tests.support.waiting import next_reload, until
 
 AT_TERMINAL = """\
 import fcntl, os, sys, termios
