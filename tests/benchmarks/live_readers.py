@@ -8,9 +8,9 @@
 come that change 64 chunks each; a reader maps every chunk file and lets none go, one touches what it has
 mapped without end (SIGBUS ends it, and another takes its place), and readers within their limits look 512
 chunks up each, stopped for some seconds wherever they are.  Every voxel of a chunk has one value at any
-moment, so that a reader sees what is torn.  Limits: what the file system has given to the live map, sampled at
-50 Hz, is at most the budget, a tenth of it and a mebibyte; every cell of points is served; no reader sees a
-wrong voxel or ends by a signal; `shmmap doctor` names the reader that keeps chunks within five seconds.
+moment, so that a reader sees what is torn.  Limits: what the file system has given to the live map, sampled
+at 50 Hz, is at most the budget, a tenth of it and a mebibyte; every cell of points is served; no reader sees
+a wrong voxel or ends by a signal; `shmmap doctor` names the reader that keeps chunks within five seconds.
 
 ``latency``: the 99th percentile of a scan from its mapper to *applied*, ten a second, alone and beside 64
 requests of readers in flight over that many chunks, beside readers of files on a disk that takes two seconds
@@ -356,6 +356,8 @@ def flooding(endpoint: str, chunks: int, in_flight: int, pipe: Any) -> None:
                 answers += 1
                 ask(client)
     pipe.send(answers)
+    for client in clients:
+        client.close()
 
 
 def moving(endpoint: str, readers: int, pipe: Any) -> None:
@@ -381,6 +383,8 @@ def reading_disk(endpoint: str, readers: int, pipe: Any) -> None:
     pipe.send("ready")
     pipe.poll(None)
     pipe.send(0)
+    for client in clients:
+        client.close()
 
 
 SLOW_DISK = """
