@@ -8,13 +8,17 @@
     cells = shmmap.connect().around(x, y, radius=50)
     print(sum(len(cell.xyz) for cell in cells))
 
-Every public name is loaded when it is first used, so that ``import shmmap`` itself costs nothing.
+Every public name is loaded when it is first used, so that ``import shmmap`` itself costs next to nothing: it
+loads what says why a name cannot be loaded.
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any, Final
+
+from shmmap.optional_packages import needed_packages
+from shmmap.segment.process_limits import no_files_left
 
 if TYPE_CHECKING:
     from shmmap.chunks.occupancy import Occupancy
@@ -51,6 +55,7 @@ if TYPE_CHECKING:
         DaemonUnreachable,
         InstanceBusy,
         InternalError,
+        LimitReached,
         LiveInterrupted,
         LoadFailed,
         LoadTimeout,
@@ -83,7 +88,6 @@ if TYPE_CHECKING:
     from shmmap.layers.covariance import voxel_covariances
     from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
-    from shmmap.optional_packages import needed_packages
     from shmmap.protocol.live import LiveMapRow
     from shmmap.protocol.messages import HeldCell, Holder, Intent
 
@@ -117,6 +121,7 @@ __all__ = [
     "InternalError",
     "LayerKind",
     "LayerTable",
+    "LimitReached",
     "LiveInterrupted",
     "LiveMap",
     "LiveMapRow",
@@ -224,16 +229,18 @@ def __getattr__(name: str) -> Any:
         module = "shmmap.formats.cloud"
     elif name == "write_pcd":
         module = "shmmap.formats.pcd.writer"
-    elif name == "needed_packages":
-        module = "shmmap.optional_packages"
     elif name in __all__:
         module = "shmmap.errors"
     else:
         raise AttributeError(f"module 'shmmap' has no attribute {name!r}")
-    from shmmap.optional_packages import needed_packages
-
-    with needed_packages(f"shmmap.{name}"):
-        value = getattr(importlib.import_module(module), name)
+    try:
+        with needed_packages(f"shmmap.{name}"):
+            value = getattr(importlib.import_module(module), name)
+    except (OSError, ImportError) as error:
+        limit = no_files_left(error, f"shmmap.{name} cannot be loaded: ")
+        if limit is None:
+            raise
+        raise limit from None
     globals()[name] = value
     return value
 

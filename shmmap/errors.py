@@ -21,6 +21,7 @@
     ├── CannotStart            what hinders the daemon's start can pass           exit 71
     ├── NoSession              the daemon does not know this session: say hello   exit 1
     ├── NotPermitted           the daemon refuses this to this user               exit 1
+    ├── LimitReached           this process may have no more files, threads, memory   exit 71
     ├── Busy                   too many requests of this process wait already     exit 75
     ├── LiveInterrupted        who keeps live maps is started anew: ask again      exit 75
     ├── SegmentError           a segment cannot be used
@@ -58,6 +59,7 @@ __all__ = [
     "DaemonUnreachable",
     "InstanceBusy",
     "InternalError",
+    "LimitReached",
     "LiveInterrupted",
     "LoadFailed",
     "LoadTimeout",
@@ -240,6 +242,13 @@ class NotPermitted(ShmmapError):
 
     code = "not_permitted"
     exit_code = 1
+
+
+class LimitReached(ShmmapError):
+    """This process may have no more of something: files, threads, memory; the message names the limit."""
+
+    code = "limit_reached"
+    exit_code = 71  # EX_OSERR of sysexits.h
 
 
 class Busy(ShmmapError):

@@ -1,37 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where compiled kernels are kept, and whether those of the layers are there; without importing numba.
+"""Compiled kernels on disk: where they are kept, which of them may be used; without importing numba.
 
-``NUMBA_CACHE_DIR`` where that is set, else ``$CACHE_DIRECTORY/kernels`` (a service), else
+They are in ``NUMBA_CACHE_DIR`` where that is set, else in ``$CACHE_DIRECTORY/kernels`` (a service), else in
 ``$XDG_CACHE_HOME/shmmap/kernels`` or ``~/.cache/shmmap/kernels``.
+
+Nothing depends on them: what is missing, damaged, of another version or not to be trusted is compiled
+again, and where nothing can be written kernels are compiled in each process.  A kernel is code that this
+process will run, so directory and file have to belong to this user or to root, and nobody else may write
+there.
+
+A file: 8 bytes of magic, the SHA-256 of what the kernel was made from, the SHA-256 of the kernel, the kernel.
+It is complete and flushed before it has its name.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib.util
 import os
+import secrets
+import stat
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from shmmap import __version__
+from shmmap.logfmt import log
 
-__all__ = ["compiled_mark", "kernel_directory"]
+__all__ = ["all_kept", "compiled_mark", "discard", "kernel_directory", "read_kernel", "write_kernel"]
+
+_MAGIC: Final = b"SHMMAPK\x01"
+_MAX_BYTES: Final = 64 << 20  # the largest kernel has a few hundred kB
+_ABANDONED_S: Final = 3600.0
+
+_said: set[str] = set()
+_unkept: list[str] = []
 
 
 def kernel_directory() -> Path | None:
-    """Directory of compiled kernels, made if missing; None where none can be written."""
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    service = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
-    base = os.environ.get("XDG_CACHE_HOME", "")
+    """Directory of compiled kernels, made if missing; None, and said once, where none can be used."""
     try:
-        if named:
-            path = Path(named)
-        elif service:
-            path = Path(service) / "kernels"
-        else:
-            path = (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "kernels"
-        path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        return path if os.access(path, os.W_OK | os.X_OK) else None
-    except (OSError, RuntimeError):  # RuntimeError: no home directory
+        path = _place()
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(parents=True, mode=0o700)
+        with _opened(path):
+            return path
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home directory
+        _not_kept(error)
         return None
 
 
@@ -41,10 +59,158 @@ def compiled_mark() -> Path | None:
     None where they cannot be kept, or there is no numba.
     """
     directory, numba = kernel_directory(), importlib.util.find_spec("numba")
-    if directory is None or numba is None or not numba.origin:
+    if directory is None or not os.access(directory, os.W_OK) or numba is None or not numba.origin:
         return None
     try:
         which = os.stat(numba.origin).st_mtime_ns
     except OSError:
         return None
     return directory / f"layers-{__version__}-{sys.implementation.cache_tag}-{which:x}.compiled"
+
+
+def read_kernel(name: str, source: bytes) -> bytes | None:
+    """Return the kernel of this name that was made from ``source``; None where there is none to be used.
+
+    Parameters
+    ----------
+    name
+        Of its file.
+    source
+        Whatever the kernel depends on.
+    """
+    if (directory := kernel_directory()) is None:
+        return None
+    try:
+        data = _read(directory, name)
+    except FileNotFoundError:
+        return None
+    except (OSError, MemoryError) as error:
+        discard(name, error)
+        return None
+    head, rest = data[: len(_MAGIC) + 64], memoryview(data)[len(_MAGIC) + 64 :]
+    if head[: len(_MAGIC)] != _MAGIC or head[-32:] != hashlib.sha256(rest).digest():
+        discard(name, "damaged")
+        return None
+    return bytes(rest) if head[len(_MAGIC) : -32] == hashlib.sha256(source).digest() else None
+
+
+def write_kernel(name: str, source: bytes, data: bytes) -> None:
+    """Keep a kernel, in place of another one of that name; where it cannot be kept that is said once."""
+    if (directory := kernel_directory()) is None:
+        return
+    unfinished = f"{name}.{secrets.token_hex(4)}.tmp"
+    try:
+        with _opened(directory) as parent:
+            try:
+                fd = os.open(
+                    unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600, dir_fd=parent
+                )
+                with open(fd, "wb") as file:
+                    file.write(_MAGIC + hashlib.sha256(source).digest() + hashlib.sha256(data).digest())
+                    file.write(data)
+                    file.flush()
+                    os.fsync(fd)
+                os.rename(unfinished, name, src_dir_fd=parent, dst_dir_fd=parent)
+            except OSError:
+                with contextlib.suppress(OSError):
+                    os.unlink(unfinished, dir_fd=parent)
+                raise
+    except OSError as error:
+        _not_kept(error)
+
+
+def discard(name: str, why: object) -> None:
+    """Remove a kernel that cannot be used, and the mark that all are compiled; say so once."""
+    if (directory := kernel_directory()) is None:
+        return
+    _say("compiled kernel discarded", path=directory / name, reason=_words(why))
+    for path in (directory / name, compiled_mark()):
+        if path is not None:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def all_kept() -> bool:
+    """Whether this process has kept whatever it compiled, and that is on the disk.
+
+    Files that killed processes left unfinished are removed.
+    """
+    if _unkept or (directory := kernel_directory()) is None:
+        return False
+    try:
+        with _opened(directory) as parent:
+            os.fsync(parent)
+            for entry in os.scandir(parent):
+                status = entry.stat(follow_symlinks=False)
+                if entry.name.endswith(".tmp") and status.st_mtime < time.time() - _ABANDONED_S:
+                    os.unlink(entry.name, dir_fd=parent)
+    except OSError as error:
+        _not_kept(error)
+        return False
+    return True
+
+
+def _place() -> Path:
+    if named := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(named)
+    if service := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
+        return Path(service) / "kernels"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "kernels"
+
+
+@contextlib.contextmanager
+def _opened(directory: Path) -> Iterator[int]:
+    """The directory's descriptor; it is checked, and what is opened in it is in that directory."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        _check_trust(os.fstat(fd), directory)
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def _read(directory: Path, name: str) -> bytes:
+    with _opened(directory) as parent:
+        # nothing to wait for, if it is a pipe; no way out, if it is a link
+        fd = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
+    try:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError("not a regular file")
+        _check_trust(status, directory / name)
+        if status.st_size > _MAX_BYTES:
+            raise OSError(f"{status.st_size} bytes, which is too large")
+        with open(fd, "rb", closefd=False) as file:
+            return file.read()
+    finally:
+        os.close(fd)
+
+
+def _check_trust(status: os.stat_result, path: Path) -> None:
+    if status.st_uid not in {0, os.geteuid()}:
+        raise PermissionError(f"{path} belongs to another user (uid {status.st_uid}), who is not trusted")
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(f"{path} can be written by other users: chmod go-w {path}")
+
+
+def _not_kept(error: Exception) -> None:
+    _unkept.append(str(error))
+    with contextlib.suppress(RuntimeError):
+        _say(
+            "compiled kernels are not kept", path=_place(), reason=_words(error),
+            effect="each process compiles them, which takes some seconds",
+        )  # fmt: skip
+
+
+def _words(why: object) -> str:
+    if isinstance(why, OSError) and why.strerror:
+        return why.strerror
+    return str(why) or type(why).__name__
+
+
+def _say(event: str, **details: object) -> None:
+    """Log something once a process, and not again in its children."""
+    if event not in _said:
+        _said.add(event)
+        log.warning(event, **details)

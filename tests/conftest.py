@@ -10,12 +10,14 @@ import signal
 import tempfile
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from shmmap.kernel_cache import compiled_mark
 from tests.support.built_once import built_once
 from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
+    NEEDS_ROOT,
     pytest_collectreport,
     pytest_runtest_logreport,
     pytest_sessionfinish,
@@ -29,11 +31,15 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         # a shell's background job ignores SIGINT, and so would the programs it starts for the tests
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    # how long an example takes is for the machine to say
+    hypothesis.settings.register_profile("shmmap", deadline=None)
+    hypothesis.settings.load_profile("shmmap")
     if "NUMBA_CACHE_DIR" not in os.environ:
         cache = getattr(config, "cache", None)
         path = (
             cache.mkdir("kernels") if cache is not None else Path(tempfile.mkdtemp(prefix="shmmap-kernels-"))
         )
+        path.chmod(0o700)  # whatever the umask is: who else could write there is not trusted
         os.environ["NUMBA_CACHE_DIR"] = str(path)
         if (mark := compiled_mark()) is not None:
             mark.touch()  # no daemon of a test compiles what nobody asks it for
@@ -52,7 +58,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if os.geteuid() != 0:
         for item in items:
             if item.get_closest_marker("root"):
-                item.add_marker(pytest.mark.skip(reason="needs root (other user accounts, private tmpfs)"))
+                item.add_marker(pytest.mark.skip(reason=NEEDS_ROOT))
 
 
 def pytest_collection_finish() -> None:
@@ -68,6 +74,18 @@ def data_dir() -> Path:
     if not path:
         pytest.skip("SHMMAP_TEST_DATA is not set")
     return Path(path)
+
+
+@pytest.fixture(scope="session")
+def layer_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Have the kernels of layers compiled before a daemon needs them: there a load has a deadline."""
+
+    def compile_them(_folder: Path) -> None:
+        from shmmap.layers import height_kernels, lattice_kernels, ndt_kernels
+
+        del height_kernels, lattice_kernels, ndt_kernels  # they are compiled as they are imported
+
+    built_once(tmp_path_factory, "layer_kernels", compile_them)
 
 
 @pytest.fixture(scope="session")

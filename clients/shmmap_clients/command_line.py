@@ -3,17 +3,21 @@
 
 Exit codes are those of ``shmmap``: 0 done; 1 a negative answer, or nothing found; 2 wrong usage; 65 bad data;
 66 no file or no map there; 69 no daemon answers, or a package is missing; 70 internal error; 73 an output
-cannot be written; 75 busy; 130 interrupted.
+cannot be written; 75 busy; 130 interrupted, 143 ended by SIGTERM.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import shutil
+import signal
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
 from typing import Any, Protocol
 
 from shmmap import needed_packages
@@ -130,7 +134,37 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
             code: int = args.run(args)
         return code
 
-    return exit_code_of(name, run)
+    with _ended_as_interrupted() as ended_by:
+        code = exit_code_of(name, run)
+    return 128 + ended_by[0] if ended_by else code
+
+
+@contextlib.contextmanager
+def _ended_as_interrupted() -> Iterator[list[int]]:
+    """Let SIGTERM, and SIGHUP unless it is ignored, end a program as Ctrl-C does: it cleans up after itself.
+
+    Yields a list that holds the signal then; a second signal ends the process at once.
+    """
+    ended_by: list[int] = []
+    handled: list[int] = []
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        for one in handled:
+            signal.signal(one, signal.SIG_DFL)
+        ended_by.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, end)
+                handled.append(number)
+    try:
+        yield ended_by
+    finally:
+        for number in handled:
+            if signal.getsignal(number) is end:
+                signal.signal(number, signal.SIG_DFL)
 
 
 def positive(text: str) -> float:

@@ -5,14 +5,20 @@ from __future__ import annotations
 
 import argparse
 import os
+from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.command_line import finite, not_negative, positive
+from shmmap_clients.command_line import complain, finite, not_negative, positive
+
+if TYPE_CHECKING:
+    from shmmap_clients.scans.bin_layout import BinLayout
+    from shmmap_clients.scans.scan_file import ScanReader
 
 __all__ = [
     "Parser",
     "add_backend_option",
     "add_height_option",
     "add_leaf_option",
+    "add_min_range_option",
     "add_quiet_option",
     "add_radius_option",
     "add_scan_option",
@@ -20,27 +26,89 @@ __all__ = [
     "add_sigma_options",
     "add_thin_option",
     "add_threads_option",
+    "reader_from",
 ]
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 
 
 def add_scan_option(parser: Parser) -> None:
-    """Add ``--scan``, a file as `shmmap_clients.scans.scan_file` reads it."""
+    """Add ``--scan``, a file as `shmmap_clients.scans.scan_file` reads it, and how it is read."""
     parser.add_argument(
-        "--scan", required=True, metavar="FILE", help="scan: PCD, NPZ (xyz or xyz_4mm) or KITTI .bin"
+        "--scan",
+        required=True,
+        metavar="FILE",
+        help="scan: PCD, NPZ (xyz or xyz_4mm), or bare rows in a .bin",
     )
+    _add_bin_option(parser)
+    add_min_range_option(parser)
 
 
-def add_scans_option(parser: Parser) -> None:
-    """Add ``--scans``, see `shmmap_clients.scans.scan_source`."""
+def add_scans_option(parser: Parser, *, min_range: bool = True) -> None:
+    """Add ``--scans``, see `shmmap_clients.scans.scan_source`, and how they are read."""
     parser.add_argument(
         "--scans",
         required=True,
         metavar="DIR|ENDPOINT",
-        help="scans: a directory (PCD, NPZ, KITTI .bin; in the order of their names), or the ZeroMQ address"
-        " of a publisher",
+        help="scans: a directory (PCD, NPZ, .bin; in the order of their names), or the ZeroMQ address of a"
+        " publisher",
     )
+    _add_bin_option(parser)
+    if min_range:
+        add_min_range_option(parser)
+
+
+def _add_bin_option(parser: Parser) -> None:
+    parser.add_argument(
+        "--bin-columns",
+        type=_bin_layout,
+        metavar="NAMES",
+        help="columns of .bin files, such as x,y,z,intensity,ring: float32, or as x:f8,y,z,t:u4 says; _ skips"
+        " one (default: recognised by their numbers, and said)",
+    )
+
+
+def _bin_layout(text: str) -> BinLayout:
+    from shmmap import BadRequest
+    from shmmap_clients.scans.bin_layout import BinLayout
+
+    try:
+        return BinLayout.parse(text)
+    except BadRequest as error:
+        raise argparse.ArgumentTypeError(f"{error.message} ({error.hint})") from None
+
+
+def add_min_range_option(parser: Parser) -> None:
+    """Add ``--min-range``."""
+    parser.add_argument(
+        "--min-range",
+        type=not_negative,
+        default=0.5,
+        metavar="M",
+        help="leave out points of the scan nearer than that to its frame's origin: no-returns at (0, 0, 0)"
+        " (default: 0.5; 0: none)",
+    )
+
+
+def reader_from(args: argparse.Namespace, name: str, **settings: Any) -> ScanReader:
+    """Return what reads scans as the options say; what a user should know goes to stderr, unless ``--quiet``.
+
+    Parameters
+    ----------
+    args
+    name
+        The program's.
+    settings
+        Of `ScanReader`, instead of the options.
+    """
+    from shmmap_clients.scans.scan_file import ScanReader
+
+    def say(note: str) -> None:
+        if not getattr(args, "quiet", False):
+            complain(name, note)
+
+    given = {"bin_layout": args.bin_columns, "min_range": getattr(args, "min_range", None), "say": say}
+    return ScanReader(**{**given, **settings})
 
 
 def add_leaf_option(parser: Parser) -> None:

@@ -191,15 +191,10 @@ def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
     map_dir = os.path.dirname(os.path.dirname(id_prefix + "_"))
     if not os.path.exists(os.path.join(map_dir, "shmmap_divide.json")):
         return None
-    from shmmap.dividing.report import read_report
-    from shmmap.errors import MapDataError
+    from shmmap.origin.map_frame import read_map_frame
 
-    try:
-        report = read_report(map_dir)
-        x, y, z = map(float, report["origin"]) if report else (0.0, 0.0, 0.0)
-    except (MapDataError, KeyError, TypeError, ValueError):
-        return None  # not ours after all
-    return (x, y, z) if (x, y, z) != (0.0, 0.0, 0.0) else None
+    origin = read_map_frame(map_dir).origin
+    return origin if any(origin) else None
 
 
 def no_cell_there(args: argparse.Namespace, client: Client, area: Area) -> int:

@@ -1,63 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handles to cells: each segment is mapped once in a client, and unmapped where nobody is disturbed."""
+"""Handles to cells: each segment is mapped once in a client, and unmapped where nobody is disturbed.
+
+Cells and views end wherever the last reference to them is dropped, in any thread and in the middle of
+anything.  What happens then is built in, appending to a deque or putting into a `queue.SimpleQueue`: it takes
+no lock, and no signal handler runs in it, whose exception Python would have to ignore.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import weakref
 from collections import deque
 from queue import Empty, SimpleQueue
-from typing import Final
-from weakref import WeakValueDictionary
 
-from shmmap.client.cell import Cell
+from shmmap.client.cell import Access, Cell
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import attach
 from shmmap.segment.owned import Owned
 
-__all__ = ["Attacher", "Unmapper"]
+__all__ = ["Attacher"]
 
 
-class Unmapper:
-    """Where mapped memory goes when its last view is gone: nowhere, which unmaps it, or to a thread.
+class _Attached(weakref.ref[Cell]):
+    """A cell as long as others have it, and what it is found by."""
 
-    Views end wherever the last reference to them is dropped, in any thread and in the middle of
-    anything, so nothing here takes a lock; `queue.SimpleQueue` is made for that.
-    """
+    __slots__ = ("key",)
 
-    def __init__(self) -> None:
-        self._pid = os.getpid()
-        self._sinks: tuple[SimpleQueue[Owned | None], ...] = ()
-        self._getpid: Final = os.getpid  # kept here, for memory that ends while the interpreter shuts down
-
-    def __call__(self, memory: Owned) -> None:
-        """Take memory that nobody looks at any more."""
-        sinks = self._sinks
-        if sinks and self._getpid() == self._pid:
-            sinks[0].put(memory)
-            if sinks[0] not in self._sinks:  # its thread ended meanwhile
-                _drain(sinks[0])
-
-    def defer_to(self, queue: SimpleQueue[Owned | None]) -> None:
-        """From now on hand memory to a queue, whose thread unmaps it."""
-        self._sinks = (*self._sinks, queue)
-
-    def stop_deferring(self, queue: SimpleQueue[Owned | None]) -> None:
-        """End `defer_to`: the queue's thread ended."""
-        self._sinks = tuple(other for other in self._sinks if other is not queue)
-        _drain(queue)
-
-    def restart_in_child(self) -> None:
-        """After a fork: the threads that memory was handed to stayed in the parent."""
-        self._pid = os.getpid()
-        self._sinks = ()
-
-
-def _drain(queue: SimpleQueue[Owned | None]) -> None:
-    with contextlib.suppress(Empty):
-        while True:
-            queue.get_nowait()
+    key: tuple[int, str]
 
 
 class _Mapped(weakref.ref[Owned]):
@@ -70,43 +39,38 @@ class _Mapped(weakref.ref[Owned]):
 
 
 class Attacher:
-    """Attaches handles; not thread-safe, but cells may end in any thread.
-
-    Attributes
-    ----------
-    unmapper : Unmapper
-        Where the mappings of its cells go.
-    """
+    """Attaches handles; not thread-safe, but cells may end in any thread."""
 
     def __init__(self) -> None:
-        self.unmapper = Unmapper()
-        self._cells: WeakValueDictionary[tuple[int, str], Cell] = WeakValueDictionary()
+        self._cells: dict[tuple[int, str], _Attached] = {}
+        self._dropped: deque[weakref.ref[Cell]] = deque()
         self._mapped: dict[int, _Mapped] = {}  # the last one of each version, which knows the one before
         self._ended: deque[_Mapped] = deque()
         self._unmapped: list[int] = []
+        self._sinks: list[SimpleQueue[Owned | None]] = []
 
     def attach(
-        self,
-        handle: Handle,
-        cell_id: str,
-        segment: str,
-        *,
-        shm_dir: str,
-        slot: int,
-        owner: int | None = None,
-        populate: bool = False,
+        self, handle: Handle, cell_id: str, segment: str, access: Access, *, populate: bool = False
     ) -> Cell:
         """Return the cell of a handle; one that is attached already is shared.
 
-        Parameters are those of `shmmap.segment.attach.attach`.
+        Parameters
+        ----------
+        handle, cell_id, segment
+            The handle, and what it names, whole.
+        access
+            Where the segments are, and whose.
+        populate
+            Let the kernel map every page now.
 
         Raises
         ------
-        StaleHandle, SegmentCorrupt, SegmentError
+        StaleHandle, SegmentCorrupt, SegmentError, LimitReached
             As `shmmap.segment.attach.attach`.
         """
         key = (handle.version, handle.layer)
-        cell = self._cells.get(key)
+        known = self._cells.get(key)
+        cell = known() if known is not None else None
         if cell is not None:
             cell.stale = handle.stale
             return cell
@@ -114,15 +78,26 @@ class Attacher:
             segment,
             offset=handle.offset,
             nbytes=handle.bytes,
-            shm_dir=shm_dir,
-            slot=slot,
-            owner=owner,
+            shm_dir=access.shm_dir,
+            slot=access.slot,
+            owner=access.owner,
             populate=populate,
-            on_unmap=self.unmapper,
+            sinks=self._sinks,
             on_mapped=lambda memory: self._note(memory, handle.version),
         )
-        cell = self._cells[key] = Cell(cell_id, segment, handle, attached)
+        cell = Cell(cell_id, segment, handle, attached, access)
+        found = _Attached(cell, self._dropped.append)
+        found.key = key
+        self._forget_dropped()
+        self._cells[key] = found
         return cell
+
+    def _forget_dropped(self) -> None:
+        while self._dropped:
+            gone = self._dropped[0]  # it stays until all is done: an exception may come anywhere
+            if isinstance(gone, _Attached) and self._cells.get(gone.key) is gone:
+                del self._cells[gone.key]
+            self._dropped.popleft()
 
     def _note(self, memory: Owned, version: int) -> None:
         """Memory is mapped for a version; when and wherever it is unmapped, that is noted by itself."""
@@ -151,7 +126,21 @@ class Attacher:
             self._ended.popleft()
         return self._unmapped
 
+    # --- where memory goes when its last view is gone -----------------------------------------------
+
+    def unmap_in(self, queue: SimpleQueue[Owned | None]) -> None:
+        """From now on hand memory to a queue, whose thread unmaps it, instead of unmapping it on the spot."""
+        self._sinks.append(queue)
+
+    def stop_unmapping_in(self, queue: SimpleQueue[Owned | None]) -> None:
+        """End `unmap_in`: the queue's thread ended."""
+        if queue in self._sinks:
+            self._sinks.remove(queue)
+        with contextlib.suppress(Empty):
+            while True:
+                queue.get_nowait()
+
     def restart_in_child(self) -> None:
-        """After a fork: what is unmapped here, the parent's session still has."""
+        """After a fork: threads stayed in the parent, and so did the session of what is unmapped here."""
         self._ended = deque()
-        self.unmapper.restart_in_child()
+        self._sinks.clear()

@@ -3,21 +3,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
 from shmmap.protocol.messages import Handle
-from shmmap.segment.attach import AttachedSegment
-from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
+from shmmap.segment.attach import AttachedSegment, attach_writable
+from shmmap.segment.layout import ColumnRow, Lattice, SegmentHeader, SourceStamp
 
 if TYPE_CHECKING:
     import open3d
     import torch
     from numpy.typing import NDArray
 
-__all__ = ["Cell"]
+__all__ = ["Access", "Cell"]
+
+
+class Access(NamedTuple):
+    """How this process gets at a daemon's segments.
+
+    ``shm_dir`` is their directory, ``slot`` the session whose use of them the daemon sees, ``owner`` the user
+    they must belong to, None where that is not known.
+    """
+
+    shm_dir: str
+    slot: int | None
+    owner: int | None
 
 
 class Cell:
@@ -26,6 +38,9 @@ class Cell:
     Every array is a read-only view of shared memory, zero-copy, and valid as long as it or any
     view of it lives: after the cell object is gone, after the client is closed, after the daemon
     ended.  Its bytes never change; a changed map comes as a new cell.
+
+    A pickled cell is its handle, and is attached where it is unpickled; what is gone by then is a
+    `StaleHandle` (``MULTIPROCESSING.md``).  `copy` makes a cell that does not depend on the daemon.
 
     Attributes
     ----------
@@ -54,6 +69,7 @@ class Cell:
 
     __slots__ = (
         "__weakref__",
+        "_access",
         "_attached",
         "_views",
         "box",
@@ -68,7 +84,9 @@ class Cell:
         "version",
     )
 
-    def __init__(self, cell_id: str, segment: str, handle: Handle, attached: AttachedSegment) -> None:
+    def __init__(
+        self, cell_id: str, segment: str, handle: Handle, attached: AttachedSegment, access: Access | None
+    ) -> None:
         self.id = cell_id
         self.name = handle.id
         self.version = handle.version
@@ -80,10 +98,46 @@ class Cell:
         self.offset = handle.offset
         self.nbytes = handle.bytes
         self._attached = attached
+        self._access = access  # None: memory of this process
         self._views: dict[str, NDArray[Any]] = {}
 
     def __repr__(self) -> str:
         return f"<Cell {self.id} {self.layer} version {self.version_hex}, {self.points} points>"
+
+    # --- copies, and other processes --------------------------------------------------------------
+
+    def copy(self) -> Cell:
+        """Return the cell in memory of this process alone: it may be written, and pickles with its points.
+
+        Such a cell has no `segment`, and keeps nothing in the daemon.
+
+        Raises
+        ------
+        LimitReached
+            There is not so much memory.
+        """
+        return Cell(self.id, "", self._handle(), self._attached.copy(), None)
+
+    def __copy__(self) -> Cell:
+        return self if self._access is not None else self.copy()  # what never changes need not be copied
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Cell:
+        return self.__copy__()
+
+    def __reduce__(self) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
+        if self._access is None:
+            return _private_cell, (self.id, self._handle(), self._attached.columns, self._attached.raw)
+        from shmmap.client.handed_over import hand_over
+
+        return hand_over(self, self._access, self._handle())
+
+    def _handle(self) -> Handle:
+        return Handle(
+            self.name, self.version, self.layer, self.segment, self.offset, self.nbytes, self.points,
+            *self.box, self.stale,
+        )  # fmt: skip
+
+    # --- what it is ---------------------------------------------------------------------------
 
     @property
     def version_hex(self) -> str:
@@ -192,25 +246,47 @@ class Cell:
         """
         self._attached.verify()
 
-    # --- other libraries, over the same memory ----------------------------------------------------
+    # --- other libraries ------------------------------------------------------------------------
 
     def to_open3d(self) -> open3d.t.geometry.PointCloud:
-        """Return an Open3D tensor point cloud over the same memory.
+        """Return an Open3D tensor point cloud over the cell's memory, which may be written.
 
         ``xyz`` is its ``positions``; every other column is an attribute of its own name, (N, 1) or
-        (N, k).  Open3D does not know read-only memory: **writing through the result ends the
-        process** (SIGSEGV).  ``.clone()`` makes a private copy.
+        (N, k).  Nothing is copied to be read.  What is written becomes memory of this process, 4 KiB at a
+        time, and shows in this result alone: the cell, other results and other processes keep their bytes.
+
+        Raises
+        ------
+        LimitReached
+            There is no room for another mapping, and no memory for a copy.
         """
         from shmmap.client.wrapping import open3d_cloud
 
-        return open3d_cloud(self.columns)
+        return open3d_cloud(self._writable())
 
     def to_torch(self) -> dict[str, torch.Tensor]:
-        """Return torch tensors by column name over the same memory.
+        """Return torch tensors by column name over the cell's memory, which may be written.
 
-        Torch does not know read-only memory: **writing through a tensor ends the process**
-        (SIGSEGV).  ``.clone()`` makes a private copy.
+        As for `to_open3d`, what is written shows in this result alone.  (``torch.from_numpy(cell.xyz)`` would
+        be over the shared memory itself, where writing ends the process.)
+
+        Raises
+        ------
+        LimitReached
+            There is no room for another mapping, and no memory for a copy.
         """
         from shmmap.client.wrapping import torch_tensors
 
-        return torch_tensors(self.columns)
+        return torch_tensors(self._writable())
+
+    def _writable(self) -> Mapping[str, NDArray[Any]]:
+        """Return the columns over memory that may be written without anybody else's seeing it."""
+        segment = self._attached
+        if self._access is not None:
+            segment = attach_writable(segment, self.segment, offset=self.offset, shm_dir=self._access.shm_dir)
+        return {row[0]: segment.column(index) for index, row in enumerate(segment.columns)}
+
+
+def _private_cell(cell_id: str, handle: Handle, columns: list[ColumnRow], raw: NDArray[Any]) -> Cell:
+    """Unpickle a copy."""
+    return Cell(cell_id, "", handle, AttachedSegment(columns, raw), None)

@@ -7,10 +7,11 @@ import os
 from collections.abc import Iterable, Sequence
 from threading import TIMEOUT_MAX
 from types import TracebackType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NoReturn
+
+import numpy as np
 
 from shmmap import geometry
-from shmmap.client.attaching import Unmapper
 from shmmap.client.cell_set import CellSet
 from shmmap.client.discovery import candidates
 from shmmap.client.held import Held, HeldCells
@@ -24,6 +25,7 @@ from shmmap.protocol.messages import Intent, Welcome
 if TYPE_CHECKING:
     from shmmap.client.live.live_map import LiveMap
     from shmmap.client.map_listing import MapListing
+    from shmmap.client.points_around import PointsAround
     from shmmap.protocol.live import LiveMapRow
 
 __all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
@@ -72,6 +74,13 @@ class Client(OperatorRequests):
     def __repr__(self) -> str:
         return f"<Client of {self.endpoint}, map {self.welcome.map_path}>"
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a Client cannot be pickled: it is this process's connection to the daemon. Connect in each"
+            " process, shmmap.connect(...); a child that is forked may use it as it is. Cells can be pickled:"
+            " they go as handles"
+        )
+
     def close(self) -> None:
         """End the session; attached cells stay readable."""
         self._session.close()
@@ -115,11 +124,6 @@ class Client(OperatorRequests):
     def session(self) -> Session:
         """What its requests share; for windows."""
         return self._session
-
-    @property
-    def unmapper(self) -> Unmapper:
-        """Where this client's mappings go when their last view is gone."""
-        return self._session.attacher.unmapper
 
     # --- cells ------------------------------------------------------------------------------------
 
@@ -172,6 +176,41 @@ class Client(OperatorRequests):
         specs = several(layers)
         message, sent = messages.area_to_message(area), sendable(intent)
         return self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
+
+    def points_around(
+        self,
+        x: float,
+        y: float,
+        radius: float,
+        *,
+        layer: str = "points",
+        z: tuple[float, float] | None = None,
+        wait: float | None = DEFAULT_WAIT_S,
+    ) -> PointsAround:
+        """Points within ``radius`` metres of a place, as views of the cells they lie in; nothing is copied.
+
+        `around` answers with whole cells, which reach beyond the circle; `PointsAround.gather`, ``mask`` and
+        ``count`` take the points within it.  `PointsAround.covered` says whether these are all that the map
+        has there.
+
+        Parameters
+        ----------
+        x, y, radius
+            Metres, map frame.
+        layer
+            What to have of each cell.
+        z
+            Only cells that reach into these heights, (lowest, highest), metres; their points are not sorted
+            out by height.
+
+        Other parameters and errors are those of `area`.
+        """
+        from shmmap.client.points_around import points_around  # windows need it, and few others
+
+        heights = geometry.ZRange(*z) if z is not None else None
+        found = self.area(geometry.Circle(x, y, radius, heights), layer, wait=wait)
+        boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
+        return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
 
     def differential(
         self,
@@ -323,6 +362,8 @@ def connect(
         Why no daemon can be reached; all of them are `DaemonUnreachable`.
     ProtocolMismatch
         Who listens is no shmmap daemon, or one of another major version.
+    LimitReached
+        This process may not have the descriptors or threads that are needed.
     BadRequest
         The endpoint cannot be a socket path.
     """

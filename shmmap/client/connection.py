@@ -19,13 +19,14 @@ from typing import Any, Final, TypeVar
 
 import zmq
 
-from shmmap.client.connection_watch import ConnectionWatch
+from shmmap.client.connection_watch import CONNECTION, FILES, ConnectionWatch
 from shmmap.client.discovery import find_socket
 from shmmap.client.orphans import stop_orphans
 from shmmap.client.program_name import program_name
-from shmmap.errors import NoAnswer, ProtocolMismatch, error_from_wire
+from shmmap.errors import LimitReached, NoAnswer, ProtocolMismatch, ShmmapError, error_from_wire
 from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.messages import PROTOCOL_VERSION, ErrorReply, Hello, Reply, Request, Welcome
+from shmmap.segment.process_limits import check_files
 
 __all__ = ["Connection"]
 
@@ -73,6 +74,8 @@ class Connection:
     ------
     DaemonUnreachable, ProtocolMismatch
         As `shmmap.client.discovery.find_socket`, and when no `Welcome` comes in time.
+    LimitReached
+        This process may not have the descriptors or threads that a connection needs.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class Connection:
         timeout_s: float,
         waiting: Sequence[SimpleQueue[Any]] = (),
     ) -> None:
+        check_files(FILES, CONNECTION)
         deadline_s = time.monotonic() + timeout_s
         self.path = find_socket(paths, deadline_s)
         self._name = name or program_name()
@@ -92,8 +96,9 @@ class Connection:
         self._greeting = True
         stop_orphans()
         self._watch = ConnectionWatch(self, f"ipc://{self.path}", _OPTIONS, waiting)
-        # also when nobody calls close(), and at the end of the program
+        # also when nobody calls close(); not at the end of the program, where threads may be using it
         self._finalizer = weakref.finalize(self, self._watch.stop)
+        self._finalizer.atexit = False
         self._socket = self._watch.socket
         self._greet(deadline_s)
 
@@ -150,7 +155,7 @@ class Connection:
             if isinstance(reply, kind):
                 return reply
             if reply is None:
-                raise NoAnswer(f"{self.path}: no answer within {timeout_s:.3g} s", hint=_SILENT_HINT)
+                raise self._silence(f"no answer within {timeout_s:.3g} s")
             if not isinstance(reply, ErrorReply):
                 raise ProtocolMismatch(
                     f"the daemon answered a request {type(message).__name__} with {type(reply).__name__}",
@@ -167,10 +172,7 @@ class Connection:
         hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name, self._slot)
         reply = self._exchange(hello.request, encode(hello), deadline_s, 0.0)
         if reply is None:
-            raise NoAnswer(
-                f"{self.path}: connected, but no welcome within {time.monotonic() - started_s:.2g} s",
-                hint=_SILENT_HINT,
-            )
+            raise self._silence(f"connected, but no welcome within {time.monotonic() - started_s:.2g} s")
         if isinstance(reply, ErrorReply):
             raise error_from_wire(reply.code, reply.message, reply.hint)
         if not isinstance(reply, Welcome):
@@ -187,6 +189,15 @@ class Connection:
         self.welcome: Welcome = reply
         self._watch.wait_until_connected(deadline_s - time.monotonic())  # else it looks like a second time
         self._greeting = False
+
+    def _silence(self, what: str) -> ShmmapError:
+        """Return why there is no reply: the daemon's silence, or this process's lack of descriptors."""
+        if self._watch.lost_since is not None or not self._watch.handshakes:
+            try:
+                check_files(1, CONNECTION)
+            except LimitReached as limit:
+                return limit
+        return NoAnswer(f"{self.path}: {what}", hint=_SILENT_HINT)
 
     def _exchange(self, request: int, data: bytes, deadline_s: float, quiet_s: float) -> Reply | None:
         """Send until something comes back under this request id; None at the deadline."""

@@ -6,6 +6,9 @@ exception can leave a part behind that nobody knows of.  For the same reason it 
 that is built in, and whoever waits for it does so in queues.  The thread lets no signal interrupt it: the
 kernel may give one to any thread, and a context whose end it interrupts stays, with a thread and five
 descriptors.
+
+Where the interpreter ends nothing is closed: another thread may be using the socket, and libzmq ends the
+process when one is closed under its user.  Python stops such threads, and the kernel closes what is open.
 """
 
 from __future__ import annotations
@@ -16,20 +19,22 @@ import os
 import struct
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
 import zmq
 
 from shmmap.client.orphans import running
+from shmmap.errors import LimitReached
+from shmmap.segment.process_limits import check_files, check_threads, no_threads_left
 
 if TYPE_CHECKING:
     import signal as _signal
 else:
     import _signal  # `signal` is the same with enumerations, which take a millisecond to import
 
-__all__ = ["ConnectionWatch"]
+__all__ = ["CONNECTION", "FILES", "ConnectionWatch", "start_thread"]
 
 _EVENT: Final = struct.Struct("=HI")  # first frame of a message of zmq_socket_monitor(3): event, value
 _EVENTS: Final = (
@@ -42,8 +47,31 @@ _EVENTS: Final = (
 _OURS: Final = frozenset({_signal.SIGBUS, _signal.SIGFPE, _signal.SIGILL, _signal.SIGSEGV})
 """Signals that a thread brings upon itself; they are not to be put off."""
 _LAST_WORDS_MS: Final = 100  # closing may take this long to deliver a last message
+CONNECTION: Final = "a connection to the daemon"
+FILES: Final = 10
+"""Descriptors that libzmq needs (context, socket, monitor, connection), and one to map segments by."""
+THREADS: Final = 2
+"""Threads of libzmq for a context, beside the one that makes it."""
 _MADE_S: Final = 0.001
 _OVER_S: Final = 0.5  # who waits for the end looks again after this long, should another have waited, too
+
+
+def start_thread(run: Callable[..., object], *arguments: object) -> None:
+    """Start a thread by one function that is built in: no signal handler runs in the middle.
+
+    Raises
+    ------
+    LimitReached
+        This process may have no more threads.
+    SystemExit
+        The interpreter is ending, and starts none: the thread that asks ends, too, and quietly.
+    """
+    try:
+        _thread.start_new_thread(run, arguments)
+    except RuntimeError as error:
+        if "shutdown" in str(error):  # as Python calls it since 3.12
+            raise SystemExit from None
+        raise no_threads_left("no thread can be started: ") from None
 
 
 class ConnectionWatch:
@@ -75,8 +103,8 @@ class ConnectionWatch:
 
     Raises
     ------
-    zmq.ZMQError
-        There can be no socket, for lack of descriptors, say.
+    LimitReached
+        This process may not have the descriptors or threads that are needed.
     """
 
     def __init__(
@@ -100,10 +128,11 @@ class ConnectionWatch:
         self._ended = False
         self._thread = 0
         self._socket: zmq.Socket[bytes] | None = None
-        _thread.start_new_thread(self._run, (endpoint, options, kind))
+        check_files(FILES, CONNECTION)
+        start_thread(self._run, endpoint, options, kind)
         failure = self._made.get()
         if failure is not None:
-            raise failure
+            raise failure from None
 
     @property
     def socket(self) -> zmq.Socket[bytes]:
@@ -147,6 +176,7 @@ class ConnectionWatch:
         self._thread = _thread.get_ident()
         try:
             _signal.pthread_sigmask(_signal.SIG_BLOCK, _signal.valid_signals() - _OURS)
+            check_threads(THREADS, CONNECTION)
             with contextlib.ExitStack() as ends:
                 running.add(self)
                 ends.callback(running.discard, self)
@@ -163,6 +193,8 @@ class ConnectionWatch:
                 self._socket = socket
                 self._made.put(None)
                 self._listen(monitor)
+        except zmq.ZMQError as error:  # the last descriptors went to others since they were counted
+            self._made.put(LimitReached(f"no connection to the daemon: {error.strerror or error}"))
         except BaseException as error:  # noqa: BLE001  it is raised where the socket is waited for
             self._made.put(error)
         finally:

@@ -9,13 +9,15 @@ is reported as `Missed`.
 from __future__ import annotations
 
 import contextlib
+import math
+import threading
 import time
 import weakref
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Final, TypeAlias
+from typing import Final, NoReturn, TypeAlias
 
 import msgspec
 import zmq
@@ -23,12 +25,14 @@ import zmq
 from shmmap.client.connection import Connection
 from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import candidates
+from shmmap.client.turn import closed
 from shmmap.errors import BadRequest, NoAnswer, ProtocolMismatch
 from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, decode_event
 
 __all__ = ["EventStream", "Missed"]
 
 _TIMEOUT_S: Final = 5.0
+_SLICE_MS: Final = 100  # how often a wait looks whether another thread has closed the stream
 _QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
 _RECONNECT_MS: Final = 20
 _RECONNECT_MAX_MS: Final = 500
@@ -56,7 +60,7 @@ Happening: TypeAlias = Event | Missed
 
 
 class EventStream:
-    """What happens in the daemon, in order; not thread-safe.
+    """What happens in the daemon, in order; for one thread, but any may close it.
 
     Iterating waits for ever; `next` waits as long as one likes.  When the daemon is restarted the stream
     continues with the new epoch's events from the first one.
@@ -99,13 +103,16 @@ class EventStream:
         self._connection = Connection(candidates(endpoint), name=name, timeout_s=timeout)
         try:
             path = _events_path(self._connection)
-        except ProtocolMismatch:
+            self._watch = ConnectionWatch(self, f"ipc://{path}", _OPTIONS, kind=zmq.SUB)
+        except BaseException:
             self._connection.close()
             raise
-        self._watch = ConnectionWatch(self, f"ipc://{path}", _OPTIONS, kind=zmq.SUB)
-        # also when nobody calls close(), and at the end of the program
+        # also when nobody calls close(); not at the end of the program, where a thread may be using it
         self._finalizer = weakref.finalize(self, self._watch.stop)
+        self._finalizer.atexit = False
         self._socket = self._watch.socket
+        self._using = threading.RLock()
+        self._closed = False
         self._ready: deque[Happening] = deque()
         self.epoch = self._connection.welcome.epoch
         self.heard_s = time.monotonic()
@@ -123,11 +130,19 @@ class EventStream:
     ) -> None:
         self.close()
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "an EventStream cannot be pickled: it is this process's connection to the daemon."
+            " Make one in each process, EventStream(...)"
+        )
+
     def close(self) -> None:
-        """End the subscription."""
-        self._watch.stop()
-        self._finalizer.detach()
-        self._connection.close()
+        """End the subscription; another thread that waits for an event gets `BadRequest`."""
+        self._closed = True
+        with self._using:
+            self._watch.stop()
+            self._finalizer.detach()
+            self._connection.close()
 
     def __iter__(self) -> Iterator[Happening]:
         while True:
@@ -142,10 +157,14 @@ class EventStream:
         """
         deadline_s = None if timeout is None else time.monotonic() + timeout
         while not self._ready:
-            left_ms = None if deadline_s is None else max(0, int((deadline_s - time.monotonic()) * 1000))
-            if not self._socket.poll(left_ms):
-                return None
-            self._hear(self._socket.recv())
+            left_ms = math.inf if deadline_s is None else max(0, (deadline_s - time.monotonic()) * 1000)
+            with self._using:
+                if self._closed:
+                    raise closed("event stream", "make another one")
+                if self._socket.poll(int(min(left_ms, _SLICE_MS))):
+                    self._hear(self._socket.recv())
+                elif left_ms <= _SLICE_MS:
+                    return None
         return self._ready.popleft()
 
     @property

@@ -10,16 +10,16 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from queue import SimpleQueue
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
 from shmmap.client.answer import Answer
 from shmmap.client.attaching import Attacher
-from shmmap.client.cell import Cell
+from shmmap.client.cell import Access, Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
-from shmmap.client.turn import Turn, check_not_within, out_of_time
+from shmmap.client.turn import Turn, check_not_within, closed, out_of_time
 from shmmap.client.visible import check_visible, owner_of_segments, statistics_path
 from shmmap.errors import BadRequest
 from shmmap.failpoints import step
@@ -73,8 +73,8 @@ class Session:
         self._shm_dir = shm_dir
         self._lock = threading.Lock()
         self._closed = False
-        self._owner_epoch = 0
-        self._owner: int | None = None
+        self._access_epoch = 0
+        self._access: Access | None = None
         self._waiting: list[SimpleQueue[Any]] = []
         self._inherited: list[Connection] = []
         self._connection: Connection | None = None
@@ -82,7 +82,7 @@ class Session:
         connection = self._connect()
         self.welcome = connection.welcome
         self.map_version = self.welcome.map_version
-        _sessions.add(self)
+        _sessions.append(weakref.ref(self, _sessions.remove))
 
     def _connect(self) -> Connection:
         connection = Connection(
@@ -115,6 +115,12 @@ class Session:
         """End `tell_when_lost`."""
         self._waiting.remove(queue)
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "what asks the daemon cannot be pickled: it uses this process's connection."
+            " Connect in each process, shmmap.connect(...)"
+        )
+
     def close(self) -> None:
         """End the session; attached cells stay readable.
 
@@ -144,7 +150,7 @@ class Session:
             with Turn(self._lock, timeout_s):  # type: ignore[misc]
                 entered = True
                 if self._closed:
-                    raise BadRequest("this client is closed", hint="connect again")
+                    raise closed("client", "connect again")
                 connection = self._connection or self._connect()
                 self._tell_unmapped(connection)
                 return work(connection)
@@ -251,16 +257,17 @@ class Session:
 
     def _attach(self, handle: Handle, connection: Connection, populate: bool) -> Cell:
         welcome = connection.welcome
-        if welcome.epoch != self._owner_epoch:
-            self._owner_epoch = welcome.epoch
-            self._owner = owner_of_segments(self._shm_dir or welcome.shm_dir, welcome.segment_prefix)
+        access = self._access
+        if access is None or welcome.epoch != self._access_epoch:
+            shm_dir = self._shm_dir or welcome.shm_dir
+            owner = owner_of_segments(shm_dir, welcome.segment_prefix)
+            self._access = access = Access(shm_dir, welcome.session, owner)
+            self._access_epoch = welcome.epoch
         return self.attacher.attach(
             handle,
             handle.id if handle.id.startswith("/") else welcome.id_prefix + handle.id,
             welcome.segment_prefix + handle.segment,
-            shm_dir=self._shm_dir or welcome.shm_dir,
-            slot=welcome.session,
-            owner=self._owner,
+            access,
             populate=populate,
         )
 
@@ -276,12 +283,14 @@ class Session:
 
 _TURNS: Final = (Session._in_turn.__code__, Session.close.__code__)
 
-_sessions: weakref.WeakSet[Session] = weakref.WeakSet()
+_sessions: Final[list[weakref.ref[Session]]] = []
+"""Those alive; not a weak set, which runs functions in Python when one ends (`shmmap.client.attaching`)."""
 
 
 def _after_fork_in_child() -> None:
-    for session in list(_sessions):
-        session._restart_in_child()
+    for one in tuple(_sessions):
+        if (session := one()) is not None:
+            session._restart_in_child()
 
 
 os.register_at_fork(after_in_child=_after_fork_in_child)

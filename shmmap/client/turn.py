@@ -10,7 +10,7 @@ from types import CodeType, FrameType
 
 from shmmap.errors import BadRequest, NoAnswer
 
-__all__ = ["Turn", "check_not_within", "out_of_time"]
+__all__ = ["Turn", "check_not_within", "closed", "out_of_time"]
 
 
 class Turn:
@@ -31,6 +31,17 @@ class Turn:
         # the False of a wait in vain is left out, and there is no next
         self.__enter__ = filter(None, map(lock.acquire, (True,), (timeout_s,))).__next__
         self.__exit__ = lock.__exit__
+
+
+def closed(what: str, hint: str) -> BaseException:
+    """Return the error of a request to what is closed.
+
+    While the interpreter ends, that ends the thread that asked without a word: nobody waits for it.
+    """
+    main = threading.main_thread()
+    if not main.is_alive() and threading.get_ident() != main.ident:
+        return SystemExit()
+    return BadRequest(f"this {what} is closed", hint=hint)
 
 
 def out_of_time(timeout_s: float) -> NoAnswer:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells as the objects of other libraries, over the same memory.
 
-None of these libraries knows read-only memory.  What they return claims to be writeable, and writing
-to it ends the process (SIGSEGV); nothing else can be harmed, the mapping itself is read-only.
+None of these libraries knows read-only memory; the memory they are given may be written
+(`shmmap.segment.attach.attach_writable`).
 
 DLPack: ``cell.xyz`` is exported read-only by numpy 2.1 and later to consumers that ask for DLPack 1.0
 (``np.from_dlpack(cell.xyz)`` does); older consumers get a BufferError, never a copy.
@@ -10,7 +10,6 @@ DLPack: ``cell.xyz`` is exported read-only by numpy 2.1 and later to consumers t
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,7 @@ __all__ = ["open3d_cloud", "torch_tensors"]
 
 
 def open3d_cloud(columns: Mapping[str, NDArray[Any]]) -> open3d.t.geometry.PointCloud:
-    """Return ``open3d.t.geometry.PointCloud`` over the memory of a cell's columns; see `Cell.to_open3d`."""
+    """Return ``open3d.t.geometry.PointCloud`` over the memory of columns; see `Cell.to_open3d`."""
     with needed_packages("to_open3d()"):
         import open3d
 
@@ -42,7 +41,4 @@ def torch_tensors(columns: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor
     with needed_packages("to_torch()"):
         import torch
 
-    with warnings.catch_warnings():
-        # that the array is not writeable: said in the documentation instead of once in a process
-        warnings.filterwarnings("ignore", message=".*not writ[e]?able.*", category=UserWarning)
-        return {name: torch.from_numpy(view) for name, view in columns.items()}
+    return {name: torch.from_numpy(view) for name, view in columns.items()}

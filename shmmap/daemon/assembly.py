@@ -154,6 +154,8 @@ class Service:
             with contextlib.closing(ServingSignals()) as heard:
                 watched.watch(heard.fd, lambda: self._on_signals(heard))
                 self._listen()
+                memory.statistics.set("starting", 0)
+                memory.statistics.beat()
                 self._tell_epoch("started")
                 self._live.tell()
                 memory.scheduler.pool.start_one()

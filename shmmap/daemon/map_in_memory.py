@@ -78,7 +78,9 @@ class MapInMemory:
             limit_bytes=group_limit,
         )
         try:
-            self.statistics = StatisticsWriter(directory, config.instance, self.identity, mode=mode, gid=gid)
+            self.statistics = StatisticsWriter(
+                directory, config.instance, self.identity, mode=mode, gid=gid, starting=True
+            )
         except OSError as error:
             said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
             if is_full(error):

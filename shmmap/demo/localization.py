@@ -164,7 +164,7 @@ class Localization:
         return [
             "follow", "--scans", str(self._work / "scans"), "--truth", str(self._work / "truth.txt"),
             "--odometry", str(self._work / "odometry.txt"), "--endpoint", daemon.endpoint, "--json",
-            "--json-lines", "/dev/stdout", "--quiet",
+            "--json-lines", "-", "--quiet",
             "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(SEEN_METRES),
             "--update-distance", "10", "--route", str(self._work / "truth.txt"),
         ]  # fmt: skip

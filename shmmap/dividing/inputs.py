@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
-from shmmap.dividing.report import REPORT_NAME
 from shmmap.errors import BadRequest, MapMissing
 from shmmap.formats.causes import refusal
 from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.origin.map_frame import REPORT_NAME
 from shmmap.origin.metadata_text import METADATA_NAME
 
 __all__ = ["InputFile", "check_output_directory", "check_output_place", "check_unchanged", "find_inputs"]

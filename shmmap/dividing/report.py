@@ -9,15 +9,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from shmmap.errors import MapDataError
+from shmmap.origin.map_frame import REPORT_HEAD, REPORT_NAME
 
-__all__ = ["LINK_NAME", "REPORT_NAME", "DividedMap", "read_report", "write_report"]
+__all__ = ["LINK_NAME", "DividedMap", "write_report"]
 
-REPORT_NAME: Final = "shmmap_divide.json"
 LINK_NAME: Final = "map"
 """Beside the divisions of a served cloud, this leads to the one in service."""
-_FORMAT: Final = "shmmap divided map"
-_VERSION: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +31,8 @@ class DividedMap:
         Points in the inputs, and how many were not finite.
     origin
         Where the map's frame lies in that of the inputs: add it to a point to come back, metres.
+    crs, unit_m
+        The inputs' coordinate system and unit, as in `shmmap.origin.map_frame.MapFrame`.
     cell_size, leaf, order, encoding
         As in `DivideSettings`.
     fields
@@ -63,26 +62,12 @@ class DividedMap:
     sources: list[dict[str, Any]]
     notes: list[str] = field(default_factory=list)
     resumed_points: int = 0
+    crs: str = ""
+    unit_m: tuple[float, float] = (1.0, 1.0)
 
 
 def write_report(directory: str | os.PathLike[str], report: DividedMap) -> None:
     """Write ``report`` into a map's directory."""
-    content = {"format": _FORMAT, "version": _VERSION, **asdict(report)}
+    content = {**REPORT_HEAD, **asdict(report)}
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"  # ASCII: a path may be no Unicode
     Path(directory, REPORT_NAME).write_text(text, encoding="ascii")
-
-
-def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return what `divide` left about a map, or None for a map made by others."""
-    path = os.path.join(map_dir, REPORT_NAME)
-    try:
-        report = json.loads(Path(path).read_bytes())
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise MapDataError(f"cannot be read: {error.strerror}", path=path) from error
-    except ValueError as error:
-        raise MapDataError(f"cannot be read: {error}", path=path) from error
-    if not isinstance(report, dict) or report.get("format") != _FORMAT or report.get("version") != _VERSION:
-        raise MapDataError("written by another version of shmmap", path=path)
-    return report

@@ -24,13 +24,14 @@ from typing import Any, Final
 
 from xxhash import xxh3_64_hexdigest
 
-from shmmap.dividing.report import LINK_NAME, read_report
+from shmmap.dividing.report import LINK_NAME
 from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.map_directory import MapDirectory, open_map
+from shmmap.origin.map_frame import read_report
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.map_origin import MapOrigin
 from shmmap.origin.sidecar import default_cache_directory

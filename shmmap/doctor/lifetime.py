@@ -48,6 +48,8 @@ def check_daemon(patient: Patient) -> Finding:
         )
     if state == "stopped":
         return fail(name, fact, f"continue it: kill -CONT {identity.pid}")
+    if state == "starting":
+        return warn(name, fact, "wait until it listens: kernels are compiled the first time")
     if state == "hung":
         return fail(
             name,

@@ -67,7 +67,7 @@ class Patient:
     @property
     def alive(self) -> bool:
         """Whether the daemon's process lives."""
-        return self.seen is not None and self.seen.state in ("healthy", "stopped", "hung")
+        return self.seen is not None and self.seen.state in ("healthy", "starting", "stopped", "hung")
 
     @property
     def awaits_first_client(self) -> bool:

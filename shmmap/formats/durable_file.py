@@ -10,7 +10,7 @@ import secrets
 from collections.abc import Iterator
 from typing import IO, Final
 
-from shmmap.errors import CannotWrite
+from shmmap.errors import CannotWrite, ShmmapError
 
 __all__ = ["appearing_file", "flush_directory", "writing_errors"]
 
@@ -77,6 +77,8 @@ def writing_errors(what: str) -> Iterator[None]:
     """Turn what the operating system refuses into `CannotWrite`, with a hint; ``what`` was to be written."""
     try:
         yield
+    except ShmmapError:
+        raise  # also one that is an OSError: no answer of the daemon is nothing about a file
     except OSError as error:
         raise CannotWrite(
             f"cannot write {error.filename or what}: {error.strerror or error}",

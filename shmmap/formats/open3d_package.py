@@ -4,11 +4,17 @@
 from __future__ import annotations
 
 import platform
-from typing import Any
+from typing import Any, Final
 
 from shmmap.errors import PackageMissing, ShmmapError
 
-__all__ = ["load_open3d"]
+__all__ = ["SYSTEM_PACKAGES", "load_open3d"]
+
+SYSTEM_PACKAGES: Final = (
+    "libegl1", "libgl1", "libx11-6", "libusb-1.0-0",
+    *(() if platform.machine() == "x86_64" else ("libgfortran5",)),  # its build for others links to it
+)  # fmt: skip
+"""Of Debian and Ubuntu, which Open3D needs where there is no desktop."""
 
 
 def load_open3d(purpose: str, *, instead: str = "") -> Any:
@@ -42,6 +48,6 @@ def load_open3d(purpose: str, *, instead: str = "") -> Any:
     except ImportError as error:
         raise ShmmapError(
             f"{purpose} needs the Python package Open3D, which cannot be loaded: {error}",
-            hint="it needs the system packages libegl1 libgl1 libx11-6 libusb-1.0-0",
+            hint=f"it needs the system packages {' '.join(SYSTEM_PACKAGES)}",
         ) from error
     return open3d

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 
-from shmmap.kernel_cache import compiled_mark
+from shmmap.kernel_cache import all_kept, compiled_mark
 
 __all__ = ["compile_kernels"]
 
@@ -24,12 +25,15 @@ def compile_kernels(*, wait: bool = True) -> None:
         There is not enough memory for the compiler.
     """
     mark = compiled_mark()
-    if mark is None or mark.exists():
+    if mark is None or mark.is_file():
         return
-    with mark.with_suffix(".lock").open("w") as lock:
+    with contextlib.ExitStack() as stack:
         try:
+            lock = stack.enter_context(mark.with_suffix(".lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
+        except (
+            OSError
+        ):  # another process is at it, or nothing can be kept: whoever needs a kernel compiles it
             return
         from shmmap.layers import (
             height_kernels,
@@ -38,4 +42,6 @@ def compile_kernels(*, wait: bool = True) -> None:
         )  # compiled as they are imported
 
         del height_kernels, lattice_kernels, ndt_kernels
-        mark.touch()
+        if all_kept():
+            with contextlib.suppress(OSError):
+                mark.touch()

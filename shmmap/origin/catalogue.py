@@ -13,6 +13,7 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.cell_names import CellNames
+from shmmap.origin.map_frame import UNKNOWN_FRAME, MapFrame
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
@@ -90,6 +91,8 @@ class Catalogue:
         self._fixed_digest = fixed_digest
         self._map_version: int | None = None
         self.problems = tuple(problems)
+        self.frame: MapFrame = UNKNOWN_FRAME
+        """Where the map frame lies in the world, see `MapFrame`; whoever reads the map sets it."""
 
     def _refuse_bad(self, boxes: NDArray[np.float64]) -> None:
         bad = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)

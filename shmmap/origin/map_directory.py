@@ -18,6 +18,7 @@ from shmmap.origin.catalogue_bytes import Source
 from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
+from shmmap.origin.map_frame import read_map_frame
 from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
 from shmmap.origin.metadata_entries import MapMetadata, list_some
 from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES, TOO_LARGE, metadata_bytes, parse_metadata
@@ -107,7 +108,13 @@ class MapDirectory:
         MapDataError
             The metadata is wrong, fits none of the files, or (strict) lacks some of them.
         """
-        key = self._key(find_layout(self.path, self.metadata, self.pcd_paths))
+        layout = find_layout(self.path, self.metadata, self.pcd_paths)
+        catalogue = self._catalogue(self._key(layout), fresh, before)
+        if layout.metadata is not None:
+            catalogue.frame = read_map_frame(os.path.dirname(layout.metadata))
+        return catalogue
+
+    def _catalogue(self, key: str, fresh: bool, before: Tables | None) -> Catalogue:
         sidecar = sidecar_file(self.cache_dir, key)
         if not fresh and (cached := load_sidecar(sidecar, key)) is not None:
             return cached

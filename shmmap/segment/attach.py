@@ -16,9 +16,10 @@ import ctypes
 import os
 import stat
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from operator import attrgetter
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -30,16 +31,16 @@ from shmmap.optional_packages import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import read_columns, unpack_header
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
+from shmmap.segment.names import retired_name
 from shmmap.segment.owned import Owned
 from shmmap.segment.pins import lock_slot
+from shmmap.segment.process_limits import no_files_left, no_memory_left
 from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["AttachedSegment", "OnUnmap", "attach", "map_file"]
-
-OnUnmap = Callable[[Owned], object]
+__all__ = ["AttachedSegment", "attach", "attach_writable", "map_file"]
 
 LEASE_S: Final = 0.2
 """How long a lease may keep an open waiting; the daemon holds one for microseconds."""
@@ -60,21 +61,38 @@ _munmap: Final = _libc.munmap
 _munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
 
 _PROT_READ: Final = 1
+_PROT_WRITE: Final = 2
 _MAP_SHARED: Final = 1
+_MAP_PRIVATE: Final = 2
+_MAP_NORESERVE: Final = 0x4000
 _MAP_POPULATE: Final = 0x8000
 _MAP_FAILED: Final = ctypes.c_void_p(-1).value
 
 
-def map_file(fd: int, nbytes: int, *, populate: bool = False) -> Owned:
+def map_file(fd: int, nbytes: int, *, populate: bool = False, private: bool = False) -> Owned:
     """Map a file's first bytes; they are unmapped when the result ends, whose value is their address.
+
+    Parameters
+    ----------
+    fd, nbytes
+        The file, open for reading, and how much of it.
+    populate
+        Let the kernel map every page now.
+    private
+        Readable and writable: the kernel copies a page when it is first written, and nobody else sees that.
 
     Raises
     ------
     SegmentError
         The kernel refuses.
     """
-    flags = _MAP_SHARED | (_MAP_POPULATE if populate else 0)
-    given = map(_mmap, (None,), (nbytes,), (_PROT_READ,), (flags,), (fd,), (0,))
+    if private:
+        protection, flags = _PROT_READ | _PROT_WRITE, _MAP_PRIVATE | _MAP_NORESERVE
+    else:
+        protection, flags = _PROT_READ, _MAP_SHARED
+    if populate:
+        flags |= _MAP_POPULATE
+    given = map(_mmap, (None,), (nbytes,), (protection,), (flags,), (fd,), (0,))
     memory = Owned(zip(given, (nbytes,), strict=True), _munmap)
     if memory.value == _MAP_FAILED or memory.value is None:
         number = ctypes.get_errno()
@@ -87,29 +105,53 @@ def map_file(fd: int, nbytes: int, *, populate: bool = False) -> Owned:
 
 
 class _Mapping:
-    """Has mapped memory as long as any array over it lives: the root of the base chain of all of them."""
+    """Has mapped memory as long as any array over it lives: the root of the base chain of all of them.
 
-    __slots__ = ("__array_interface__", "_memory", "_on_unmap")
+    The last view is dropped in any thread and in the middle of anything, so what happens then is made of
+    built-in functions alone: no signal handler runs in it, whose exception Python would have to ignore.
+    """
 
-    def __init__(self, memory: Owned, nbytes: int, on_unmap: OnUnmap | None) -> None:
-        self._memory = memory
-        self._on_unmap = on_unmap
+    __slots__ = ("__array_interface__", "__del__", "_beside")
+
+    __del__: Callable[[], object]
+
+    def __init__(
+        self,
+        memory: Owned,
+        nbytes: int,
+        sinks: Sequence[SimpleQueue[Owned | None]],
+        beside: NDArray[np.uint8] | None,
+    ) -> None:
+        # a private mapping keeps the first one, by which the daemon knows who uses the segment
+        self._beside = beside
         # True: read-only; numpy then refuses to make any view of it writeable
         self.__array_interface__ = {
-            "data": (memory.value, True),
+            "data": (memory.value, beside is None),
             "shape": (nbytes,),
             "typestr": "|u1",
             "version": 3,
         }
+        # into the first of the queues that there are then; where there is none, nobody has it any more
+        self.__del__ = partial(any, map(SimpleQueue.put, sinks, (memory,)))
 
-    def __del__(self) -> None:
-        on_unmap = getattr(self, "_on_unmap", None)
-        if on_unmap is not None:
-            on_unmap(self._memory)
+
+def _bytes_of(
+    memory: Owned,
+    offset: int,
+    end: int,
+    *,
+    sinks: Sequence[SimpleQueue[Owned | None]] = (),
+    beside: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """Return mapped memory as an array that keeps it mapped."""
+    mapping = _Mapping(memory, end, sinks, beside)
+    raw: NDArray[np.uint8] = np.asarray(mapping)
+    del mapping.__array_interface__  # it has done its work, and windows have hundreds of mappings
+    return raw[offset:] if offset else raw
 
 
 class AttachedSegment:
-    """A verified, read-only view of one segment.
+    """A verified view of one segment, read-only as a rule.
 
     Attributes
     ----------
@@ -135,7 +177,7 @@ class AttachedSegment:
         return header
 
     def column(self, index: int) -> NDArray[np.generic]:
-        """Return column number ``index`` as a read-only, zero-copy array."""
+        """Return column number ``index`` as a zero-copy array."""
         _name, dtype, shape, offset, _nbytes, _unit, _checksum = self.columns[index]
         view: NDArray[np.generic] = np.ndarray(shape, dtype, self.raw, offset)
         return view
@@ -144,6 +186,19 @@ class AttachedSegment:
     def published(self) -> PublishBlock | None:
         """The publish block; None for bytes that no daemon published."""
         return unpack_publish_block(self.raw.data, self.header.header_bytes)
+
+    def copy(self) -> AttachedSegment:
+        """Return the same in memory of this process alone, which may be written.
+
+        Raises
+        ------
+        LimitReached
+            There is not so much memory.
+        """
+        try:
+            return AttachedSegment(self.columns, self.raw.copy())
+        except MemoryError:
+            raise no_memory_left(len(self.raw)) from None
 
     def verify(self) -> None:
         """Check every column against its checksum (about 10 ms per 100 MB).
@@ -203,7 +258,7 @@ def attach(
     slot: int | None = None,
     owner: int | None = None,
     populate: bool = False,
-    on_unmap: OnUnmap | None = None,
+    sinks: Sequence[SimpleQueue[Owned | None]] = (),
     on_mapped: Callable[[Owned], object] | None = None,
 ) -> AttachedSegment:
     """Map a segment read-only and verify its header.
@@ -223,9 +278,9 @@ def attach(
         gave up may be anybody's by now.
     populate
         Let the kernel map every page now (``MAP_POPULATE``) instead of at first touch.
-    on_unmap
-        Is given the memory when the last array over it is gone; it is unmapped when nobody has it any
-        more, on the spot as a rule.
+    sinks
+        The first of these queues gets the memory when the last array over it is gone, to unmap it in a
+        thread; they may change at any time.  Without any it is unmapped on the spot.
     on_mapped
         Is given the memory as soon as it is mapped; not to be kept.
 
@@ -237,25 +292,27 @@ def attach(
         Its bytes are not a segment of a layout this program reads.
     SegmentError
         It may not be opened by this user, or cannot be mapped.
+    LimitReached
+        This process may open no more files.
     """
     try:
         try:
             file = _open(name, shm_dir)
         except BlockingIOError:
             file = _open_soon(name, shm_dir)
-    except (FileNotFoundError, posix_ipc.ExistentialError) as error:
-        raise StaleHandle(f"segment {name} is gone", hint="ask the daemon again") from error
-    except (PermissionError, posix_ipc.PermissionsError) as error:
+    except (FileNotFoundError, posix_ipc.ExistentialError):
+        raise StaleHandle(f"segment {name} is gone", hint="ask the daemon again") from None
+    except (PermissionError, posix_ipc.PermissionsError):
         raise SegmentError(
             f"segment {name}: this user may not read it",
             hint="join the group that the daemon was started with (--group)",
-        ) from error
-    except BlockingIOError as error:
+        ) from None
+    except BlockingIOError:
         raise StaleHandle(
             f"segment {name} cannot be opened: its lease is not given back", hint="ask the daemon again"
-        ) from error
-    except OSError as error:
-        raise SegmentError(f"segment {name}: {error.strerror}") from error
+        ) from None
+    except (OSError, posix_ipc.Error) as error:  # posix_ipc raises some without a number
+        raise no_files_left(error) or SegmentError(f"segment {name}: {_reason(error)}") from None
     fd = file.value
     try:
         step("client.open")
@@ -285,12 +342,57 @@ def attach(
             on_mapped(memory)
         step("client.map")
     except OSError as error:
-        raise SegmentError(f"segment {name} cannot be read: {error.strerror}") from error
+        raise SegmentError(f"segment {name} cannot be read: {_reason(error)}") from None
     finally:
         file.give_back()
-    mapping = _Mapping(memory, end, on_unmap)
-    raw: NDArray[np.uint8] = np.asarray(mapping)
-    del mapping.__array_interface__  # it has done its work, and windows have hundreds of mappings
-    if offset:
-        raw = raw[offset:]
-    return AttachedSegment(columns, raw)
+    return AttachedSegment(columns, _bytes_of(memory, offset, end, sinks=sinks))
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
+
+
+def attach_writable(
+    segment: AttachedSegment, name: str, *, offset: int = 0, shm_dir: str = DEFAULT_SHM_DIR
+) -> AttachedSegment:
+    """Return a view of a segment that may be written, for libraries that know no read-only memory.
+
+    It is a second mapping, private and copy-on-write: it is read without a copy, a page that is written
+    becomes the process's own, and neither the segment nor any other view changes.  Where the kernel does not
+    allow that (the limit of data, ``ulimit -d``) or the segment has no name any more, it is a copy.
+
+    Parameters
+    ----------
+    segment
+        As it is attached; stays so as long as the result's arrays.
+    name, offset, shm_dir
+        As it was attached by, see `attach`; a retired segment is found, too.
+
+    Raises
+    ------
+    LimitReached
+        A copy is needed, and there is not so much memory.
+    """
+    for path in (name, retired_name(name)):
+        try:
+            file = _open_soon(path, shm_dir)
+        except (OSError, posix_ipc.Error):
+            continue
+        try:
+            with contextlib.suppress(SegmentError, OSError):
+                raw = _same_bytes(segment, file.value, offset)
+                if raw is not None:
+                    return AttachedSegment(segment.columns, raw)
+        finally:
+            file.give_back()
+    return segment.copy()
+
+
+def _same_bytes(segment: AttachedSegment, fd: int, offset: int) -> NDArray[np.uint8] | None:
+    """Map a file privately; None where it is not the segment's own."""
+    first = segment.raw
+    end = offset + len(first)
+    head = min(len(first), PAGE_BYTES)
+    if os.fstat(fd).st_size < end or os.pread(fd, head, offset) != first[:head].tobytes():
+        return None
+    return _bytes_of(map_file(fd, end, private=True), offset, end, beside=first)

@@ -6,24 +6,20 @@ Units are replaced (an operator's changes belong in drop-ins), a configuration t
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from shmmap.errors import CannotWrite, MapMissing
+from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import DROP_IN, MOUNT
-from shmmap.service.program import (
-    bridge_command,
-    check_readable,
-    daemon_command,
-    hidden_directories,
-    is_hidden,
-    quoted,
-)
+from shmmap.service.program import Program, command_line, is_hidden, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
 
 __all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_text", "write"]
@@ -51,20 +47,32 @@ class PlannedFile:
 
     @property
     def action(self) -> Literal["new", "changed", "same", "kept"]:
-        """What writing it means for the file that is there."""
-        try:
-            old = self.path.read_text(encoding="utf-8")
-        except (FileNotFoundError, NotADirectoryError):
+        """What writing it means for what is there."""
+        if not os.path.lexists(self.path):
             return "new"
         if self.keep:
             return "kept"
-        return "same" if old == self.text else "changed"
+        return "same" if self._is_there() else "changed"
+
+    def _is_there(self) -> bool:
+        """Whether just this file is there; a link, a pipe or a device is not."""
+        wanted = self.text.encode()
+        fd = -1
+        try:
+            fd = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+            return stat.S_ISREG(os.fstat(fd).st_mode) and os.pread(fd, len(wanted) + 1, 0) == wanted
+        except OSError:
+            return False
+        finally:
+            if fd >= 0:
+                os.close(fd)
 
 
-def unit_text(name: str, root: str = "/") -> str:
-    """Return a shipped unit with the program of this installation in it, as ``root`` will see it."""
-    text = shipped_text(name).replace(SHIPPED_PROGRAM, daemon_command(root))
-    return text.replace(SHIPPED_BRIDGE, bridge_command(root))
+def unit_text(name: str, program: Program | None = None) -> str:
+    """Return a shipped unit that starts a program, by default this installation."""
+    program = program or Program.this_one()
+    text = shipped_text(name).replace(SHIPPED_PROGRAM, command_line(program.daemon))
+    return text.replace(SHIPPED_BRIDGE, command_line(program.bridge))
 
 
 def configuration(map_path: str = "", *, group: bool = True) -> str:
@@ -76,10 +84,18 @@ def configuration(map_path: str = "", *, group: bool = True) -> str:
     return text if group else re.sub(r"^group = .*$", '#group = ""', text, flags=re.M)
 
 
-def _map_path(given: str) -> str:
-    path = os.path.abspath(given) if given else ""
-    if path and not os.path.exists(path):
-        raise MapMissing(f"there is no map at {path}")
+def _map_path(given: str, file_system: FileSystem) -> str:
+    """Return the map's path as the service will have it."""
+    if not given:
+        return ""
+    path = file_system.inside(given)
+    if file_system.status(path) is None:
+        raise MapMissing(
+            f"there is no map at {file_system.outside(path)}",
+            hint=""
+            if file_system.is_this_machine
+            else f"the service will see what lies below {file_system.root} alone: put the map there",
+        )
     return path
 
 
@@ -100,9 +116,11 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
     Parameters
     ----------
     map_path
-        The map of the plain service; empty: what the example says.
+        The map of the plain service; empty: what the example says.  Of an image: as it will be named there,
+        or as it is here, below ``root``.
     root
-        Where the machine's file system begins: another directory than ``/`` for a package or an image.
+        Where the machine's file system begins: another directory than ``/`` for an image, which has the
+        program in it.
     huge_pages
         Keep the segments on a tmpfs of their own, with huge pages; kept where an earlier installation did.
 
@@ -110,39 +128,48 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
     ------
     MapMissing
         There is nothing at ``map_path``.
+    BadRequest
+        ``root`` is no directory.
     ConfigError
-        The service's account could not read this program.
+        The image has no program, or the service's account could not read it.
     """
-    map_path = _map_path(map_path)
-    check_readable()
-    etc = Path(root) / "etc"
-    units = etc / "systemd" / "system"
+    file_system = FileSystem(root)
+    map_path = _map_path(map_path, file_system)
+    program = Program.this_one() if file_system.is_this_machine else Program.in_image(file_system)
+    program.check_readable()
+
+    def place(*names: str, keep: bool = False) -> Path:
+        path = "/".join(("/etc", *names))
+        return file_system.outside(file_system.resolve(path) if keep else path)
+
+    units = ("systemd", "system")
     planned = [
-        PlannedFile(units / Path(name).name, unit_text(name, root))
+        PlannedFile(place(*units, Path(name).name), unit_text(name, program))
         for name in shipped_names()
         if name.startswith("system/") and not name.endswith(".mount")
     ]
     why = "This Python lies where ProtectHome= or PrivateTmp= would hide it."
     for service in ("shmmapd.service", "shmmapd@.service", "shmmap-ros-bridge.service"):
-        planned += _drop_in(units / f"{service}.d" / "10-program.conf", hidden_directories(root=root), why)
+        planned += _drop_in(place(*units, f"{service}.d", "10-program.conf"), program.hidden_directories, why)
     if map_path:
         shown = [map_path] if is_hidden(map_path) else []
         why = "The map lies where ProtectHome= or PrivateTmp= would hide it."
-        planned += _drop_in(units / "shmmapd.service.d" / "20-map.conf", shown, why)
-    mount = units / Path(MOUNT).name
+        planned += _drop_in(place(*units, "shmmapd.service.d", "20-map.conf"), shown, why)
+    mount = place(*units, Path(MOUNT).name)
     if huge_pages or mount.exists():
         planned.append(PlannedFile(mount, shipped_text(MOUNT)))
         for service in ("shmmapd.service", "shmmapd@.service"):
-            path = units / f"{service}.d" / "30-huge-pages.conf"
+            path = place(*units, f"{service}.d", "30-huge-pages.conf")
             planned.append(PlannedFile(path, _GENERATED + shipped_text(DROP_IN)))
     for name in ("sysusers.d/shmmap.conf", "tmpfiles.d/shmmap.conf"):
-        planned.append(PlannedFile(etc / name, shipped_text(name)))
-    return [*planned, PlannedFile(etc / "shmmap" / "shmmap.toml", configuration(map_path), keep=True)]
+        planned.append(PlannedFile(place(name), shipped_text(name)))
+    config = place("shmmap", "shmmap.toml", keep=True)
+    return [*planned, PlannedFile(config, configuration(map_path), keep=True)]
 
 
 def plan_user(map_path: str = "", config_home: str = "") -> list[PlannedFile]:
     """Return what a user's own service needs; parameters and errors as for `plan_system`."""
-    map_path = _map_path(map_path)
+    map_path = _map_path(map_path, FileSystem())
     home = Path(config_home or os.environ.get("XDG_CONFIG_HOME", "") or Path.home() / ".config")
     return [
         *(
@@ -168,10 +195,14 @@ def write(planned: Sequence[PlannedFile]) -> None:
         interim = one.path.with_name(f".{one.path.name}.new")
         try:
             one.path.parent.mkdir(parents=True, exist_ok=True)
-            interim.write_text(one.text, encoding="utf-8")
+            interim.unlink(missing_ok=True)
+            with interim.open("x", encoding="utf-8") as file:
+                file.write(one.text)
             interim.chmod(0o644)
             interim.replace(one.path)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                interim.unlink()
             denied = isinstance(error, PermissionError)
             raise CannotWrite(
                 f"cannot write {one.path}: {error.strerror}",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a unit starts this installation of the daemon, and whether the service's account can read it.
+"""How a unit starts the daemon: by this installation, or by the one that an image has.
 
 The units hide home directories and /tmp from the daemon.  An installation that lies there (a virtual
 environment in a home, a Python of pyenv or uv) is made visible again, read-only and nothing else with
@@ -14,17 +14,17 @@ import re
 import stat
 import sys
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.errors import ConfigError
+from shmmap.service.file_system import FileSystem
 
 __all__ = [
     "INSTALL_FOR_SERVICE",
-    "bridge_command",
-    "check_readable",
-    "daemon_command",
-    "hidden_directories",
+    "INSTALL_IN_IMAGE",
+    "Program",
+    "command_line",
     "is_hidden",
     "outermost",
     "quoted",
@@ -32,33 +32,146 @@ __all__ = [
 
 INSTALL_FOR_SERVICE: Final = "python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install ."
 """As root, in a checkout: the program where the units of a machine can start it."""
+INSTALL_IN_IMAGE: Final = (
+    "cp -r . IMAGE/usr/src/shmmap && chroot IMAGE sh -c"
+    " 'python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install /usr/src/shmmap'"
+)
+"""The same in an image that has Python."""
 
 _HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108  ProtectHome=, PrivateTmp=
+_IN_IMAGES: Final = ("/opt/shmmap/bin", "/usr/local/bin", "/usr/bin")
 
 
-def daemon_command(root: str = "/") -> str:
-    """Return what starts the daemon of this installation, for ``ExecStart=``.
+@dataclass(frozen=True)
+class Program:
+    """An installation of shmmap as the service's machine will see it.
 
-    Where the installation lies below ``root``, an image's file system, as the image will see it.
+    Attributes
+    ----------
+    daemon, bridge
+        What starts the daemon, and the bridge to ROS.
+    places
+        Directories that the service has to see.
+    read
+        Directories and files that the service's account has to be able to read.
     """
-    return _command("shmmapd", "shmmap.daemon", root)
+
+    daemon: tuple[str, ...]
+    bridge: tuple[str, ...]
+    places: tuple[str, ...]
+    read: tuple[str, ...]
+    file_system: FileSystem = field(default_factory=FileSystem)
+
+    @classmethod
+    def this_one(cls) -> Program:
+        """Return the installation that runs."""
+
+        def command(name: str, module: str) -> tuple[str, ...]:
+            script = os.path.join(sys.prefix, "bin", name)
+            return (script,) if os.access(script, os.X_OK) else (sys.executable, "-m", module)
+
+        python = os.path.realpath(sys.executable)
+        package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+        needed = (sys.prefix, sys.base_prefix, os.path.dirname(os.path.dirname(python)))
+        return cls(
+            command("shmmapd", "shmmap.daemon"),
+            command("shmmap-ros-bridge", "shmmap_clients.ros_bridge"),
+            tuple(os.path.abspath(place) for place in (*needed, *sys.path) if place and os.path.isdir(place)),
+            (*needed, python, package, f"{package}/__init__.py"),
+        )
+
+    @classmethod
+    def in_image(cls, file_system: FileSystem) -> Program:
+        """Return the installation that an image has: this one, if it lies there, else that in /opt/shmmap.
+
+        Raises
+        ------
+        ConfigError
+            It has none, or one that would not start there.
+        """
+        own = file_system.inside(os.path.join(sys.prefix, "bin"))
+        for folder in dict.fromkeys((own, *_IN_IMAGES)):
+            script = f"{folder}/shmmapd"
+            if file_system.is_executable(script):
+                break
+        else:
+            raise ConfigError(
+                f"no shmmap is installed below {file_system.root}, and the units could start none",
+                hint=f"as root, in shmmap's checkout: {INSTALL_IN_IMAGE}",
+            )
+        python = _interpreter(file_system, script)
+        bridge = f"{folder}/shmmap-ros-bridge"
+        if file_system.is_executable(bridge):
+            _interpreter(file_system, bridge)
+            start_bridge: tuple[str, ...] = (bridge,)
+        else:
+            start_bridge = (python, "-m", "shmmap_clients.ros_bridge")
+        real = file_system.resolve(python)
+        places = (os.path.dirname(folder), os.path.dirname(os.path.dirname(real)))
+        return cls((script,), start_bridge, places, (*places, script, real), file_system)
+
+    @property
+    def hidden_directories(self) -> list[str]:
+        """Directories that it needs and that the units would hide."""
+        return outermost(place for place in self.places if is_hidden(place))
+
+    def check_readable(self) -> None:
+        """Refuse what an account without rights of its own, the service's, cannot read.
+
+        Raises
+        ------
+        ConfigError
+            It names what is closed, and how to install the program for the service.
+        """
+        for path in self.read:
+            if (closed := self._closed_to_others(path)) is not None:
+                install = INSTALL_FOR_SERVICE if self.file_system.is_this_machine else INSTALL_IN_IMAGE
+                raise ConfigError(
+                    f"the service could not run this program: only its owner may read {closed}",
+                    hint=f"install it for the service, as root in shmmap's checkout: {install}",
+                )
+
+    def _closed_to_others(self, path: str) -> str | None:
+        """First directory on the way to ``path``, or itself, that others may not enter or read; else None.
+
+        What lies above a directory that the units show does not matter: it is shown whatever that allows.
+        """
+        shown = self.hidden_directories
+        start = next((place for place in shown if path == place or path.startswith(place + "/")), "/")
+        steps = [path]
+        while steps[-1] not in (start, "/"):
+            steps.append(os.path.dirname(steps[-1]))
+        for place in reversed(steps):
+            status = self.file_system.status(place)
+            if status is None:
+                return place
+            needed = stat.S_IXOTH if stat.S_ISDIR(status.st_mode) else 0
+            needed |= stat.S_IROTH if place == path else 0
+            if status.st_mode & needed != needed:
+                return place
+        return None
 
 
-def bridge_command(root: str = "/") -> str:
-    """Return what starts the bridge to ROS of this installation, as `daemon_command` does."""
-    return _command("shmmap-ros-bridge", "shmmap_clients.ros_bridge", root)
+def _interpreter(file_system: FileSystem, script: str) -> str:
+    """Return the interpreter of a script in an image, which has to be there.
 
-
-def _command(name: str, module: str, root: str) -> str:
-    script = Path(sys.prefix, "bin", name)
-    command = [str(script)] if os.access(script, os.X_OK) else [sys.executable, "-m", module]
-    return " ".join(quoted(word) for word in (_seen_from(root, command[0]), *command[1:]))
-
-
-def _seen_from(root: str, path: str) -> str:
-    """Return ``path`` as it is called where ``root`` is ``/``; itself where it lies elsewhere."""
-    below = os.path.abspath(root).rstrip("/") + "/"
-    return "/" + path[len(below) :] if path.startswith(below) else path
+    Raises
+    ------
+    ConfigError
+        It is not: the script was made outside of the image, or Python is missing there.
+    """
+    with open(file_system.root + file_system.resolve(script), "rb") as file:
+        first = file.readline(4096)
+    words = os.fsdecode(first[2:]).split() if first.startswith(b"#!") else []
+    if not words:  # a program
+        return script
+    if not file_system.is_executable(words[0]):
+        raise ConfigError(
+            f"{script} would not start in the image: it is run by {words[0]}, which is not below"
+            f" {file_system.root}",
+            hint=f"install it from within, as root in shmmap's checkout: {INSTALL_IN_IMAGE}",
+        )
+    return words[0]
 
 
 def quoted(word: str) -> str:
@@ -81,64 +194,6 @@ def outermost(paths: Iterable[str]) -> list[str]:
     return kept
 
 
-def _places(search_path: Sequence[str]) -> list[str]:
-    """Directories that this Python needs, and those it is told to look for modules in."""
-    interpreter = os.path.dirname(os.path.dirname(os.path.realpath(sys.executable)))
-    places = [sys.prefix, sys.base_prefix, interpreter, *search_path]
-    return [os.path.abspath(place) for place in places if place and os.path.isdir(place)]
-
-
-def hidden_directories(search_path: Sequence[str] | None = None, *, root: str = "/") -> list[str]:
-    """Return the directories that this Python needs and that the units would hide.
-
-    Parameters
-    ----------
-    search_path
-        Where modules are found; `sys.path` by default.
-    root
-        An image's file system: what lies below it is where the image will see it.
-    """
-    return outermost(
-        place
-        for place in (
-            _seen_from(root, one) for one in _places(sys.path if search_path is None else search_path)
-        )
-        if is_hidden(place)
-    )
-
-
-def check_readable() -> None:
-    """Refuse an installation that an account without rights of its own, the service's, cannot read.
-
-    Raises
-    ------
-    ConfigError
-        It names what is closed, and how to install the program for the service.
-    """
-    package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    wanted = [*_places(()), os.path.realpath(sys.executable), package, f"{package}/__init__.py"]
-    shown = hidden_directories()
-    for path in wanted:
-        if (closed := _closed_to_others(path, shown)) is not None:
-            raise ConfigError(
-                f"the service could not run this program: only its owner may read {closed}",
-                hint=f"install it for the service, as root in shmmap's checkout: {INSTALL_FOR_SERVICE}",
-            )
-
-
-def _closed_to_others(path: str, shown: Sequence[str]) -> str | None:
-    """First directory on the way to ``path``, or itself, that others may not enter or read; else None.
-
-    What lies above a directory that the units show does not matter: it is shown whatever that allows.
-    """
-    start = next((place for place in shown if path == place or path.startswith(place + "/")), "/")
-    steps = [path]
-    while steps[-1] not in (start, "/"):
-        steps.append(os.path.dirname(steps[-1]))
-    for place in reversed(steps):
-        status = os.stat(place)
-        needed = stat.S_IXOTH if stat.S_ISDIR(status.st_mode) else 0
-        needed |= stat.S_IROTH if place == path else 0
-        if status.st_mode & needed != needed:
-            return place
-    return None
+def command_line(words: Sequence[str]) -> str:
+    """Return words as ``ExecStart=`` has them."""
+    return " ".join(quoted(word) for word in words)

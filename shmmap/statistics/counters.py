@@ -54,6 +54,7 @@ COUNTERS: Final = (
     Counter("bytes_received", "counter", "bytes", "Request bytes received"),
     Counter("bytes_sent", "counter", "bytes", "Reply bytes sent"),
     Counter("handles_sent", "counter", "", "Segment handles sent in replies"),
+    Counter("starting", "gauge", "", "1 while the daemon gets ready and does not listen yet"),
     Counter("sessions", "gauge", "", "Client sessions that are alive"),
     Counter("sessions_opened", "counter", "", "Client sessions opened"),
     Counter("waiting_requests", "gauge", "", "Requests that wait for cells to be loaded"),

@@ -21,7 +21,7 @@ __all__ = [
     "start_time_ticks",
 ]
 
-DaemonState: TypeAlias = Literal["healthy", "stopped", "hung", "dead"]
+DaemonState: TypeAlias = Literal["healthy", "starting", "stopped", "hung", "dead"]
 
 HUNG_AFTER_S: Final = 5.0
 """A running daemon without a beat for this long is called hung."""

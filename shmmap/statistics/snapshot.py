@@ -27,9 +27,9 @@ class Snapshot:
     Attributes
     ----------
     state : str
-        ``healthy``; ``stopped`` (SIGSTOP, a debugger); ``hung`` (runs, but has not beaten for 5 s);
-        ``dead`` (the process is gone and left its segment); ``absent`` (no segment: never started,
-        or stopped cleanly).  All but ``absent`` come with an identity.
+        ``healthy``; ``starting`` (it beats, and does not listen yet); ``stopped`` (SIGSTOP, a debugger);
+        ``hung`` (runs, but has not beaten for 5 s); ``dead`` (the process is gone and left its segment);
+        ``absent`` (no segment: never started, or stopped cleanly).  All but ``absent`` come with an identity.
     identity : DaemonIdentity or None
         Who wrote the statistics; None when absent.
     beat_age_s : float
@@ -55,7 +55,6 @@ class Snapshot:
         clients: bytes = b"",
         live: bytes = b"",
     ) -> None:
-        self.state: DaemonState | Literal["absent"] = state
         self.identity = identity
         self.beat_age_s = beat_age_s
         self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
@@ -66,6 +65,9 @@ class Snapshot:
         self._rows = rows
         self._clients = clients
         self._live = live
+        self.state: DaemonState | Literal["absent"] = state
+        if state == "healthy" and self.counters.get("starting"):
+            self.state = "starting"
 
     @cached_property
     def counters(self) -> dict[str, int]:

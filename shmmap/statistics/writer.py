@@ -66,6 +66,8 @@ class StatisticsWriter:
         Who writes.
     mode, gid
         Access of the segment; ``gid`` -1 leaves the group alone.
+    starting
+        The daemon does not listen yet: the gauge of that name is 1 until it is set to 0.
 
     Attributes
     ----------
@@ -91,8 +93,10 @@ class StatisticsWriter:
         *,
         mode: int = 0o400,
         gid: int = -1,
+        starting: bool = False,
     ) -> None:
         self.values: dict[str, int] = dict.fromkeys(COUNTER_NAMES, 0)
+        self.values["starting"] = int(starting)
         self.reserve: Callable[[int], bool] = _always
         self.name = statistics_name(instance)
         self._directory = directory

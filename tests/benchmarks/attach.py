@@ -18,7 +18,7 @@ import numpy as np
 import posix_ipc
 
 from shmmap.client.attaching import Attacher
-from shmmap.client.cell import Cell
+from shmmap.client.cell import Access, Cell
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
 from shmmap.segment.publish_block import PublishBlock
@@ -41,14 +41,12 @@ def publish(directory: ShmDirectory, number: int, points: int) -> tuple[str, Han
 
 def time_cells(segments: list[tuple[str, Handle]]) -> list[int]:
     """Attach every segment once; nanoseconds each."""
-    attacher = Attacher()
+    attacher, access = Attacher(), Access(DEFAULT_SHM_DIR, 0x1234_5678_9ABC, None)
     kept: list[Cell] = []
     took = []
     for name, handle in segments:
         began = time.perf_counter_ns()
-        cell = attacher.attach(
-            handle, handle.id, name, shm_dir=DEFAULT_SHM_DIR, slot=0x1234_5678_9ABC, populate=False
-        )
+        cell = attacher.attach(handle, handle.id, name, access)
         cell.xyz, cell["intensity"]
         took.append(time.perf_counter_ns() - began)
         kept.append(cell)

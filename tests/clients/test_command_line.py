@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
+import os
 import re
 import subprocess
 import sys
@@ -19,7 +21,7 @@ from shmmap_clients.ndt_scan_matcher.cli import main as ndt
 from shmmap_clients.pose_initializer.cli import main as pose_init
 from shmmap_clients.rolling_map.cli import main as rolling
 
-from shmmap import CannotWrite
+from shmmap import CannotWrite, read_cloud, write_pcd
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:
@@ -90,6 +92,109 @@ def test_a_scan_without_points_is_said_so(tmp_path: Path, capsys: pytest.Capture
         assert program([*words, "--allow-empty"]) == 0
 
 
+def test_no_returns_are_left_out_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-20, 20, (20_000, 2)), np.zeros(20_000)]).astype(np.float32)
+    seen = ground[:4000] - np.array([0, 0, 1.8], np.float32)
+    near = np.array([[0, 0, 0]] * 60 + [[0.1, -0.2, 0.3]] * 7 + [[np.nan, 1, 1]] * 3, np.float32)
+    new = np.array([[5, 5, 0.7]] * 11, np.float32)
+    scan = np.concatenate([near[:30], seen, near[30:], new])
+    np.savez(tmp_path / "map.npz", xyz=ground)
+    np.savez(tmp_path / "scan.npz", xyz=scan, ring=np.arange(len(scan), dtype=np.uint32))
+    np.column_stack([scan, np.arange(len(scan)) % 7]).astype("<f4").tofile(tmp_path / "scan.bin")
+    write_pcd(tmp_path / "scan.pcd", {"xyz": scan})
+    for suffix in ("npz", "bin", "pcd"):
+        words = ["apply", "--map", f"{tmp_path}/map.npz", "--scan", f"{tmp_path}/scan.{suffix}"]
+        words += ["--pose", "0,0,1.8,0,0,0", "--mode", "distance", "--backend", "numpy", "--json"]
+        assert compare([*words, "--out", f"{tmp_path}/out"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert {name: found[name] for name in ("points", "kept", "too_near", "not_finite")} == {
+            "points": 4011, "kept": 11, "too_near": 67, "not_finite": 3
+        }  # fmt: skip
+        index = read_cloud(tmp_path / "out" / "scan.pcd").columns["index"]
+        assert index.tolist() == [*range(len(scan) - 11, len(scan))], "rows of the file"
+        assert compare([*words, "--min-range", "0.3"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert (found["kept"], found["too_near"], found["not_finite"]) == (18, 60, 3)
+        assert compare([*words, "--min-range", "0"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert (found["kept"], found["too_near"], found["not_finite"]) == (78, 0, 3)
+        words = ["align", "--map", f"{tmp_path}/map.npz", "--scan", f"{tmp_path}/scan.{suffix}"]
+        ndt([*words, "--backend", "numpy", "--json", "--thin", "0"])
+        found = json.loads(capsys.readouterr().out)
+        assert (found["points"], found["too_near"], found["not_finite"]) == (4011, 67, 3)
+    words = ["apply", "--map", f"{tmp_path}/map.npz", "--scan", f"{tmp_path}/scan.pcd", "--backend", "numpy"]
+    assert compare(words) == 0
+    assert "left out: 67 points nearer than 0.5 m, 3 not finite" in capsys.readouterr().out
+
+
+def test_bin_columns_are_named_or_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(1, 20, (3000, 3))
+    np.column_stack([xyz, rng.uniform(0, 1, 3000)]).tofile(tmp_path / "doubles.bin")
+    words = ["apply", "--map", f"{tmp_path}/doubles.bin", "--scan", f"{tmp_path}/doubles.bin", "--json"]
+    words += ["--backend", "numpy", "--allow-empty"]
+    assert compare(words) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["points"] == 3000
+    assert "rows of 4 float64, x y z intensity, by the look of its numbers; --bin-columns" in told.err
+    assert compare([*words, "--bin-columns", "x:f8,y,z,_"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["points"] == 3000
+    assert "--bin-columns" not in told.err
+    assert compare([*words, "--bin-columns", "x,y,z,_"]) == 65
+    assert "doubles.bin: read as rows of 4 float32" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        compare([*words, "--bin-columns", "x,y"])
+    assert ended.value.code == 2
+    assert "x, y and z must be among them" in capsys.readouterr().err
+
+
+def test_a_pipe_among_scans_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(tmp_path / "scan_1.bin")
+    for suffix in ("bin", "npz", "pcd"):
+        pipe = tmp_path / f"pipe.{suffix}"
+        os.mkfifo(pipe)
+        assert ndt(["align", "--map", str(pipe), "--scan", str(pipe), "--backend", "numpy"]) == 65
+        assert f"pipe.{suffix}: " in capsys.readouterr().err
+
+
+def test_names_that_are_no_text_are_printed_escaped(tmp_path: Path) -> None:
+    """As arguments of a process: what is not UTF-8 comes as surrogates."""
+    odd = os.fsencode(tmp_path) + b"/scan_\xff.npz"
+    with open(odd, "wb") as file:
+        np.savez(file, xyz=np.random.default_rng(0).uniform(1, 9, (500, 3)))
+    missing = os.fsencode(tmp_path) + b"/none_\xff.npz"
+    for program, verb, option in (
+        ("ndt_scan_matcher", "align", b"--map"),
+        ("compare_map_filter", "apply", b"--map"),
+        ("ndt_scan_matcher", "follow", b"--truth"),
+        ("rolling_map", "run", b"--poses"),
+    ):
+        base = [sys.executable, "-m", f"shmmap_clients.{program}", verb]
+        scans: list[str | bytes] = ["--scan" if option == b"--map" else "--scans", odd]
+        if option != b"--map":
+            scans = ["--scans", os.fsencode(tmp_path)]
+        if program == "rolling_map":
+            scans += ["--live", "lidar"]
+        for value in (missing, b"\xfe"):
+            done = subprocess.run([*base, *scans, option, value], capture_output=True)
+            assert done.returncode in (65, 66), done.stderr
+            assert b"Traceback" not in done.stderr
+            assert b"\\udcf" in done.stderr
+    words = ["align", "--map", odd, "--scan", odd, "--backend", "numpy"]
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher", *words], capture_output=True
+    )
+    assert done.returncode in (0, 1), done.stderr
+    assert b"Traceback" not in done.stderr
+    words = ["apply", "--map", odd, "--scan", odd, "--backend", "numpy", "--allow-empty"]
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap_clients.compare_map_filter", *words], capture_output=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
 PROGRAMS = {
     "ndt_scan_matcher": (ndt, ["align"], ["follow"], ["devices"]),
     "compare_map_filter": (compare, ["apply"], ["follow"]),
@@ -143,7 +248,7 @@ def test_the_same_option_is_the_same_everywhere(
     assert with_daemon == 5
     # these differ in their defaults, or in what they are of
     own = {"--thin", "--height", "--update-distance", "--wait", "--out", "--mask", "--pose", "--picture"}
-    own |= {"--backend", "--threads"}
+    own |= {"--backend", "--threads", "--min-range"}
     assert {name: said for name, said in seen.items() if len(said) > 1 and name not in own} == {}
 
 

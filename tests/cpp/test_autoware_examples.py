@@ -93,3 +93,16 @@ def test_requesters_of_the_service(
     one = daemon(divided_map.root)
     lines = run(program, one.endpoint, 0, 0, 100, 6)
     assert lines == ["36 map 0 map "] * 6 + ["3"]
+    assert run(program, one.endpoint, 0, 0, -1, 1) == ["0 map 0 map ", "1"], "no area, nothing in it"
+    one.stop()
+    environment = {**os.environ, "SHMMAP_ENDPOINT": one.endpoint}
+    ended = subprocess.run(
+        [program, "0", "0", "100", "2", "6"], env=environment, check=True, capture_output=True, text=True
+    )
+    assert ended.stdout.splitlines() == ["none none "] * 2 + ["1"], "no daemon, no answer: never an empty one"
+    with subprocess.Popen(
+        [program, "0", "0", "100", "2"], env=environment, stdout=subprocess.PIPE, text=True
+    ) as waiting:
+        one.start()
+        assert waiting.communicate()[0].splitlines() == ["36 map 0 map "] * 2 + ["1"]
+        assert waiting.returncode == 0

@@ -28,6 +28,10 @@ _NODE = """
 #include "autoware_messages.hpp"
 #define RCLCPP_WARN(logger, ...) std::printf(__VA_ARGS__), (void)(logger)
 
+namespace rclcpp {{
+bool ok() {{ return true; }}
+}}
+
 struct MapUpdateModule {{
   using GetDifferentialPointCloudMap = plain::Service;
   using PcdLoaderFunction = std::function<std::shared_ptr<GetDifferentialPointCloudMap::Response>(

@@ -204,3 +204,15 @@ def test_by_another_compiler_and_standard(
         pytest.skip("clang++ is missing")
     program = compiled(tmp_path, compiler="clang++", standard="c++20")
     assert equal_bytes(program, daemon(divided_map.root).endpoint, QUICK_LAYERS) == 36 * 500
+
+
+def test_a_request_too_large_is_refused_before_it_is_sent(
+    daemon: DaemonFactory, cpp_program: Path, divided_map: DividedMap
+) -> None:
+    """A daemon would end the connection; what comes next is answered."""
+    one = daemon(divided_map.root)
+    with CppClient(cpp_program, one.endpoint) as client:
+        session = client.program.ask("area", "circle 0 0 1", "points", "5")
+        with pytest.raises(shmmap.BadRequest, match="4 MiB"):
+            client.selected([f"{number:060}" for number in range(80_000)])
+        assert client.program.ask("area", "circle 0 0 1", "points", "5") == session

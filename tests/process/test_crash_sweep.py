@@ -124,6 +124,7 @@ def live(client: shmmap.Client, made: DividedMap) -> None:
     assert_right(whole(client, 0, 0, 5), made, near)
 
 
+@pytest.mark.more_as_root
 @pytest.mark.parametrize("label", [*DAEMON_STEPS, *WORKER_STEPS])
 def test_daemon_and_worker(
     crashing: Callable[[str], DaemonProcess], divided_map: DividedMap, label: str

@@ -18,6 +18,8 @@ from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.patience import Patience
 
+pytestmark = pytest.mark.usefixtures("layer_kernels")
+
 PATIENCE_S = 60.0
 EAST = [(-160.0, 0.0), (160.0, 0.0)]
 Listen = Callable[[DaemonProcess], list[Any]]

@@ -16,7 +16,7 @@ DaemonFactory = Callable[..., DaemonProcess]
 
 def compiled(folder: Path) -> set[str]:
     """Files of compiled kernels."""
-    return {path.name for path in folder.rglob("*.nbc")}
+    return {path.name for path in folder.rglob("*.kernel")}
 
 
 def marks(folder: Path) -> list[Path]:

@@ -21,6 +21,8 @@ from tests.support.open3d_package import open3d_or_skip
 from tests.support.raw_client import DaemonError, RawCells, RawClient, RawHandle, circle, pack_versions
 from tests.support.segment_reader import read_segment
 
+pytestmark = pytest.mark.usefixtures("layer_kernels")
+
 Connect = Callable[..., RawClient]
 NDT = "ndt(leaf=2.0,min_points=3)"
 

@@ -22,6 +22,7 @@ from shmmap.client.live.live_map import Sphere
 from shmmap.errors import BadRequest, ConfigError, LiveInterrupted
 from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
+from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.live_daemon import LiveDaemon, worker_of
@@ -330,3 +331,30 @@ def shmmap_command(*words: str) -> str:
     """What a command prints, which is to succeed."""
     command = [sys.executable, "-m", "shmmap.cli", *words]
     return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+
+
+def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon, tmp_path: Path) -> None:
+    """It beats, and says that it does not listen yet."""
+    one = live_daemon(start=False)
+    one.environment["NUMBA_CACHE_DIR"] = str(tmp_path / "no_kernels")
+    one.launch()
+    beats: set[int] = set()
+    waiting = Patience()
+    while waiting(len(beats) < 3):
+        with StatisticsReader(one.instance, one.shm_dir) as statistics:
+            seen = statistics.snapshot(tables=False)
+        assert seen.state in ("absent", "starting")
+        beats |= {seen.beat_monotonic_ns} - {0}
+    words = [
+        sys.executable,
+        "-m",
+        "shmmap.cli",
+        "health",
+        "--instance",
+        one.instance,
+        "--shm-dir",
+        one.shm_dir,
+    ]
+    health = subprocess.run(words, capture_output=True, text=True)
+    assert (health.returncode, health.stdout.split(":")[0]) == (1, "starting")
+    one.kill()

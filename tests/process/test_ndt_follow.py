@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +26,7 @@ from shmmap_clients.scans.trajectory import read_trajectory
 import shmmap
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import stop
 from tests.support.drive_sender import PERIOD_S, to_and_fro
 from tests.support.patience import Patience
 from tests.support.town_drive import TownDrive, make_town_drive
@@ -188,6 +192,29 @@ def test_a_map_that_cannot_be_made_is_an_error_and_not_the_end(
         assert other.cells.keys() != first.cells.keys()
         assert made == 4
         assert maps.error is None
+
+
+def test_a_map_that_is_long_in_coming_is_waited_for(drive: TownDrive, daemon: DaemonFactory) -> None:
+    """As where kernels are compiled for it, on a slow machine: the daemon says that it loads."""
+    one = daemon(drive.map_dir)
+    rules = MapRules(update_distance=5.0, map_radius=60.0, lidar_radius=40.0, wait_s=0.2)
+    parent = one.loaders_parent()
+    stop(parent)
+    stopped = [parent, *one.stop_loaders()]
+    waiting = Patience()
+    with (
+        StatisticsReader(one.instance, one.shm_dir) as statistics,
+        MapUpdater(one.endpoint, rules) as maps,
+        ThreadPoolExecutor(1) as thread,
+    ):
+        asked = thread.submit(maps.map_at, *drive.poses[0, :2])
+        while waiting(statistics.snapshot(tables=False).counters["requests"] < 10):  # each may take 0.05 s
+            pass
+        assert not asked.done()
+        for pid in stopped:
+            os.kill(pid, signal.SIGCONT)
+        found, waited = asked.result()
+        assert (found.voxels > 0, waited) == (True, True)
 
 
 def test_the_daemon_is_told_the_way_ahead(drive: TownDrive, daemon: DaemonFactory) -> None:

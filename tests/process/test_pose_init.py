@@ -43,12 +43,35 @@ def test_poses_are_found_and_cost_no_loading(town: TownDrive, daemon: DaemonFact
             found = initializer.initialize(scan, rough(town, index, index))
             assert found.reliable
             np.testing.assert_allclose(found.T_map_base[:3, 3], town.poses[index, :3], atol=0.3)
-            assert found.ground_z == pytest.approx(town.poses[index, 2] - 1.8, abs=0.5)
+            assert found.ground_z == pytest.approx(found.T_map_base[2, 3] - 1.8, abs=0.1)
             assert all(other.score <= found.score for other in found.alternatives)
             misses = session.stats().counters["misses"]
             again = initializer.initialize(scan, rough(town, index, index))
             assert (again.T_map_base == found.T_map_base).all()
             assert session.stats().counters["misses"] == misses > 0
+
+
+@pytest.mark.parametrize("below", ["reflections", "a stray point", "a pit"])
+def test_the_ground_is_that_of_the_pose(
+    town: TownDrive, daemon: DaemonFactory, tmp_path: Path, below: str
+) -> None:
+    x, y, z, _, _, yaw = town.poses[2]
+    rng = np.random.default_rng(1)
+    edge = 4.0 if below == "reflections" else 1.5
+    deep = np.column_stack([rng.uniform(-edge / 2, edge / 2, (200, 2)) + (x, y), np.full(200, z - 5.0)])
+    keep = np.ones(len(town.points), np.bool_)
+    if below == "a pit":
+        keep = (np.abs(town.points[:, :2] - (x, y)) > edge / 2).any(axis=1)
+    cloud = np.concatenate([town.points[keep], deep[:1] if below == "a stray point" else deep])
+    shmmap.write_pcd(tmp_path / "map.pcd", {"xyz": cloud.astype(np.float32)})
+    one = daemon(tmp_path / "map.pcd")
+    scan = read_scan(town.scans / "scan_0002.npz")
+    with PoseInitializer(one.endpoint, InitializerRules(map_radius=60.0, height=1.8)) as initializer:
+        # the rough pose is on the spot, where Autoware's rule finds what lies below the street
+        found = initializer.initialize(scan, RoughPose(x, y, yaw=yaw + 0.1))
+    assert found.reliable
+    np.testing.assert_allclose(found.T_map_base[:3, 3], [x, y, z], atol=0.3)
+    assert found.ground_z == pytest.approx(z - 1.8, abs=0.1)
 
 
 def test_a_place_without_map_is_no_answer(town: TownDrive, daemon: DaemonFactory) -> None:

@@ -24,6 +24,8 @@ from tests.support.offered_kinds import install
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 
+pytestmark = pytest.mark.usefixtures("layer_kernels")
+
 Connect = Callable[..., RawClient]
 NDT = "ndt(leaf=2.0,min_points=3)"
 

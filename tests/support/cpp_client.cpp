@@ -275,7 +275,7 @@ void obey(const std::vector<std::string>& words) {
       pose.route.push_back({real(parts.at(0)), real(parts.at(1))});
     }
     const auto wait = maybe(words.at(6));
-    print(wait ? window->move_to(pose, *wait) : window->move_to(pose));
+    print(window->move_to(pose, wait.value_or(5.0)));
   } else if (what == "state") {
     const auto error = window->error();
     std::cout << "state\t" << window->complete() << "\t" << (error ? error->code() : "-") << "\t"

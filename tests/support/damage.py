@@ -44,7 +44,9 @@ def damage_publish_block(path: str) -> None:
 
 
 def shorten(path: str) -> None:
+    os.chmod(path, 0o600)
     os.truncate(path, 4096)
+    os.chmod(path, 0o400)
 
 
 def punch(path: str) -> None:

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
+from shmmap.formats.open3d_package import SYSTEM_PACKAGES
+
 __all__ = ["open3d_or_skip"]
 
 
 def open3d_or_skip() -> Any:
     """Return Open3D's module; skip the test where it cannot be loaded."""
-    reason = "Open3D, or one of libegl1 libgl1 libx11-6 libusb-1.0-0 that it needs, is missing"
+    reason = f"Open3D, or one of {' '.join(SYSTEM_PACKAGES)} that it needs, is missing"
     return pytest.importorskip("open3d", reason=reason, exc_type=ImportError)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 
-LIMIT_S = 60.0
+LIMIT_S = 240.0
 
 
 class Patience:

@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // The part of the example `autoware_node.cpp` that needs no rclcpp: several requesters of one service.
-// Usage: requesters X Y RADIUS COUNT
+// Usage: requesters X Y RADIUS COUNT [LIFE]
 //
 // Each of COUNT requesters asks twice at the same time as the others, the second time with the ids that it
-// got.
+// got.  With LIFE the program is over, as ROS says it, when that has been asked so often.
 
 #define SHMMAP_WITHOUT_RCLCPP
+#include <atomic>
 #include <cstdio>
 #include <thread>
 
@@ -31,10 +32,12 @@ struct RequestId {  // as rmw_request_id_t
 }  // namespace
 
 int main(int count, char** words) {
-  if (count != 5) return 2;
+  if (count < 5) return 2;
   shmmap::LoaderOptions options;
   options.wait = 60.0;
   options.log = [](const std::string& message) { std::fprintf(stderr, "%s\n", message.c_str()); };
+  std::atomic<int> life{count > 5 ? std::stoi(words[5]) : 1 << 30};
+  options.keep_waiting = [&life] { return --life > 0; };
   shmmap_example::Requesters<Service> requesters(options);
   const int threads = std::stoi(words[4]);
   std::vector<std::string> told(static_cast<std::size_t>(threads));
@@ -51,7 +54,10 @@ int main(int count, char** words) {
       request.area.radius = std::stof(words[3]);
       for (int time = 0; time < 2; ++time) {
         Service::Response response;
-        requesters.answer(name, request, response);
+        if (!requesters.answer(name, request, response)) {
+          told[static_cast<std::size_t>(number)] += "none ";
+          continue;
+        }
         for (const auto& cell : response.new_pointcloud_with_ids) request.cached_ids.push_back(cell.cell_id);
         told[static_cast<std::size_t>(number)] +=
             std::to_string(response.new_pointcloud_with_ids.size()) + " " + response.header.frame_id + " ";

@@ -1,25 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hooks that fail a run in which a test was skipped that is not on a list.
+"""Hooks that say at the end what was skipped and why, and fail a run that skipped what is not on a list.
 
-Active where ``SHMMAP_TEST_ALLOWED_SKIPS`` names that list: one pattern a line (``*`` and ``?`` as in a
+The latter where ``SHMMAP_TEST_ALLOWED_SKIPS`` names that list: one pattern a line (``*`` and ``?`` as in a
 shell) for the test's id, then blanks and why it may be skipped; ``#`` starts a comment.
+What needs root may be skipped by everybody else: it is marked so, and `.ci/run` runs exactly that as root.
 """
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Final
 
 import pytest
 
 __all__ = [
+    "NEEDS_ROOT",
     "allowed_patterns",
     "pytest_collectreport",
     "pytest_runtest_logreport",
     "pytest_sessionfinish",
     "pytest_terminal_summary",
 ]
+
+NEEDS_ROOT: Final = "needs root (other user accounts, private tmpfs)"
 
 _skipped: dict[str, str] = {}
 
@@ -45,7 +51,7 @@ def _unexpected() -> dict[str, str]:
     return {
         test: reason
         for test, reason in _skipped.items()
-        if not any(fnmatchcase(test, pattern) for pattern in patterns)
+        if not reason.endswith(NEEDS_ROOT) and not any(fnmatchcase(test, pattern) for pattern in patterns)
     }
 
 
@@ -67,7 +73,10 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say which tests should not have been skipped."""
+    """Say in one line what was skipped, and which tests should not have been."""
+    if reasons := Counter(reason.removeprefix("Skipped: ") for reason in _skipped.values()):
+        words = "; ".join(f"{count}: {reason}" for reason, count in reasons.most_common())
+        terminalreporter.write_line(f"{reasons.total()} skipped. {words}")
     unexpected = _unexpected()
     if unexpected:
         terminalreporter.section("skipped, but not on the list of allowed skips", red=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.daemon_process import ROOT
-from tests.support.skips import allowed_patterns
+from tests.support.skips import NEEDS_ROOT, allowed_patterns
 
 TESTS = """
 import pytest
@@ -49,6 +49,12 @@ def test_only_listed_tests_may_be_skipped(tmp_path: Path, listed: str | None, co
     done = run(tmp_path, listed)
     assert done.returncode == code, done.stdout + done.stderr
     assert ("test_it.py::test_skipped: Skipped: no reason" in done.stdout) == bool(code)
+    assert "1 skipped. 1: no reason\n" in done.stdout
+
+
+def test_what_needs_root_is_left_to_root(tmp_path: Path) -> None:
+    tests = f"import pytest\n@pytest.mark.skip(reason={NEEDS_ROOT!r})\ndef test_it(): pass\n"
+    assert run(tmp_path, "", tests).returncode == 0
 
 
 def test_a_skipped_module_counts(tmp_path: Path) -> None:

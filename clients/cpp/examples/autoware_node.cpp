@@ -1,23 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
-// NOT BUILT HERE: this project has no ROS 2 to build it with.  Its tests compile and run all but the node at
-// the end, with message types from ROS 2's generator.
-//
 // Autoware's differential map service out of shared memory, for every RMW: an ordinary node on the machine
 // where the daemon runs.  Points are copied into messages once more and travel as any message does; a node
 // that is built with `shmmap/autoware.hpp` itself needs neither.
 //
 //   find_package(autoware_map_msgs REQUIRED)
 //   find_package(rclcpp REQUIRED)
+//   find_package(shmmap REQUIRED)
 //   add_executable(shmmap_map_loader autoware_node.cpp)
-//   ament_target_dependencies(shmmap_map_loader rclcpp autoware_map_msgs)
+//   target_link_libraries(shmmap_map_loader shmmap::shmmap rclcpp::rclcpp ${autoware_map_msgs_TARGETS})
 //
 //   ros2 run PACKAGE shmmap_map_loader --ros-args -r __ns:=/shmmap -p wait:=10.0
 //
 // It offers /shmmap/get_differential_pointcloud_map: remap a client's service to it (of the scan matcher, the
 // launch argument `client_map_loader`).  In the namespace /map it takes the place of Autoware's own loader,
 // for clients that ask for nothing else.  Parameters: `endpoint` (of the daemon; empty: as for every client),
-// `wait`.
+// `wait` (seconds that a try may take).  Without a daemon a request waits until there is one: an empty answer
+// would say that nothing has changed.
 
+#include <chrono>
+#include <cmath>
 #include <cstdint>
 #include <functional>
 #include <list>
@@ -25,6 +26,7 @@
 #include <mutex>
 #include <shmmap/autoware.hpp>
 #include <string>
+#include <thread>
 #include <utility>
 
 namespace shmmap_example {
@@ -41,13 +43,24 @@ class Requesters {
 
   explicit Requesters(shmmap::LoaderOptions options) : options_(std::move(options)) {}
 
-  /// Answer one; where nothing could be fetched, the answer is empty, as clients wait for one for ever.
+  /// Answer one, when a daemon has; returns false where the program ends before, and there is no answer.
   template <typename Request, typename Response>
-  void answer(const std::string& requester, const Request& request, Response& response) {
-    if (auto found = loader_of(requester)(&request)) {
-      response = std::move(*found);
-    } else {
-      response.header.frame_id = "map";
+  bool answer(const std::string& requester, const Request& request, Response& response) {
+    const auto loader = loader_of(requester);
+    const auto& area = request.area;
+    if (!(area.radius >= 0.0F) || !std::isfinite(area.center_x + area.center_y + area.radius)) {
+      response.header.frame_id = "map";  // as Autoware's loader: in no area there is nothing
+      return true;
+    }
+    while (true) {
+      if (auto found = loader(&request)) {
+        response = std::move(*found);
+        return true;
+      }
+      for (int tenths = 0; tenths < 10; ++tenths) {
+        if (options_.keep_waiting && !options_.keep_waiting()) return false;
+        std::this_thread::sleep_for(std::chrono::milliseconds(100));
+      }
     }
   }
 
@@ -103,9 +116,10 @@ class MapLoaderNode : public rclcpp::Node {
 #endif
     service_ = create_service<Service>(
         "get_differential_pointcloud_map",
-        [this](const std::shared_ptr<rmw_request_id_t> id, const Service::Request::SharedPtr request,
-               Service::Response::SharedPtr response) {
-          requesters_.answer(requester_of(*id), *request, *response);
+        [this](std::shared_ptr<rclcpp::Service<Service>> service, std::shared_ptr<rmw_request_id_t> id,
+               std::shared_ptr<Service::Request> request) {
+          Service::Response response;
+          if (requesters_.answer(requester_of(*id), *request, response)) service->send_response(*id, response);
         },
         qos, group_);
   }
@@ -116,6 +130,7 @@ class MapLoaderNode : public rclcpp::Node {
     found.client.endpoint = declare_parameter<std::string>("endpoint", "");
     found.client.name = get_fully_qualified_name();
     found.wait = declare_parameter<double>("wait", 10.0);
+    found.keep_waiting = [] { return rclcpp::ok(); };
     found.log = [this](const std::string& message) { RCLCPP_WARN(get_logger(), "%s", message.c_str()); };
     return found;
   }

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numba import types
 
+from shmmap.compiling import compiled, read_only
 from shmmap_clients.compare_map_filter.numpy_path import SLACK
 from shmmap_clients.compare_map_filter.rule import VOXEL, VOXEL_DISTANCE
 from shmmap_clients.compare_map_filter.search_table import (
@@ -24,7 +25,7 @@ from shmmap_clients.compare_map_filter.search_table import (
     TILES_X,
     TILES_Y,
 )
-from shmmap_clients.compiling import compiled, float32_at, float64_at, int32_at, read_only
+from shmmap_clients.elements_at import float32_at, float64_at, int32_at
 
 __all__ = ["explain"]
 
@@ -67,7 +68,7 @@ _ARGUMENTS: Final = (
 _SIGNATURES: Final = [types.void(read_only(t, 2), *_ARGUMENTS) for t in (types.float32, types.float64)]
 
 
-@compiled(*_SIGNATURES, error_model="numpy")
+@compiled(*_SIGNATURES)
 def explain(
     points: Any, T: Any, mode: Any, d: Any, d_z: Any, leaf: Any, rows: Any, bin_columns: Any,
     bin_first_x: Any, bin_first_y: Any, bins_x: Any, bins_y: Any, bin_start: Any, bin_cells: Any,

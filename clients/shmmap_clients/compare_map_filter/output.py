@@ -30,11 +30,15 @@ class Output(Protocol):
 
 
 def _columns(compared: ComparedScan, mask: bool) -> dict[str, NDArray[Any]]:
-    """All points with a column ``kept``, or the kept ones with a column ``index``: their rows in the scan."""
-    columns, comparison = compared.scan.columns, compared.comparison
+    """All points with a column ``kept``, or the kept ones with a column ``index``: their rows in the scan.
+
+    Those rows count the points that were left out before the comparison, too.
+    """
+    columns, comparison, rows = compared.scan.columns, compared.comparison, compared.scan.rows
     if mask:
         return {**columns, "kept": comparison.kept.astype(np.uint8)}
-    return {**comparison.select(columns), "index": comparison.indices.astype(np.uint32)}
+    index = comparison.indices if rows is None else rows[comparison.indices]
+    return {**comparison.select(columns), "index": index.astype(np.uint32)}
 
 
 class PcdDirectory:

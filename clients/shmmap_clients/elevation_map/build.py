@@ -28,13 +28,14 @@ from shmmap import (
 )
 from shmmap_clients.elevation_map.cell_columns import columns_of, heights_of
 from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
+from shmmap_clients.elevation_map.far_cells import far_cells
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.rule import ElevationRule
 from shmmap_clients.elevation_map.seams import ColumnBox, Seams, column_boxes
 
 __all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map"]
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 _EVERY: Final = 64  # cells between checkpoints
 
 
@@ -74,6 +75,9 @@ class BuiltElevation:
         Points left out because they lie outside the box of their cell.
     failed
         Cells that could not be loaded; what they hold is missing.
+    far
+        Ids of cells that were left out, for they lie far from all others and hold next to nothing, and how
+        far, metres.
     """
 
     grid: ElevationGrid
@@ -83,6 +87,7 @@ class BuiltElevation:
     occupied: int
     stray: int
     failed: tuple[CellError, ...]
+    far: tuple[tuple[str, float], ...] = ()
 
 
 def _map_key(map_version: int, rule: ElevationRule) -> str:
@@ -158,11 +163,14 @@ def _build(
 ) -> BuiltElevation:
     # row after row: only the strip between two rows has to wait
     metres = listing.boxes
+    away = far_cells(metres, np.array([info.source_bytes for info in listing], np.int64))
+    far = tuple((listing[n].id, float(away[n])) for n in np.flatnonzero(away).tolist())
     order = np.lexsort((metres[:, 0], metres[:, 1]))
+    order = order[away[order] == 0.0]
     boxes = column_boxes(metres[order], rule.resolution)
     first = (int(boxes[:, 0].min()), int(boxes[:, 1].min()))
     shape = (int(boxes[:, 3].max()) - first[1], int(boxes[:, 2].max()) - first[0])
-    grid = ElevationGrid(directory / "heights", rule.resolution, first, shape)
+    grid = ElevationGrid(directory / "heights", rule.resolution, first, shape, boxes)
     journal = Journal(directory)
     seams = Seams(boxes)
     state = journal.read(seams)
@@ -199,7 +207,7 @@ def _build(
     client.release()
     loaded = len(order) - begun
     return BuiltElevation(
-        grid, listing.map_version, len(order), loaded, state.occupied, state.stray, tuple(failed)
+        grid, listing.map_version, len(listing), loaded, state.occupied, state.stray, tuple(failed), far
     )
 
 

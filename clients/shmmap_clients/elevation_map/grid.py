@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -40,12 +41,16 @@ class ElevationGrid:
         Index i, j of column [0, 0]: it begins at i · resolution, j · resolution.
     shape
         Rows and columns.
+    boxes
+        (N, 4) int64: columns i0, j0 up to but without i1, j1 that may have heights, any order, indices from
+        the map's origin; None: all.  What is outside of them costs next to nothing.
     """
 
     path: Path
     resolution: float
     first: tuple[int, int]
     shape: tuple[int, int]
+    boxes: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def create(
@@ -138,6 +143,35 @@ class ElevationGrid:
         (n, m) float32 metres, and (n, m) uint8: `NOTHING`, `MEASURED` or `FILLED`.
         """
         right = self.shape[1] if right is None else right
+        heights = np.full((end - begin + 2 * margin, right - left), np.nan, np.float32)
+        kind = np.full(heights.shape, NOTHING, np.uint8)
+        for west, east in self._spans(begin - margin, end + margin, left, right, fill_radius):
+            part = np.s_[:, west - left : east - left]
+            heights[part], kind[part] = self._filled(begin, end, fill_radius, margin, west, east)
+        return heights, kind
+
+    def _spans(
+        self, begin: int, end: int, left: int, right: int, fill_radius: float
+    ) -> list[tuple[int, int]]:
+        """Return which columns may have heights in some rows, filled ones among them: from west to east."""
+        if self.boxes is None:
+            return [(left, right)]
+        reach = math.ceil(fill_radius / self.resolution)
+        i0, j0, i1, j1 = self.boxes.T - np.array([*self.first, *self.first])[:, None]
+        here = (j0 - reach < end) & (j1 + reach > begin)
+        low = np.maximum(i0[here] - reach, left)
+        high = np.minimum(i1[here] + reach, right)
+        spans: list[tuple[int, int]] = []
+        for west, east in sorted(zip(low.tolist(), high.tolist(), strict=True)):
+            if spans and west <= spans[-1][1]:
+                spans[-1] = (spans[-1][0], max(east, spans[-1][1]))
+            elif west < east:
+                spans.append((west, east))
+        return spans
+
+    def _filled(
+        self, begin: int, end: int, fill_radius: float, margin: int, left: int, right: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         radius = round(fill_radius / self.resolution, 6)  # 0.6 / 0.2 is three columns, not a hair less
         reach = fill_reach(radius)
         around = self.rows(begin - margin - reach, end + margin + reach, left - reach, right + reach)

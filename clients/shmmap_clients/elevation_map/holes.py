@@ -16,7 +16,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
-from shmmap_clients.compiling import compiled, read_only
+from shmmap.compiling import compiled, read_only
 
 __all__ = ["fill_holes", "fill_reach"]
 
@@ -61,7 +61,6 @@ def fill_holes(heights: NDArray[np.float32], radius: float) -> NDArray[np.float3
 
 @compiled(
     types.void(read_only(types.float32, 2), types.float64, types.int64, types.float32[:, ::1]),
-    error_model="numpy",
 )
 def _fill(heights: Any, radius: Any, reach: Any, result: Any) -> None:
     rows, columns = heights.shape

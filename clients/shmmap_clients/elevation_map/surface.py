@@ -13,7 +13,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from shmmap_clients.compiling import compiled
+from shmmap.compiling import compiled
 from shmmap_clients.elevation_map.rule import ElevationRule
 
 __all__ = ["surface_heights"]
@@ -58,7 +58,6 @@ def _root(parent: Any, member: Any) -> Any:
     types.void(
         types.float64[:, ::1], types.int64[::1], types.float64, types.float64, types.int64, types.float64[::1]
     ),
-    error_model="numpy",
 )
 def _surface(xyz: Any, bounds: Any, tolerance: Any, height_range: Any, min_points: Any, heights: Any) -> None:
     """``xyz`` sorted by column and height, column n in rows ``bounds[n] : bounds[n + 1]``."""

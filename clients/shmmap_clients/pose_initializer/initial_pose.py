@@ -44,7 +44,8 @@ class InitialPose:
     reliable
         Whether the result is within all limits of trust.
     ground_z
-        Height of the map's ground at the rough pose, metres; None where there is none near.
+        Height of the map's ground below the pose, metres: of the two heights that the search tries, the one
+        that fits; None where there is none near.
     alternatives
         Others, best first; at least a metre or ten degrees away from the best and each other.
     candidates

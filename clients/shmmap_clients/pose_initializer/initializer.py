@@ -13,7 +13,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Client, MapWindow, NoAnswer, canonical_layer
+from shmmap import BadRequest, Client, MapWindow, NoAnswer, canonical_layer, ground_height
 from shmmap_clients.map_extent import NoMapHere, map_extent
 from shmmap_clients.ndt_scan_matcher import (
     DeviceError,
@@ -28,7 +28,6 @@ from shmmap_clients.ndt_scan_matcher import (
     cell_from_layer,
     matrix_from_pose,
 )
-from shmmap_clients.pose_initializer.height import ground_heights
 from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
 from shmmap_clients.pose_initializer.parzen import ParzenEstimator
 from shmmap_clients.pose_initializer.rough_pose import RoughPose
@@ -39,6 +38,7 @@ _APART_M: Final = 1.0
 _APART_YAW: Final = math.radians(10.0)
 _SEED_APART_M: Final = 0.5
 _SEED_APART_YAW: Final = math.radians(3.0)
+_SAME_HEIGHT_M: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +179,11 @@ class PoseInitializer:
             The daemon cannot be asked.
         """
         began = time.perf_counter()
-        ground_z, grounds = self._take_map(rough)
+        self._take_map(rough)
         had_map = time.perf_counter()
         height = self.rules.height
         # the rough z is a guess of GNSS; the ground of the map is known to centimetres
+        grounds = self._grounds(rough.x, rough.y)
         heights = [z + height for z in grounds] if height is not None and grounds else [rough.z]
 
         def pose_of(candidate: NDArray[np.float64], z: float) -> NDArray[np.float64]:
@@ -217,7 +218,7 @@ class PoseInitializer:
             result=best,
             score=best.transform_probability,
             reliable=best.trustworthy,
-            ground_z=ground_z,
+            ground_z=self._ground_below(best.T_map_base),
             alternatives=tuple(others),
             candidates=sum(batches),
             map_s=had_map - began,
@@ -234,11 +235,32 @@ class PoseInitializer:
         """Why the fallback computes; None as long as it does not."""
         return self._coarse.fault or self._fine.fault
 
-    def _take_map(self, rough: RoughPose) -> tuple[float | None, list[float]]:
-        """Have the map around a place, and return the heights of its ground there."""
+    def _grounds(self, x: float, y: float) -> list[float]:
+        """Return the heights of the ground worth a try: the median, then the lowest where it is another one.
+
+        Where the rough pose is beside the street, half of the columns may be higher than it.
+        """
+        cells = [cell for cell in self._window.cells if cell.layer == self._ground]
+        grids = [(cell["min"], cell.header.lattice) for cell in cells]
+        known = [(low, lattice) for low, lattice in grids if lattice is not None]
+        median, lowest = ground_height(known, x, y), ground_height(known, x, y, rule="min")
+        if median is None or lowest is None:
+            return []
+        return [median] if abs(lowest - median) < _SAME_HEIGHT_M else [median, lowest]
+
+    def _ground_below(self, T_map_base: NDArray[np.float64]) -> float | None:
+        """Return the height of the ground that fits a pose best."""
+        x, y, z = T_map_base[:3, 3].tolist()
+        grounds = self._grounds(x, y)
+        if self.rules.height is None:
+            return grounds[0] if grounds else None
+        stands_at = z - self.rules.height
+        return min(grounds, key=lambda ground: abs(ground - stands_at), default=None)
+
+    def _take_map(self, rough: RoughPose) -> None:
+        """Have the map around a place."""
         self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)
-        cells = self._window.cells
-        voxels = {cell.id: cell for cell in cells if cell.layer == self._voxels}
+        voxels = {cell.id: cell for cell in self._window.cells if cell.layer == self._voxels}
         if not voxels:
             self._window_is_empty(rough)
         versions = self._window.versions()
@@ -262,7 +284,6 @@ class PoseInitializer:
             self._coarse.set_map(self._map)
             self._fine.set_map(self._map)
             self._versions = versions
-        return ground_heights([cell for cell in cells if cell.layer == self._ground], rough.x, rough.y)
 
     def _window_is_empty(self, rough: RoughPose) -> NoReturn:
         """Say why there is no map around the place."""

@@ -1,29 +1,139 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan from one file: PCD, NPZ, or KITTI's ``.bin``; or from any cloud file that shmmap reads."""
+"""One scan from one file: PCD, NPZ, or bare rows (``.bin``); or from any cloud file that shmmap reads."""
 
 from __future__ import annotations
 
 import os
+import stat
 import zipfile
 import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import MapDataError, MapMissing, read_cloud
+from shmmap_clients.scans.bin_layout import BinLayout, guess_layout
 
-__all__ = ["SCAN_SUFFIXES", "read_scan", "read_scan_fields"]
+__all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "read_scan_fields"]
 
 SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
+MIN_RANGE_M: Final = 0.5
+"""Programs leave out nearer points: no-returns at (0, 0, 0), and the vehicle's own parts."""
+
 _NO_ARCHIVE: Final = (
     ValueError, KeyError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 _METRES: Final = {"xyz": 1.0, "xyz_4mm": 0.004}
 
+Columns = dict[str, NDArray[Any]]
+
+
+def _silent(note: str) -> None:
+    """Say nothing."""
+
+
+@dataclass(slots=True)
+class ScanReader:
+    """Reads the scans of a program, all in one way.
+
+    Attributes
+    ----------
+    bin_layout
+        Columns of ``.bin`` files; None: guessed from the first that is not empty, and said.
+    min_range
+        `screened` leaves out nearer points, metres from the sensor; None: it leaves out nothing, also
+        not what is not finite.
+    say
+        Called with what a user should know of how files are read, once each.
+    too_near, not_finite
+        Points that `screened` has left out.
+    """
+
+    bin_layout: BinLayout | None = None
+    min_range: float | None = MIN_RANGE_M
+    say: Callable[[str], None] = field(default=_silent, repr=False)
+    too_near: int = 0
+    not_finite: int = 0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Points left out so far, by the names that they have in JSON."""
+        return {"too_near": self.too_near, "not_finite": self.not_finite}
+
+    @property
+    def left_out(self) -> str:
+        """What was left out, in words; empty where nothing was."""
+        near = f"{self.too_near} points nearer than {self.min_range:g} m" if self.too_near else ""
+        return ", ".join(filter(None, [near, f"{self.not_finite} not finite" if self.not_finite else ""]))
+
+    def read(self, path: str | os.PathLike[str]) -> Columns:
+        """Return all columns of a file by name, ``xyz`` (N, 3) among them, metres, and all its rows.
+
+        An NPZ holds ``xyz`` in metres or ``xyz_4mm`` in units of 4 mm, and any arrays of as many rows.
+
+        Raises
+        ------
+        MapMissing
+            There is no such file.
+        MapDataError
+            The file is not what its name says, or no file but a pipe or a directory.
+        """
+        name = os.fspath(path)
+        suffix = os.path.splitext(name)[1].lower()
+        try:
+            mode = os.stat(name).st_mode
+            if not stat.S_ISREG(mode):
+                kind = "a directory" if stat.S_ISDIR(mode) else "a pipe or a device"
+                raise MapDataError(f"{name}: cannot be read: {kind}, not a file")
+            if suffix == ".npz":
+                return _from_npz(name)
+            if suffix == ".bin":
+                return self._from_bin(name)
+        except (FileNotFoundError, NotADirectoryError):
+            raise MapMissing(f"there is no file {name}") from None
+        except OSError as error:
+            raise MapDataError(f"{name}: cannot be read: {error.strerror}") from error
+        return dict(read_cloud(name, keep_non_finite=True).columns)
+
+    def points(self, path: str | os.PathLike[str]) -> NDArray[np.floating]:
+        """Return the points of a file that count, (N, 3); see `read` and `screened`."""
+        return self.screened(self.read(path))[0]["xyz"]
+
+    def screened(self, columns: Columns) -> tuple[Columns, NDArray[np.int64] | None]:
+        """Leave out points that are not finite or nearer than `min_range`, and count them.
+
+        Returns
+        -------
+        The columns, and which rows they are; None: all.
+        """
+        if self.min_range is None:
+            return columns, None
+        xyz = columns["xyz"]
+        finite = np.isfinite(xyz).all(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            # NaN is no nearer than anything
+            near = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64, casting="unsafe") < self.min_range**2
+        good = finite & ~near
+        if good.all():
+            return columns, None
+        self.not_finite += len(finite) - int(np.count_nonzero(finite))
+        self.too_near += int(np.count_nonzero(finite & near))
+        return {name: values[good] for name, values in columns.items()}, np.flatnonzero(good)
+
+    def _from_bin(self, name: str) -> Columns:
+        if self.bin_layout is None:
+            self.bin_layout = guess_layout(name)
+            if self.bin_layout is None:
+                return {"xyz": np.empty((0, 3), np.float32)}
+            self.say(f"{name}: {self.bin_layout}, by the look of its numbers; --bin-columns names others")
+        return self.bin_layout.read(name)
+
 
 def read_scan(path: str | os.PathLike[str]) -> NDArray[np.floating]:
-    """Return the points of a scan, (N, 3) float32 (float64 where the file has it), sensor frame, metres.
+    """Return the finite points of a scan, (N, 3) float32 or float64 as in the file, sensor frame, metres.
 
     Raises
     ------
@@ -32,30 +142,16 @@ def read_scan(path: str | os.PathLike[str]) -> NDArray[np.floating]:
     MapDataError
         The file is not what its name says.
     """
-    return read_scan_fields(path)["xyz"]
+    return ScanReader(min_range=0.0).points(path)
 
 
-def read_scan_fields(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
-    """Return all columns of a scan by name, ``xyz`` (N, 3) among them; rows that are not finite left out.
-
-    An NPZ holds ``xyz`` in metres or ``xyz_4mm`` in units of 4 mm, and any arrays of as many rows.  A
-    KITTI ``.bin`` is rows of four float32, x y z and intensity.
-    """
-    name = os.fspath(path)
-    suffix = os.path.splitext(name)[1].lower()
-    if not os.path.exists(name):
-        raise MapMissing(f"there is no file {name}")
-    try:
-        if suffix == ".npz":
-            return _finite(_from_npz(name))
-        if suffix == ".bin":
-            return _finite(_from_bin(name))
-    except OSError as error:
-        raise MapDataError(f"{name}: cannot be read: {error.strerror}") from error
-    return dict(read_cloud(name).columns)
+def read_scan_fields(path: str | os.PathLike[str]) -> Columns:
+    """Return all columns of a scan by name, as `ScanReader.read`; rows that are not finite left out."""
+    reader = ScanReader(min_range=0.0)
+    return reader.screened(reader.read(path))[0]
 
 
-def _from_npz(name: str) -> dict[str, NDArray[Any]]:
+def _from_npz(name: str) -> Columns:
     try:
         with zipfile.ZipFile(name), np.load(name, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
@@ -71,16 +167,3 @@ def _from_npz(name: str) -> dict[str, NDArray[Any]]:
             others = {k: v for k, v in arrays.items() if v.ndim and len(v) == len(xyz)}
             return {"xyz": xyz, **others}
     raise MapDataError(f"{name}: no array called xyz or xyz_4mm", hint="save it with np.savez(file, xyz=...)")
-
-
-def _from_bin(name: str) -> dict[str, NDArray[Any]]:
-    raw = np.fromfile(name, np.float32)
-    if os.path.getsize(name) % 16:
-        raise MapDataError(f"{name}: its size is not a multiple of 16 bytes: not rows of x y z intensity")
-    rows = raw.reshape(-1, 4)
-    return {"xyz": np.ascontiguousarray(rows[:, :3]), "intensity": rows[:, 3].copy()}
-
-
-def _finite(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    good = np.isfinite(columns["xyz"]).all(axis=1)
-    return columns if good.all() else {name: values[good] for name, values in columns.items()}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapDataError, MapMissing
-from shmmap_clients.scans.scan_file import SCAN_SUFFIXES, read_scan_fields
+from shmmap import MapDataError, MapMissing
+from shmmap_clients.scans.scan_file import SCAN_SUFFIXES, ScanReader
+from shmmap_clients.scans.scan_names import in_order, pair_with_poses, stem
 from shmmap_clients.scans.trajectory import Trajectory
 
 __all__ = ["Scan", "ScanSequence"]
@@ -38,6 +38,8 @@ class Scan:
         (4, 4) float64; None where it is not known.
     no_map
         Its points were filtered with a map, but there was none around it.
+    rows
+        (N,) int64: which rows of the file or message the points are, where others were left out; else None.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Scan:
     columns: dict[str, NDArray[Any]] = field(repr=False)
     T_map_sensor: NDArray[np.float64] | None = None
     no_map: bool = False
+    rows: NDArray[np.int64] | None = field(default=None, repr=False)
 
     @property
     def xyz(self) -> NDArray[Any]:
@@ -53,11 +56,10 @@ class Scan:
 
 
 class ScanSequence:
-    """The scans in a directory (PCD, NPZ or KITTI ``.bin``), by name, ``s_9`` before ``s_10``; read when
+    """The scans in a directory (PCD, NPZ or ``.bin``), by name, ``s_9`` before ``s_10``; read when
     their turn comes.
 
-    A scan gets its pose by its place, where there are as many poses as scans; else by the last number in
-    its name, which counts the poses from 0 (``scan_0081.npz`` gets the 82nd).
+    Which scan has which pose, and in which order they come then, is said in `pair_with_poses`.
 
     Parameters
     ----------
@@ -65,60 +67,75 @@ class ScanSequence:
         Of the scans.
     trajectory
         Their poses; None: scans have none, and times 0.1 s apart.
+    reader
+        How files are read, and which points count; by default all that are finite.
+
+    Attributes
+    ----------
+    files
+        In the order in which they come.
+    pairing
+        How poses were found, the first and the last pair; empty without poses.
 
     Raises
     ------
     MapMissing
         There is no such directory, or no scan in it.
     BadRequest
-        The poses do not fit the scans.
+        The names have no order, or the poses do not fit the scans.
     """
 
-    def __init__(self, directory: str | os.PathLike[str], trajectory: Trajectory | None = None) -> None:
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        trajectory: Trajectory | None = None,
+        reader: ScanReader | None = None,
+    ) -> None:
         try:
             found = [path for path in Path(directory).iterdir() if path.suffix.lower() in SCAN_SUFFIXES]
-            self.files = sorted(found, key=_by_numbers)
         except (FileNotFoundError, NotADirectoryError):
             raise MapMissing(f"{os.fspath(directory)} is no directory") from None
         except OSError as error:
             raise MapDataError(f"{os.fspath(directory)}: cannot be read: {error.strerror}") from error
-        if not self.files:
+        if not found:
             raise MapMissing(
                 f"{os.fspath(directory)} has no scans", hint=f"names end in {', '.join(SCAN_SUFFIXES)}"
             )
+        self.files = in_order(found)
+        self.reader = reader if reader is not None else ScanReader(min_range=0.0)
+        self.pairing = ""
         self._trajectory = trajectory
         self._rows = list(range(len(self.files)))
-        if trajectory is not None and len(trajectory) != len(self.files):
-            self._rows = [_row(path, len(trajectory), len(self.files)) for path in self.files]
+        if trajectory is not None:
+            rows, how = pair_with_poses(self.files, trajectory)
+            order = sorted(range(len(rows)), key=rows.__getitem__) if how != "place" else range(len(rows))
+            self.files, self._rows = [self.files[n] for n in order], [rows[n] for n in order]
+            first, last = (self._pair(n) for n in (0, -1))
+            self.pairing = f"{len(rows)} scans have poses by {how}: {first}, ..., {last}"
 
     def __len__(self) -> int:
         return len(self.files)
 
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """Times and poses of the scans, in their order; None where they have none."""
+        if self._trajectory is None:
+            return None
+        return Trajectory(self._trajectory.stamps_s[self._rows], self._trajectory.T_map_sensor[self._rows])
+
     def leave_out(self, count: int) -> None:
-        """Begin after so many scans."""
+        """Begin after ``count`` scans."""
         del self.files[:count], self._rows[:count]
 
     def __iter__(self) -> Iterator[Scan]:
         for path, row in zip(self.files, self._rows, strict=True):
-            columns = read_scan_fields(path)
-            if self._trajectory is None:
-                yield Scan(path.stem, row * _PERIOD_S, columns)
-            else:
-                stamp_s = float(self._trajectory.stamps_s[row])
-                yield Scan(path.stem, stamp_s, columns, self._trajectory.T_map_sensor[row])
+            columns, kept = self.reader.screened(self.reader.read(path))
+            stamp_s, T = row * _PERIOD_S, None
+            if self._trajectory is not None:
+                stamp_s, T = float(self._trajectory.stamps_s[row]), self._trajectory.T_map_sensor[row]
+            yield Scan(stem(path), stamp_s, columns, T, rows=kept)
 
-
-def _by_numbers(path: Path) -> tuple[list[str | int], str]:
-    """Key for sorting by name, numbers in it by their value: not all programs write leading zeros."""
-    words = re.split(r"([0-9]+)", path.name)
-    return [int(word) if place % 2 else word for place, word in enumerate(words)], path.name
-
-
-def _row(path: Path, poses: int, scans: int) -> int:
-    numbers = re.findall(r"\d+", path.stem)
-    if not numbers or int(numbers[-1]) >= poses:
-        raise BadRequest(
-            f"{poses} poses do not fit {scans} scans: {path.name} has no number of one of them in its name",
-            hint="give a pose for each scan, or number the scans by the poses' lines, from 0",
-        )
-    return int(numbers[-1])
+    def _pair(self, number: int) -> str:
+        assert self._trajectory is not None  # noqa: S101  # asked only then
+        row = self._rows[number]
+        return f"{stem(self.files[number])} pose {row} at {self._trajectory.stamps_s[row]:.12g} s"

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 
 from shmmap import BadRequest
+from shmmap_clients.scans.scan_file import ScanReader
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_stream import ScanSubscriber
 from shmmap_clients.scans.trajectory import read_trajectory
@@ -15,7 +17,7 @@ from shmmap_clients.streams import is_endpoint
 __all__ = ["open_scans"]
 
 
-def open_scans(source: str, poses: str | None, stack: ExitStack) -> Iterable[Scan]:
+def open_scans(source: str, poses: str | None, stack: ExitStack, reader: ScanReader) -> Iterable[Scan]:
     """Return the scans of a directory, or those of a publisher as they come.
 
     Parameters
@@ -23,9 +25,11 @@ def open_scans(source: str, poses: str | None, stack: ExitStack) -> Iterable[Sca
     source
         Directory or address.
     poses
-        File with T_map_sensor of each scan of a directory.
+        File with T_map_sensor of each scan of a directory; the first and the last pair are said.
     stack
         Closes a subscription.
+    reader
+        How files are read, and which points of files and messages count.
 
     Raises
     ------
@@ -35,7 +39,16 @@ def open_scans(source: str, poses: str | None, stack: ExitStack) -> Iterable[Sca
         The directory or the file cannot be read.
     """
     if not is_endpoint(source):
-        return ScanSequence(source, read_trajectory(poses) if poses else None)
+        scans = ScanSequence(source, read_trajectory(poses) if poses else None, reader)
+        if scans.pairing:
+            reader.say(scans.pairing)
+        return scans
     if poses:
         raise BadRequest(f"{poses} is for a directory of scans: those of a publisher bring their poses")
-    return stack.enter_context(ScanSubscriber(source))
+    return _screened(stack.enter_context(ScanSubscriber(source)), reader)
+
+
+def _screened(scans: Iterable[Scan], reader: ScanReader) -> Iterator[Scan]:
+    for scan in scans:
+        columns, rows = reader.screened(scan.columns)
+        yield scan if rows is None else replace(scan, columns=columns, rows=rows)

@@ -29,9 +29,10 @@ WORTH_TELLING_NS: Final = 1_000_000
 _WIDE: Final = 100  # columns from which there is room for everything about a client
 _SHORTEST_NAME: Final = 14
 SPAN_TITLES: Final = (("10s", "10 s"), ("1min", "1 min"), ("10min", "10 min"))
-_STATE_NAMES: Final = {"healthy": "healthy", "stopped": "PAUSED"}
+_STATE_NAMES: Final = {"healthy": "healthy", "starting": "starting", "stopped": "PAUSED"}
 _STATE_STYLES: Final = {
     "healthy": "bold green",
+    "starting": "bold yellow",
     "stopped": "bold yellow",
     "hung": "bold red",
     "dead": "bold red",

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped": paused | "hung" | "dead", "beat_age_s", "pid", "instance",
+  {"state": "healthy" | "starting" | "stopped": paused | "hung" | "dead", "beat_age_s", "pid", "instance",
    "defects": exceptions that the daemon survived, whose tracebacks its log has}
-Exit code: 0 healthy, 1 paused or hung, 69 dead or never started."""
+Exit code: 0 healthy, 1 starting, paused or hung, 69 dead or never started."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -28,8 +28,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "health",
         run,
         help="is the daemon healthy? (exit code 0: yes)",
-        description="Say whether the daemon is healthy, paused (by SIGSTOP or a debugger), hung or "
-        "dead.  Reads its statistics in shared memory, so it answers whatever the daemon does.",
+        description="Say whether the daemon is healthy, starting (it does not listen yet), paused (by SIGSTOP"
+        " or a debugger), hung or dead.  Reads its statistics in shared memory, so it answers whatever the"
+        " daemon does.",
         json=_JSON,
     )
     add_statistics_options(parser)

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _JSON = """\
-  {"state": "healthy" | "stopped": paused by a signal or a debugger | "hung" | "dead",
+  {"state": "healthy" | "starting": it does not listen yet | "stopped": paused by a signal or a debugger |
+             "hung" | "dead",
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
@@ -102,6 +103,7 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     share = f" ({100 * used / budget:.0f} %)" if budget else ""
     state = {
         "healthy": f"healthy, pid {identity.pid}, up {format_duration(uptime_s)}",
+        "starting": f"starting, pid {identity.pid}, for {format_duration(uptime_s)}: it does not listen yet",
         "stopped": f"PAUSED, pid {identity.pid}: continue it with `kill -CONT {identity.pid}`",
         "hung": f"HUNG, pid {identity.pid}: no heartbeat for {format_duration(found.beat_age_s)}",
         "dead": f"DEAD: pid {identity.pid} crashed or was killed; start it again, it keeps the "

@@ -28,7 +28,8 @@ it, as root in shmmap's checkout:
 --huge-pages writes a mount unit for /run/shmmap_huge, of at most half of the machine's memory, and drop-ins
 that let the daemon use it; a later install keeps them.  To undo it, remove run-shmmap_huge.mount and both
 30-huge-pages.conf.
-With --root the units name the program as the image will see it, if it lies below that directory.
+With --root the units start the program that the image has in /opt/shmmap (or /usr/local, /usr), and the
+map is the one that has its path there; what lies outside of the image is refused.
 Exit code: 0, 66 no map there, 73 a file cannot be written, 78 the service could not read this program."""
 
 _PRINT = """\

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Final
 
+from shmmap.client.connection_watch import start_thread
 from shmmap.client.orphans import running
 from shmmap.client.session import Session
 from shmmap.client.window.refresh import WindowRefresher
@@ -21,6 +22,7 @@ from shmmap.client.window.state import EMPTY, WindowState, moved
 from shmmap.errors import BadRequest, InternalError, ShmmapError
 from shmmap.protocol.messages import Intent
 from shmmap.segment.owned import Owned
+from shmmap.segment.process_limits import no_files_left
 
 __all__ = ["PENDING_WAIT_S", "WindowFollower"]
 
@@ -67,7 +69,6 @@ class WindowFollower:
         self.owner = weakref.ref(owner)
         self._refresher = refresher
         self._session = session
-        self._unmapper = session.attacher.unmapper
         self._update_distance = update_distance
         self._refresh_interval_s = refresh_interval_s
         self._mailbox: SimpleQueue[Owned | None] = SimpleQueue()
@@ -83,10 +84,15 @@ class WindowFollower:
         self.state = EMPTY
         self.error: ShmmapError | None = None
         self.stale_since: float | None = None
-        self._unmapper.defer_to(self._mailbox)
+        session.attacher.unmap_in(self._mailbox)
         session.tell_when_lost(self._mailbox)
         self._thread = 0
-        _thread.start_new_thread(self._run, ())
+        try:
+            start_thread(self._run)
+        except BaseException:
+            session.stop_telling(self._mailbox)
+            session.attacher.stop_unmapping_in(self._mailbox)
+            raise
 
     @property
     def _elsewhere(self) -> bool:
@@ -176,7 +182,7 @@ class WindowFollower:
             raise
         finally:
             self._session.stop_telling(self._mailbox)
-            self._unmapper.stop_deferring(self._mailbox)
+            self._session.attacher.stop_unmapping_in(self._mailbox)
             running.discard(self)
             self._ended = True
             self._over.put(None)
@@ -208,6 +214,12 @@ class WindowFollower:
             state, progress = self._refresher.refresh(before, pose, wait_s)
         except ShmmapError as error:
             self._publish(before, error)
+            return self._pause()
+        except (OSError, ImportError) as error:
+            limit = no_files_left(error)  # to load a module, say
+            if limit is None:
+                raise
+            self._publish(before, limit)
             return self._pause()
         del before  # the last reference to what was replaced may be this one
         self._publish(state, None)

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Sequence
 from threading import TIMEOUT_MAX
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
@@ -78,6 +78,8 @@ class MapWindow:
     ------
     DaemonUnreachable, ProtocolMismatch
         As `connect`, where an endpoint is given.
+    LimitReached
+        This process may not have the descriptors or threads that are needed.
     BadRequest
         A parameter makes no sense.
     """
@@ -123,24 +125,25 @@ class MapWindow:
                 populate=background,  # page faults, too, are better taken by the thread
                 timeout_s=timeout,
             )
-        except ShmmapError:
+            if background:
+                self._follower = WindowFollower(
+                    self._refresher,
+                    self._client.session,
+                    owner=self,
+                    update_distance=update_distance,
+                    refresh_interval_s=refresh_interval,
+                )
+            else:
+                self._follower = BlockingFollower(
+                    self._refresher, update_distance=update_distance, refresh_interval_s=refresh_interval
+                )
+        except BaseException:
             if self._owns_client:
                 self._client.close()
             raise
-        if background:
-            self._follower = WindowFollower(
-                self._refresher,
-                self._client.session,
-                owner=self,
-                update_distance=update_distance,
-                refresh_interval_s=refresh_interval,
-            )
-        else:
-            self._follower = BlockingFollower(
-                self._refresher, update_distance=update_distance, refresh_interval_s=refresh_interval
-            )
-        # also when nobody calls close(), and at the end of the program before sockets are closed
+        # also when nobody calls close(); at the end of the program Python stops the thread
         self._finalizer = weakref.finalize(self, self._follower.stop)
+        self._finalizer.atexit = False
 
     def __enter__(self) -> MapWindow:
         return self
@@ -156,6 +159,12 @@ class MapWindow:
     def __repr__(self) -> str:
         where = "closed" if self._closed else f"of radius {self._radius:g} m"
         return f"<MapWindow {where}, {len(self.cells)} cells of {', '.join(self._layers)}>"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a MapWindow cannot be pickled: a thread of this process keeps it current. Make one in each"
+            " process, MapWindow(...); cells can be pickled, window.cells: they go as handles"
+        )
 
     def close(self) -> None:
         """Stop following and let the window's cells go; views that live elsewhere stay readable."""

@@ -83,10 +83,10 @@ class NothingNew:
         session = self._session
         opened_for = session.welcome.epoch, session.handshakes
         if opened_for != self._opened_for:
-            from shmmap.client.window.change_counter import ChangeCounter  # once a daemon, and not at import
-
             self._counter = None
             try:
+                from shmmap.client.window.change_counter import ChangeCounter  # once a daemon, not at import
+
                 counter = ChangeCounter(session.statistics_path)
             except (OSError, ShmmapError):
                 pass

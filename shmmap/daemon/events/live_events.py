@@ -47,6 +47,10 @@ class LiveEvents:
         if self._begun:
             self.event_log.publish(events.LiveEnded, restarts)
 
+    def beat(self) -> None:
+        """Write the statistics while the daemon waits for live maps, and its loop does not run yet."""
+        self.statistics.beat()
+
     def told(self, rows: Sequence[LiveMapRow]) -> None:
         """This is how the maps are now."""
         self._rows = {row.name: row for row in rows}

@@ -32,6 +32,7 @@ from shmmap.protocol.live import LiveList, LiveListed, LiveRequest
 
 __all__ = ["LiveRelay", "NoLiveMaps"]
 
+BEAT_S: Final = 0.5
 START_S: Final = 120.0
 """How long the maps may take to come into memory before the daemon is ready: kernels are compiled, too."""
 END_S: Final = 60.0
@@ -156,8 +157,9 @@ class LiveRelay:
                 if self._failures > STARTS:
                     break
                 self.start()
-            self._wait(left_s)
+            self._wait(min(left_s, BEAT_S))
             self.hear()
+            self._events.beat()
         if not self._serving:
             raise self._why or CannotStart(
                 "the process that keeps live maps did not begin", hint="see the lines of the log before this"

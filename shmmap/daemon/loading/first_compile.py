@@ -24,7 +24,7 @@ _LEAST: Final = 19  # niceness
 def is_compiled() -> bool:
     """Whether there is nothing to do: all is compiled, or cannot be kept."""
     mark = compiled_mark()
-    return mark is None or mark.exists()
+    return mark is None or mark.is_file()
 
 
 def compile_in_child(channel: socket.socket) -> int:

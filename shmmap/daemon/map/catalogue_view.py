@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from shmmap.geometry import Area
 from shmmap.origin.catalogue_change import Tables
+from shmmap.origin.map_frame import MapFrame
 from shmmap.segment.version import Stamp
 
 __all__ = ["CatalogueView", "ViewOrigin"]
@@ -41,6 +42,10 @@ class CatalogueView(Tables, Protocol):
     @property
     def frame_id(self) -> str:
         """Name of the map frame."""
+
+    @property
+    def frame(self) -> MapFrame:
+        """Where the map frame lies in the world."""
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:

@@ -61,6 +61,7 @@ def frame(number: int, T: NDArray[np.float64], truth: NDArray[np.float64] | None
         T_truth=truth,
         state="lost",
         relocalized=False,
+        clock_jumped=False,
         thin_s=0.001,
         map_s=0.0,
         align_s=0.01 + number * 1e-3,
@@ -305,7 +306,7 @@ def test_addresses_that_make_no_sense_are_refused() -> None:
 
 
 def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    args = argparse.Namespace(tum=None, json_lines=None, quiet=False, allow_empty=False)
+    args = argparse.Namespace(tum=None, json_lines=None, quiet=False, allow_empty=False, relocalize=None)
     client: Any = SimpleNamespace(welcome=SimpleNamespace(bounds=(0.0, -1.5, 20.0, 30.25)))
     named = dataclasses.replace(frame(0, np.eye(4), None), name="\x1b[2Jscan\n")
     with FollowReport(args) as report:
@@ -319,4 +320,5 @@ def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.Captur
         ),
         "shmmap-ndt: the map did not keep up with the vehicle: scan \\x1b[2Jscan\\n waited for it",
         "shmmap-ndt: lost at scan \\x1b[2Jscan\\n: no map",
+        "hint: --relocalize searches for it",
     ]

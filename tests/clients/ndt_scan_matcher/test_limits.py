@@ -182,8 +182,8 @@ def test_a_drive_counts_what_each_limit_left_out() -> None:
         statistics.add(
             Frame(
                 name="scan", stamp_s=0.0, result=dataclasses.replace(result, cut=cut), T_guess=np.eye(4),
-                T_truth=None, state="uncertain", relocalized=False, thin_s=0.0, map_s=0.0, align_s=0.0,
-                relocalize_s=0.0, waited=False,
+                T_truth=None, state="uncertain", relocalized=False, clock_jumped=False,
+                thin_s=0.0, map_s=0.0, align_s=0.0, relocalize_s=0.0, waited=False,
             )
         )  # fmt: skip
     summary = statistics.summary(UpdateStatistics(), 0, TrustLimits(nvtl=1.0), backend="opencl")

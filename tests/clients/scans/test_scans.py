@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.scans import scan_stream
-from shmmap_clients.scans.scan_file import read_scan
+from shmmap_clients.scans.scan_file import ScanReader, read_scan
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_source import open_scans
 from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber, decode_scan, encode_scan
@@ -218,13 +218,16 @@ def test_scans_as_an_option_names_them(tmp_path: Path) -> None:
     poses.write_text("\n".join(tum_line(n, matrix_of((n, 0, 0), (0, 0, 0, 1))) for n in range(2)))
     endpoint = f"ipc://{tmp_path}/scans"
     with ExitStack() as stack:
-        assert [scan.T_map_sensor for scan in open_scans(str(tmp_path / "a"), None, stack)] == [None, None]
-        posed = list(open_scans(str(tmp_path / "a"), str(poses), stack))
+        assert [scan.T_map_sensor for scan in open_scans(str(tmp_path / "a"), None, stack, ScanReader())] == [
+            None,
+            None,
+        ]
+        posed = list(open_scans(str(tmp_path / "a"), str(poses), stack, ScanReader()))
         assert [scan.stamp_s for scan in posed] == [0.0, 1.0]
         with pytest.raises(BadRequest, match="publisher"):
-            open_scans(endpoint, str(poses), stack)
+            open_scans(endpoint, str(poses), stack, ScanReader())
         publisher = stack.enter_context(ScanPublisher(endpoint))
-        heard = open_scans(endpoint, None, stack)
+        heard = open_scans(endpoint, None, stack, ScanReader())
         assert publisher.wait_for_listener(30.0)
         for scan in (*posed, None):
             publisher.send(scan)

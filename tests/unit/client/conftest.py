@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shmmap.client.attaching import Attacher
-from shmmap.client.cell import Cell
+from shmmap.client.cell import Access, Cell
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SourceStamp
@@ -48,7 +48,7 @@ class Segments:
         return name, Handle(cell_id, version, layer, name, 0, header.total_bytes, rows, *box)
 
     def attach(self, name: str, handle: Handle) -> Cell:
-        return self.attacher.attach(handle, handle.id, name, shm_dir=self.path, slot=99, populate=False)
+        return self.attacher.attach(handle, handle.id, name, Access(self.path, 99, None))
 
     def cell(self, cell_id: str, columns: dict[str, NDArray[Any]], **options: Any) -> Cell:
         return self.attach(*self.publish(cell_id, columns, **options))

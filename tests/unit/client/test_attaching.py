@@ -59,8 +59,8 @@ def test_a_version_is_told_when_its_last_layer_is_unmapped(segments: Segments) -
 
 def test_deferred_mappings_stay_until_their_thread_unmaps_them(segments: Segments) -> None:
     queue: SimpleQueue[Owned | None] = SimpleQueue()
-    unmapper = segments.attacher.unmapper
-    unmapper.defer_to(queue)
+    attacher = segments.attacher
+    attacher.unmap_in(queue)
     cell = segments.cell("/a", XYZ, version=5)
     address = cell.xyz.ctypes.data
     del cell
@@ -72,22 +72,22 @@ def test_deferred_mappings_stay_until_their_thread_unmaps_them(segments: Segment
     del memory
     assert mappings_under(segments.path) == 0
     assert segments.attacher.unmapped() == [5]
-    unmapper.stop_deferring(queue)
+    attacher.stop_unmapping_in(queue)
 
 
 def test_what_is_queued_when_the_thread_ends_is_unmapped_too(segments: Segments) -> None:
     first: SimpleQueue[Owned | None] = SimpleQueue()
     second: SimpleQueue[Owned | None] = SimpleQueue()
-    unmapper = segments.attacher.unmapper
-    unmapper.defer_to(first)
-    unmapper.defer_to(second)
+    attacher = segments.attacher
+    attacher.unmap_in(first)
+    attacher.unmap_in(second)
     cells = [segments.cell(f"/{i}", XYZ, version=i) for i in range(1, 4)]
     cells.pop()
-    unmapper.stop_deferring(first)
+    attacher.stop_unmapping_in(first)
     assert mappings_under(segments.path) == 2
     cells.pop()
     assert second.qsize() == 1, "the other thread takes over"
-    unmapper.stop_deferring(second)
+    attacher.stop_unmapping_in(second)
     assert mappings_under(segments.path) == 1
     cells.pop()
     assert mappings_under(segments.path) == 0
@@ -100,9 +100,9 @@ def drop_when_all_are_there(cells: list[Cell], barrier: threading.Barrier) -> No
 
 def test_dropping_cells_in_many_threads_while_the_thread_ends_loses_none(segments: Segments) -> None:
     queue: SimpleQueue[Owned | None] = SimpleQueue()
-    unmapper = segments.attacher.unmapper
+    attacher = segments.attacher
     for round_ in range(20):
-        unmapper.defer_to(queue)
+        attacher.unmap_in(queue)
         cells = [segments.cell(f"/{round_}/{i}", XYZ, version=round_ * 100 + i + 1) for i in range(8)]
         barrier = threading.Barrier(9)
         threads = [threading.Thread(target=drop_when_all_are_there, args=([c], barrier)) for c in cells]
@@ -110,7 +110,7 @@ def test_dropping_cells_in_many_threads_while_the_thread_ends_loses_none(segment
             thread.start()
         cells.clear()
         barrier.wait()
-        unmapper.stop_deferring(queue)
+        attacher.stop_unmapping_in(queue)
         for thread in threads:
             thread.join()
         threads.clear()

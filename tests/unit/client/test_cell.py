@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shmmap.client.cell import Access
 from shmmap.errors import SegmentCorrupt, StaleHandle
-from tests.support.open3d_package import open3d_or_skip
 from tests.support.process_costs import mappings_under
 
 if TYPE_CHECKING:
@@ -142,37 +142,6 @@ def test_dlpack_is_the_same_memory_read_only_or_refused(segments: Segments) -> N
     assert not alias.flags.writeable
 
 
-def test_open3d_over_the_same_memory(segments: Segments) -> None:
-    o3d = open3d_or_skip()
-    cell = segments.cell("/map/a.pcd", {**COLUMNS, "intensity": COLUMNS["intensity"].astype(np.float32)})
-    cloud = cell.to_open3d()
-    assert isinstance(cloud, o3d.t.geometry.PointCloud)
-    positions = cloud.point["positions"].numpy()
-    assert np.shares_memory(positions, cell.xyz)
-    np.testing.assert_array_equal(positions, XYZ)
-    assert cloud.point["ring"].numpy().shape == (10, 1)
-    assert np.shares_memory(cloud.point["ring"].numpy(), cell["ring"])
-    assert cloud.get_max_bound().numpy().tolist() == XYZ.max(axis=0).tolist()
-    del cell, positions
-    assert mappings_under(segments.path) == 1, "the tensors keep the mapping"
-    np.testing.assert_array_equal(cloud.point["positions"].numpy(), XYZ)
-
-
-def test_torch_over_the_same_memory(segments: Segments) -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-    cell = segments.cell("/map/a.pcd", COLUMNS)
-    tensors = cell.to_torch()
-    assert {name: tensor.data_ptr() for name, tensor in tensors.items()} == {
-        name: view.ctypes.data for name, view in cell.columns.items()
-    }
-    del cell
-    assert mappings_under(segments.path) == 1, "the tensors keep the mapping"
-    for name, values in COLUMNS.items():
-        assert tensors[name].numpy().dtype == values.dtype
-        np.testing.assert_array_equal(tensors[name].numpy(), values)
-    assert torch.equal(tensors["xyz"].sum(dim=0), torch.tensor(XYZ).sum(dim=0))
-
-
 def test_writing_past_numpy_ends_the_process_and_harms_nobody(segments: Segments) -> None:
     """What the documentation warns of: the mapping itself is read-only."""
     name, handle = segments.publish("/map/a.pcd", COLUMNS)
@@ -189,7 +158,6 @@ ctypes.memset(view.ctypes.data, 255, 4)
 
 def test_the_name_is_the_id_as_the_daemon_shortens_it(segments: Segments) -> None:
     name, handle = segments.publish("0_0.pcd", COLUMNS)
-    cell = segments.attacher.attach(
-        handle, "/map/pointcloud_map/0_0.pcd", name, shm_dir=segments.path, slot=99
-    )
+    access = Access(segments.path, 99, None)
+    cell = segments.attacher.attach(handle, "/map/pointcloud_map/0_0.pcd", name, access)
     assert (cell.id, cell.name) == ("/map/pointcloud_map/0_0.pcd", "0_0.pcd")

@@ -49,7 +49,7 @@ from tests.support import connections
 from tests.support.daemon_process import stop
 
 EPOCH = 77
-PATIENCE_S = 30.0
+PATIENCE_S = 240.0
 EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 
 
@@ -74,7 +74,7 @@ class InnerDaemon:
         budget_bytes: int = 64 << 20,
         quota_bytes: int = 64 << 20,
         workers: int = 1,
-        load_timeout_s: float = 30.0,
+        load_timeout_s: float = 300.0,
         cache_dir: str,
         shm_dir: str = "",
         name: str = "inner",
@@ -212,7 +212,7 @@ class InnerDaemon:
 
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
-        self.ask(self.session(), Area(request, EVERYWHERE, wait=30.0))
+        self.ask(self.session(), Area(request, EVERYWHERE, wait=600.0))
         return self.cells_of(request)
 
     def path_of(self, segment: str) -> str:

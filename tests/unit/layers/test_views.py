@@ -160,7 +160,7 @@ def test_the_fitted_height_is_within_its_stated_tolerance(edge: float, origin: t
         grids.append((layer["min"], layer.lattice))
     exact = 0
     for x, y in rng.uniform(-5, 45, (200, 2)) + origin:
-        found = ground_height(grids, x, y)
+        found = ground_height(grids, x, y, rule="min")
         true = fitted_height(xyz, x, y)
         assert found is not None
         assert true is not None

@@ -11,6 +11,7 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -59,12 +60,8 @@ def test_views_cannot_be_written_nor_made_writable(shm: ShmDirectory, publish: P
 def test_the_mapping_lives_as_long_as_any_view(shm: ShmDirectory, publish: Publish, kind: str) -> None:
     """Also when the name is gone, and the segment object."""
     name = publish(5000)
-    calls: list[int] = []
-
-    def on_unmap(memory: Owned) -> None:
-        calls.append(memory.value)
-
-    segment = attach(name, shm_dir=shm.path, on_unmap=on_unmap)
+    sink: SimpleQueue[Owned | None] = SimpleQueue()
+    segment = attach(name, shm_dir=shm.path, sinks=[sink])
     xyz = segment.column(0)
     expected = xyz.copy()
     view: object = {
@@ -77,13 +74,14 @@ def test_the_mapping_lives_as_long_as_any_view(shm: ShmDirectory, publish: Publi
     shm.unlink(name)
     del segment, xyz
     gc.collect()
-    assert calls == []
+    assert sink.empty()
     assert mappings_under(name) == 1
     if kind == "column":
         assert np.array_equal(view, expected)  # type: ignore[arg-type]
     del view
     gc.collect()
-    assert len(calls) == 1
+    assert sink.qsize() == 1
+    sink.get_nowait()
     assert mappings_under(name) == 0
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -14,10 +15,11 @@ import pytest
 from shmmap.cli.entry import main
 from shmmap.errors import BadRequest, ConfigError, MapMissing
 from shmmap.segment.names import HUGE_PAGES_DIR
-from shmmap.service import installation, program
+from shmmap.service import program
+from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import check_possible
 from shmmap.service.installation import PlannedFile, configuration, plan_system, plan_user, unit_text, write
-from shmmap.service.program import bridge_command, daemon_command, hidden_directories, outermost, quoted
+from shmmap.service.program import Program, command_line, outermost, quoted
 from shmmap.service.shipped_files import shipped_names, shipped_text
 from tests.support.daemon_process import ROOT
 
@@ -27,10 +29,40 @@ else:
     import tomli as tomllib
 
 
-def test_a_service_for_the_machine(tmp_path: Path) -> None:
-    planned = plan_system(root=str(tmp_path))
-    names = {str(one.path.relative_to(tmp_path)) for one in planned}
-    assert names >= {
+def executable(path: Path, text: str = "") -> None:
+    """Make a file that can be run."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    """Return the root of an image's file system that has the program and a map."""
+    root = tmp_path / "image"
+    executable(root / "usr/bin/python3.11")
+    executable(root / "usr/bin/kill")
+    (root / "bin").symlink_to("usr/bin")
+    (root / "usr/bin/python3").symlink_to("python3.11")
+    for name in ("shmmapd", "shmmap-ros-bridge"):
+        executable(root / "opt/shmmap/bin" / name, "#!/opt/shmmap/bin/python3\n")
+    (root / "opt/shmmap/bin/python3").symlink_to("/usr/bin/python3")
+    (root / "srv/map").mkdir(parents=True)
+    return root
+
+
+def paths_in(text: str) -> set[str]:
+    """Every absolute path that a unit or a configuration names, but for what is made at start."""
+    lines = [line for line in text.splitlines() if not line.startswith(("#", ";"))]
+    found = {path for line in lines for path in re.findall(r'(?:^|[\s="\'])(/[^\s"\'$%:]+)', line)}
+    return {path for path in found if not path.startswith(("/run", "/dev", "/proc", "/sys", "/var"))}
+
+
+def test_an_image_names_nothing_outside_of_itself(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whichever Python writes it, and wherever the image lies on this machine."""
+    assert main(["unit", "install", "--root", str(image), "--map", "/srv/map"]) == 0
+    written = [path for path in (image / "etc").rglob("*") if path.is_file()]
+    assert {str(path.relative_to(image)) for path in written} >= {
         "etc/systemd/system/shmmapd.service",
         "etc/systemd/system/shmmapd.socket",
         "etc/systemd/system/shmmapd@.service",
@@ -40,50 +72,161 @@ def test_a_service_for_the_machine(tmp_path: Path) -> None:
         "etc/tmpfiles.d/shmmap.conf",
         "etc/shmmap/shmmap.toml",
     }
-    assert {one.action for one in planned} == {"new"}
-    write(planned)
-    assert {one.action for one in plan_system(root=str(tmp_path))} == {"same", "kept"}
-    unit = (tmp_path / "etc/systemd/system/shmmapd.service").read_text()
-    assert f"\nExecStart={daemon_command()} --config %E/shmmap/shmmap.toml\n" in unit
-    bridge = (tmp_path / "etc/systemd/system/shmmap-ros-bridge.service").read_text()
-    assert f"\nExecStart={bridge_command()} $ROS_BRIDGE_OPTIONS\n" in bridge
-    assert sorted(path.name for path in tmp_path.rglob(".*")) == []
+    named = set[str]()
+    for path in written:
+        text = path.read_text()
+        assert str(image) not in text
+        assert sys.prefix not in text
+        named |= paths_in(text)
+    assert named >= {"/opt/shmmap/bin/shmmapd", "/opt/shmmap/bin/shmmap-ros-bridge", "/srv/map"}
+    there = FileSystem(str(image))
+    assert {path for path in named if there.status(path) is None} <= {"/usr/sbin/nologin", "/"}
+    config = tomllib.loads((image / "etc/shmmap/shmmap.toml").read_text())
+    assert config == {"map_path": "/srv/map", "group": "shmmap"}
+    assert f"systemctl --root={image} enable shmmapd" in capsys.readouterr().out
+    assert {one.action for one in plan_system("/srv/map", str(image))} == {"same", "kept"}
+    assert sorted(path.name for path in (image / "etc").rglob(".*")) == []
 
 
-def test_units_are_replaced_and_the_configuration_is_kept(tmp_path: Path) -> None:
-    write(plan_system(root=str(tmp_path)))
-    unit = tmp_path / "etc/systemd/system/shmmapd.service"
-    config = tmp_path / "etc/shmmap/shmmap.toml"
+def test_a_map_of_an_image(image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be named as there or as here; one that lies elsewhere is refused."""
+    outside = tmp_path / "map"
+    outside.mkdir()
+    for given in ("/srv/map", str(image / "srv/map"), str(image / "srv/../srv/map")):
+        config = plan_system(given, str(image))[-1].text
+        assert tomllib.loads(config)["map_path"] == "/srv/map"
+    (image / "maps").symlink_to("/srv")  # leads nowhere here
+    assert tomllib.loads(plan_system("/maps/map", str(image))[-1].text)["map_path"] == "/maps/map"
+    (image / "trap").symlink_to(outside)
+    for given in (str(outside), "/trap", "/no", "/srv/map/../../../.." + str(outside)):
+        with pytest.raises(MapMissing, match="below"):
+            plan_system(given, str(image))
+    drop_in = image / "etc/systemd/system/shmmapd.service.d/20-map.conf"
+    for hidden in (True, False):
+        monkeypatch.setattr(program, "_HIDDEN", ("/srv",) if hidden else ())
+        write(plan_system("/srv/map", str(image)))
+        assert ("\nBindReadOnlyPaths=/srv/map\n" in drop_in.read_text()) == hidden
+
+
+def test_links_do_not_lead_out_of_an_image(image: Path, tmp_path: Path) -> None:
+    """An absolute link starts at the image's root, and `..` ends there; what is linked to is not written."""
+    elsewhere = tmp_path / "etc"
+    elsewhere.mkdir()
+    (image / "private/etc").mkdir(parents=True)
+    (image / "etc").symlink_to("/private/etc")
+    (image / "private/etc/systemd").symlink_to("../../../../../usr/lib/systemd")
+    (image / "private/etc/sysusers.d").symlink_to(elsewhere)
+    kept = elsewhere / "shmmap.conf"
+    kept.write_text("of this machine")
+    write(plan_system("/srv/map", str(image)))
+    assert (image / "usr/lib/systemd/system/shmmapd.service").is_file()
+    assert (image / "private/etc/shmmap/shmmap.toml").is_file()
+    assert (image / str(elsewhere).lstrip("/") / "shmmap.conf").is_file()
+    assert kept.read_text() == "of this machine"
+    assert list(elsewhere.iterdir()) == [kept]
+    (image / "private/etc/tmpfiles.d").mkdir(exist_ok=True)
+    (image / "private/etc/shmmap").rename(image / "private/etc/away")
+    (image / "private/etc/shmmap").symlink_to("shmmap")
+    assert main(["unit", "install", "--root", str(image)]) == 73
+
+
+@pytest.mark.parametrize("what", ["link", "pipe", "latin-1", "large", "directory"])
+def test_whatever_lies_where_a_unit_goes(image: Path, tmp_path: Path, what: str) -> None:
+    unit = image / "etc/systemd/system/shmmapd.service"
+    unit.parent.mkdir(parents=True)
+    other = tmp_path / "other"
+    if what == "link":
+        other.write_text("stays")
+        unit.symlink_to(other)
+    elif what == "pipe":
+        os.mkfifo(unit)
+    elif what == "directory":
+        unit.mkdir()
+    else:
+        unit.write_bytes("Beschreibung=Straße".encode("latin-1") if what == "latin-1" else b"x" * (1 << 24))
+    assert main(["unit", "install", "--root", str(image)]) == (73 if what == "directory" else 0)
+    if what != "directory":
+        assert unit.read_text() == unit_text(
+            "system/shmmapd.service", Program.in_image(FileSystem(str(image)))
+        )
+    if what == "link":
+        assert other.read_text() == "stays"
+    assert not list(unit.parent.glob(".*"))
+
+
+@pytest.mark.parametrize("root", ["", "no/such/directory", "file"])
+def test_a_root_that_is_none(
+    root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert main(["unit", "install", "--root", root]) == 2
+    assert "no directory" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_root_may_be_named_from_here(image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(image.parent)
+    assert main(["unit", "install", "--root", "image", "--map", "/srv/map"]) == 0
+    assert (image / "etc/systemd/system/shmmapd.service").is_file()
+
+
+def test_a_program_that_would_not_start_in_the_image(
+    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was made from outside, its Python is not there, others cannot read it, or there is none."""
+    script = image / "opt/shmmap/bin/shmmapd"
+    words = ["unit", "install", "--root", str(image)]
+    executable(script, f"#!{image}/opt/shmmap/bin/python3\n")
+    assert main(words) == 78
+    assert f"run by {image}/opt/shmmap/bin/python3" in capsys.readouterr().err
+    executable(script, "#!/opt/shmmap/bin/python3\n")
+    (image / "usr/bin/python3.11").unlink()
+    assert main(words) == 78
+    assert "chroot IMAGE sh -c 'python3 -m venv /opt/shmmap" in capsys.readouterr().err
+    executable(image / "usr/bin/python3.11")
+    (image / "opt/shmmap").chmod(0o700)
+    assert main(words) == 78
+    assert "only its owner may read /opt/shmmap" in capsys.readouterr().err
+    (image / "opt/shmmap").chmod(0o755)
+    script.unlink()
+    assert main(words) == 78
+    assert "no shmmap is installed below" in capsys.readouterr().err
+    executable(image / "usr/bin/shmmapd", "#!/usr/bin/python3\n")
+    assert main(words) == 0
+    unit = (image / "etc/systemd/system/shmmapd.service").read_text()
+    assert "\nExecStart=/usr/bin/shmmapd --config" in unit
+    bridge = (image / "etc/systemd/system/shmmap-ros-bridge.service").read_text()
+    assert "\nExecStart=/usr/bin/python3 -m shmmap_clients.ros_bridge " in bridge
+
+
+def test_a_python_that_the_units_would_hide_is_shown(image: Path) -> None:
+    python = image / "home/robot/.pyenv/versions/3.12/bin/python3"
+    executable(python)
+    (image / "opt/shmmap/bin/python3").unlink()
+    (image / "opt/shmmap/bin/python3").symlink_to("/home/robot/.pyenv/versions/3.12/bin/python3")
+    write(plan_system("", str(image)))
+    drop_in = image / "etc/systemd/system/shmmapd.service.d/10-program.conf"
+    assert "\nBindReadOnlyPaths=/home/robot/.pyenv/versions/3.12\n" in drop_in.read_text()
+
+
+def test_units_are_replaced_and_the_configuration_is_kept(image: Path) -> None:
+    write(plan_system(root=str(image)))
+    unit = image / "etc/systemd/system/shmmapd.service"
+    config = image / "etc/shmmap/shmmap.toml"
     unit.write_text("old")
     config.write_text("mine")
-    actions = {one.path: one.action for one in plan_system(root=str(tmp_path))}
+    actions = {one.path: one.action for one in plan_system(root=str(image))}
     assert (actions[unit], actions[config]) == ("changed", "kept")
-    write(plan_system(root=str(tmp_path)))
-    assert unit.read_text() == unit_text("system/shmmapd.service")
+    write(plan_system(root=str(image)))
+    assert unit.read_text() == unit_text("system/shmmapd.service", Program.in_image(FileSystem(str(image))))
     assert config.read_text() == "mine"
 
 
-def test_a_map_and_what_would_hide_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drop_in = tmp_path / "etc/systemd/system/shmmapd.service.d/20-map.conf"
-    the_map = tmp_path / "a map"
-    the_map.mkdir()
-    monkeypatch.setattr(installation, "check_readable", lambda: None)  # this Python may lie anywhere
-    for hidden in (True, False):
-        monkeypatch.setattr(program, "_HIDDEN", (str(tmp_path),) if hidden else ())
-        planned = plan_system(str(the_map), str(tmp_path))
-        write(planned)
-        text = drop_in.read_text()
-        assert (f'\nBindReadOnlyPaths="{the_map}"\n' in text) == hidden
-        config = tomllib.loads((tmp_path / "etc/shmmap/shmmap.toml").read_text())
-        assert config == {"map_path": str(the_map), "group": "shmmap"}
-    with pytest.raises(MapMissing, match="no-map"):
-        plan_system(str(tmp_path / "no-map"), str(tmp_path))
-
-
-def test_huge_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert not any("huge" in one.path.name for one in plan_system(root=str(tmp_path)))
-    assert main(["unit", "install", "--root", str(tmp_path), "--huge-pages"]) == 0
-    units = tmp_path / "etc/systemd/system"
+def test_huge_pages(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert not any("huge" in one.path.name for one in plan_system(root=str(image)))
+    assert main(["unit", "install", "--root", str(image), "--huge-pages"]) == 0
+    units = image / "etc/systemd/system"
     mount = (units / "run-shmmap_huge.mount").read_text()
     assert f"\nWhere={HUGE_PAGES_DIR}\n" in mount
     assert "\nOptions=huge=within_size,size=50%%," in mount
@@ -91,9 +234,7 @@ def test_huge_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         drop_in = (units / f"{service}.d" / "30-huge-pages.conf").read_text()
         for line in ("RequiresMountsFor=", "ReadWritePaths=", "Environment=SHMMAP_SHM_DIR="):
             assert f"\n{line}{HUGE_PAGES_DIR}\n" in drop_in
-    assert sum("huge" in one.path.name for one in plan_system(root=str(tmp_path))) == 3, (
-        "an upgrade keeps them"
-    )
+    assert sum("huge" in one.path.name for one in plan_system(root=str(image))) == 3, "an upgrade keeps them"
     assert "systemctl stop" not in capsys.readouterr().out
     assert main(["unit", "install", "--user", "--huge-pages", "--dry-run"]) == 2
     assert "mount -o remount,huge=within_size /dev/shm" in capsys.readouterr().err
@@ -138,32 +279,35 @@ def test_words_in_units(word: str, written: str) -> None:
 def test_what_hides_this_python(monkeypatch: pytest.MonkeyPatch) -> None:
     assert outermost(["/home/a/b", "/home/a", "/home/ab", "/home/a"]) == ["/home/a", "/home/ab"]
     monkeypatch.setattr(program, "_HIDDEN", ())
-    assert hidden_directories() == []
+    assert Program.this_one().hidden_directories == []
     monkeypatch.setattr(program, "_HIDDEN", (str(ROOT), "/no"))
-    found = hidden_directories([str(ROOT / "shmmap"), str(ROOT), "", "/no/such/directory"])
-    assert found == [str(ROOT)]
+    monkeypatch.setattr(sys, "path", [str(ROOT / "shmmap"), str(ROOT), "", "/no/such/directory"])
+    monkeypatch.setattr(sys, "prefix", "/usr")
+    assert Program.this_one().hidden_directories == [str(ROOT)]
 
 
 def test_a_program_that_the_service_cannot_read_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = tmp_path / "venv"
     place.mkdir()
     monkeypatch.setattr(sys, "prefix", str(place))
-    tmp_path.chmod(0o755)
+    opened_above(tmp_path)
     place.chmod(0o700)
-    words = ["unit", "install", "--root", str(tmp_path / "image")]
-    assert main(words) == 78
-    said = capsys.readouterr().err
-    assert f"only its owner may read {place}\n" in said
-    assert "python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install ." in said
-    assert not (tmp_path / "image").exists()
-    place.chmod(0o755)
-    assert main(words) == 0
+    with pytest.raises(ConfigError, match=f"only its owner may read {place} ") as refused:
+        Program.this_one().check_readable()
+    assert "python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install ." in refused.value.hint
     # a user's own service runs as that user
-    place.chmod(0o700)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     assert main(["unit", "install", "--user", "--dry-run"]) == 0
+
+
+def opened_above(path: Path) -> None:
+    """Let others enter the directories of a test."""
+    for above in (path, *path.parents):
+        if above == Path(tempfile.gettempdir()):
+            break
+        above.chmod(0o755)
 
 
 @pytest.mark.parametrize("shown", [True, False])
@@ -172,41 +316,20 @@ def test_what_lies_above_does_not_matter_where_the_units_show_it(
 ) -> None:
     home = tmp_path / "home"
     (home / "venv").mkdir(parents=True)
+    opened_above(tmp_path)
     home.chmod(0o700)
-    monkeypatch.setattr(sys, "prefix", str(home / "venv"))
-    others = [place for place in hidden_directories() if not place.startswith(str(tmp_path))]
-    monkeypatch.setattr(program, "hidden_directories", lambda: others + [str(home / "venv")] * shown)
-    for above in (tmp_path, *tmp_path.parents):
-        if above == Path(tempfile.gettempdir()):
-            break
-        above.chmod(0o755)
+    monkeypatch.setattr(program, "_HIDDEN", (str(home),) if shown else ())
+    one = Program(("x",), ("x",), (str(home / "venv"),), (str(home / "venv"),))
     if shown:
-        program.check_readable()
+        one.check_readable()
     else:
         with pytest.raises(ConfigError, match=str(home)):
-            program.check_readable()
-
-
-def test_in_an_image_the_program_is_where_the_image_has_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    script = tmp_path / "image" / "opt" / "shmmap" / "bin" / "shmmapd"
-    script.parent.mkdir(parents=True)
-    script.write_text("#!/bin/sh\n")
-    script.chmod(0o755)
-    monkeypatch.setattr(sys, "prefix", str(script.parent.parent))
-    monkeypatch.setattr(installation, "check_readable", lambda: None)
-    write(plan_system(root=str(tmp_path / "image")))
-    units = tmp_path / "image" / "etc" / "systemd" / "system"
-    for name in ("shmmapd.service", "shmmapd@.service"):
-        assert "\nExecStart=/opt/shmmap/bin/shmmapd " in (units / name).read_text()
-    assert daemon_command() == str(script)
-    assert daemon_command(str(tmp_path / "ima")) == str(script)
+            one.check_readable()
 
 
 def test_the_daemon_s_command_starts_the_daemon() -> None:
     done = subprocess.run(
-        f"exec {daemon_command()} --help",
+        f"exec {command_line(Program.this_one().daemon)} --help",
         shell=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -219,7 +342,7 @@ def test_the_daemon_s_command_starts_the_daemon() -> None:
 def test_the_bridge_s_command_starts_the_bridge() -> None:
     paths = os.pathsep.join([str(ROOT), str(ROOT / "clients")])
     done = subprocess.run(
-        f"exec {bridge_command()} --help",
+        f"exec {command_line(Program.this_one().bridge)} --help",
         shell=True,
         env={**os.environ, "PYTHONPATH": paths},
         capture_output=True,
@@ -243,16 +366,16 @@ def test_printing(capsys: pytest.CaptureFixture[str]) -> None:
         shipped_text("/etc/passwd")
 
 
-def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["unit", "install", "--root", str(tmp_path), "--dry-run"]) == 0
-    assert f"new  {tmp_path}/etc/shmmap/shmmap.toml" in capsys.readouterr().out
-    assert list(tmp_path.iterdir()) == []
-    assert main(["unit", "install", "--root", str(tmp_path), "--map", str(tmp_path / "none")]) == 66
+def test_a_dry_run_writes_nothing(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["unit", "install", "--root", str(image), "--dry-run"]) == 0
+    assert f"new  {image}/etc/shmmap/shmmap.toml" in capsys.readouterr().out
+    assert not (image / "etc").exists()
+    assert main(["unit", "install", "--root", str(image), "--map", str(image / "none")]) == 66
 
 
-def test_what_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "etc").write_text("in the way")
-    assert main(["unit", "install", "--root", str(tmp_path)]) == 73
+def test_what_cannot_be_written(image: Path) -> None:
+    (image / "etc").write_text("in the way")
+    assert main(["unit", "install", "--root", str(image)]) == 73
 
 
 def test_planned_files_know_what_they_replace(tmp_path: Path) -> None:

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 from dataclasses import replace
 
+from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics import identity as identity_module
 from shmmap.statistics.identity import DaemonIdentity, WriterProcess, judge, start_time_ticks
+from shmmap.statistics.reader import read_statistics
+from shmmap.statistics.writer import StatisticsWriter
 
 _SLEEPER = "import sys; print('up', flush=True); sys.stdin.read()"
 
@@ -42,3 +46,11 @@ def test_states_of_a_real_process(identity: DaemonIdentity) -> None:
         process.wait()
         assert judge(other, 0.1) == watched.state(0.1) == "dead"
         watched.close()
+
+
+def test_starting_until_it_listens(shm: ShmDirectory, identity: DaemonIdentity) -> None:
+    with contextlib.closing(StatisticsWriter(shm, "unit", identity, starting=True)) as writer:
+        assert read_statistics("unit", shm.path).state == "starting"
+        writer.set("starting", 0)
+        writer.beat()
+        assert read_statistics("unit", shm.path).state == "healthy"

@@ -29,6 +29,7 @@
 #include <locale>
 #include <mutex>
 #include <set>
+#include <shmmap/point_cloud2.hpp>
 #include <shmmap/shmmap.hpp>
 #include <sstream>
 
@@ -38,8 +39,11 @@ namespace shmmap {
 struct LoaderOptions {
   Options client = {};  ///< how the daemon is found
   double wait = 10.0;   ///< seconds, at most 3600; see above
-  /// Told what could not be had, a line each time; nobody, if empty.  It is called in the caller's thread.
+  /// Gets a line about what could not be had.  It is called in the caller's thread.
   std::function<void(const std::string&)> log = {};
+  /// Asked ten times a second while a call waits: where it returns false the call ends with what has come by then.
+  /// Of a node: `[] { return rclcpp::ok(); }`, lest a request delay its end.
+  std::function<bool()> keep_waiting = {};
 };
 
 namespace detail {
@@ -56,7 +60,9 @@ struct Difference {
 class HeldCells {
  public:
   HeldCells(LoaderOptions options, std::string layer)
-      : options_(std::move(options)), layer_(std::move(layer)) {}
+      : options_(std::move(options)), layer_(std::move(layer)) {
+    if (options_.keep_waiting) options_.client.keep_waiting = options_.keep_waiting;
+  }
 
   /// What `cached` lacks of an area, each cell as `make` makes it out of the mapped one, and what it has in
   /// vain; no value, and nothing forgotten, where something is missing and no other cell has come.  Cells are
@@ -106,7 +112,7 @@ class HeldCells {
         for (const auto& [id, layer] : answer.pending) lacks(id, id + ": it is still being loaded");
         // room comes of what is let go here; and for a map that is not known yet no request waits
         again = (!covered || !answer.pending.empty() || (no_room && !answer.cells.empty())) &&
-                Clock::now() < until;
+                Clock::now() < until && is_wanted();
         if (again && answer.cells.empty()) ::poll(nullptr, 0, 20);
       }
       if (!covered && trouble.empty()) trouble = "not all of the map is known yet";
@@ -138,12 +144,14 @@ class HeldCells {
   }
 
  private:
+  [[nodiscard]] bool is_wanted() const { return !options_.keep_waiting || options_.keep_waiting(); }
+
   Answer asked(const Area& area, const std::map<std::string, std::uint64_t>& held, Clock::time_point until) {
     while (!client_) {
       try {
         client_.emplace(options_.client);
       } catch (const Unreachable& error) {
-        if (error.code() == "no_permission" || Clock::now() >= until) throw;
+        if (error.code() == "no_permission" || Clock::now() >= until || !is_wanted()) throw;
         ::poll(nullptr, 0, 20);  // nobody says when it listens
       }
     }
@@ -154,7 +162,7 @@ class HeldCells {
     return client_->differential(area, have, {}, {layer_}, std::max(0.0, left));
   }
 
-  const LoaderOptions options_;
+  LoaderOptions options_;
   const std::string layer_;
   std::mutex mutex_;
   std::optional<Client> client_;
@@ -173,122 +181,9 @@ std::vector<std::string> ids_of(const Request& request) {
   return {request.cached_ids.begin(), request.cached_ids.end()};
 }
 
-// --- points ----------------------------------------------------------------------------------------------
-
-/// A field of `sensor_msgs/PointCloud2`, and where its values are in shared memory.
-struct PointField {
-  std::string name;
-  std::uint8_t datatype = 0;
-  std::uint32_t count = 1, offset = 0;
-  const unsigned char* from = nullptr;
-  std::size_t bytes = 0;  // of one point
-};
-
-/// `sensor_msgs/PointField`'s number of a dtype; 0 where it has none: integers of 64 bits, floats of 16.
-inline std::uint8_t datatype_of(std::string_view dtype) {
-  constexpr std::array<std::string_view, 8> known{"|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"};
-  for (std::size_t at = 0; at < known.size(); ++at)
-    if (known[at] == dtype) return static_cast<std::uint8_t>(at + 1);
-  return 0;
-}
-
-template <std::size_t bytes>
-void spread(const unsigned char* from, std::size_t points, unsigned char* to, std::size_t step) {
-  for (; points > 0; --points, from += bytes, to += step) std::memcpy(to, from, bytes);
-}
-
-/// Put one field's values at their places in so many points.
-inline void spread(const PointField& field, std::size_t first, std::size_t points, unsigned char* to,
-                   std::size_t step) {
-  const unsigned char* from = field.from + first * field.bytes;
-  to += first * step + field.offset;
-  switch (field.bytes) {
-    case 1: return spread<1>(from, points, to, step);
-    case 2: return spread<2>(from, points, to, step);
-    case 4: return spread<4>(from, points, to, step);
-    case 8: return spread<8>(from, points, to, step);
-    case 12: return spread<12>(from, points, to, step);
-    default:
-      for (; points > 0; --points, from += field.bytes, to += step) std::memcpy(to, from, field.bytes);
-  }
-}
-
-/// The fields of a cell's points, x, y, z first, each beside the one before; `xyz32` keeps coordinates that
-/// the map has in 64 bits: PCL's points have 32.
-inline std::vector<PointField> point_fields(const Cell& cell, std::vector<float>& xyz32) {
-  std::vector<PointField> fields;
-  std::size_t offset = 0;
-  const auto add = [&](const std::string& name, std::uint8_t datatype, std::size_t count, const void* from,
-                       std::size_t bytes) {
-    fields.push_back({name, datatype, static_cast<std::uint32_t>(count), static_cast<std::uint32_t>(offset),
-                      static_cast<const unsigned char*>(from), bytes});
-    offset += bytes;
-  };
-  for (const Column& column : cell.columns) {
-    const std::size_t rows = static_cast<std::size_t>(column.shape.front());
-    std::uint64_t count = 1;
-    for (std::size_t axis = 1; axis < column.shape.size(); ++axis) count *= column.shape[axis];
-    if (rows != cell.rows) throw SegmentError("segment_corrupt", cell.id + ": its columns differ in length");
-    if (column.name == "xyz") {
-      if (count != 3) throw SegmentError("segment_corrupt", cell.id + ": a point has not three coordinates");
-      const void* from = column.data;
-      if (column.dtype == "<f8") {
-        const auto values = cell.column<double>("xyz");
-        xyz32.resize(values.size());
-        std::transform(values.begin(), values.end(), xyz32.begin(),
-                       [](double one) { return static_cast<float>(one); });
-        from = xyz32.data();
-      } else if (column.dtype != "<f4") {
-        throw BadRequest("bad_request", cell.id + ": its coordinates are " + column.dtype);
-      }
-      for (const char* name : {"x", "y", "z"}) add(name, datatype_of("<f4"), 1, nullptr, 4);
-      fields[fields.size() - 3].from = static_cast<const unsigned char*>(from);
-    } else if (const auto datatype = datatype_of(column.dtype); datatype != 0 && count != 0) {
-      add(column.name, datatype, static_cast<std::size_t>(count), column.data,
-          static_cast<std::size_t>(count) * bytes_of(column.dtype));
-    }
-  }
-  if (cell.rows > std::numeric_limits<std::uint32_t>::max() / std::max<std::size_t>(offset, 1))
-    throw BadRequest("bad_request", cell.id + ": it has more points than a message can");
-  return fields;
-}
-
-/// Fill a `sensor_msgs/PointCloud2` of any kind with a cell's points, as `pcl::io::loadPCDFile` does.
-template <typename Cloud>
-void fill(Cloud& cloud, const Cell& cell) {
-  std::vector<float> xyz32;
-  auto fields = point_fields(cell, xyz32);
-  std::size_t step = 0;
-  for (const auto& field : fields) {
-    typename std::decay_t<decltype(cloud.fields)>::value_type one;
-    one.name = field.name;
-    one.offset = field.offset;
-    one.datatype = field.datatype;
-    one.count = field.count;
-    cloud.fields.push_back(std::move(one));
-    step += field.bytes;
-  }
-  // x, y, z lie side by side there as here: they are copied as one
-  fields.erase(
-      std::remove_if(fields.begin(), fields.end(), [](const auto& one) { return one.from == nullptr; }),
-      fields.end());
-  for (auto& field : fields)
-    if (field.name == "x") field.bytes = 12;
-  const auto points = static_cast<std::size_t>(cell.rows);
-  cloud.height = 1;
-  cloud.width = static_cast<std::uint32_t>(points);
-  cloud.point_step = static_cast<std::uint32_t>(step);
-  cloud.row_step = static_cast<std::uint32_t>(points * step);
-  cloud.is_bigendian = false;
-  cloud.is_dense = true;
-  cloud.data.resize(points * step);
-  constexpr std::size_t block = 1024;  // of points: they stay in the cache until all their fields are there
-  for (std::size_t first = 0; first < points; first += block)
-    for (const auto& field : fields)
-      spread(field, first, std::min(block, points - first), cloud.data.data(), step);
-}
-
 }  // namespace detail
+
+// --- points ----------------------------------------------------------------------------------------------
 
 /// Answers `GetDifferentialPointCloudMap` requests: what Autoware calls a `PcdLoaderFunction`.
 ///

@@ -82,8 +82,8 @@ class Cell {
                                           std::string(detail::dtype_of<T>()));
     const std::uint64_t count = found.shape.front();
     const std::uint64_t values = found.nbytes / sizeof(T);
-    return Values<T>(static_cast<const T*>(found.data), static_cast<std::size_t>(count),
-                     static_cast<std::size_t>(count != 0 ? values / count : 0));
+    return Values<T>(static_cast<const T*>(found.data), count,
+                     count != 0 ? values / count : 0);
   }
 
   /// A column by name, whatever its values are; throws NoColumn.

@@ -13,6 +13,7 @@
 #include <algorithm>
 #include <array>
 #include <chrono>
+#include <cstddef>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -37,13 +38,11 @@
 namespace shmmap {
 
 namespace detail {
-class NothingNew;
-
 using CellKey = std::pair<std::uint64_t, std::string>;  // version and layer, which name the bytes
 
 struct HashOfCellKey {
   std::size_t operator()(const CellKey& key) const noexcept {
-    return static_cast<std::size_t>(key.first) ^ std::hash<std::string>()(key.second);
+    return key.first ^ std::hash<std::string>()(key.second);
   }
 };
 
@@ -75,9 +74,27 @@ struct Options {
   std::string name = {};      ///< how the program is listed (`shmmap top`); at most 64 characters
   std::string shm_dir = {};   ///< where this process finds segments; empty: `SHMMAP_SHM_DIR`, or as the daemon says
   double patience = 5.0;      ///< seconds to wait for an answer, beyond those that the daemon may take
+  /// Asked ten times a second while a request waits; where it returns false the request ends with `Interrupted`.
+  std::function<bool()> keep_waiting = {};
 };
 
 namespace detail {
+
+/// A request whose answer may be taken in a later call than the one that sent it.
+struct Exchange {
+  std::uint64_t number = 0;
+  std::string message;
+  std::string_view tag;  // of its answer
+  double wait = 0.0;     // seconds that the daemon may take
+  Clock::time_point since = Clock::now();  // or since the connection was lost
+  Clock::time_point repeat_at = {};        // on silence
+  double pause = 0.0;                      // until then; 0: it has not been sent on this connection
+  std::string reply = {};                  // where it came while another answer was waited for
+
+  [[nodiscard]] Clock::time_point overdue(double patience) const {
+    return since + std::chrono::duration_cast<Clock::duration>(Seconds(std::min(wait + patience, 1e6)));
+  }
+};
 
 inline std::string short_text(double number) {
   std::array<char, 32> text{};
@@ -111,26 +128,25 @@ class Client {
   static constexpr double default_wait = 5.0;
 
   /// Find the daemon and open a session; throws Unreachable, ProtocolMismatch, Refused.
-  explicit Client(Options options = {}) : options_(std::move(options)) {
-    if (options_.shm_dir.empty()) options_.shm_dir = detail::variable("SHMMAP_SHM_DIR");
-    std::optional<Unreachable> telling;  // of several refusals the first one where there is something at all
-    for (const auto& path : detail::endpoints(options_.endpoint)) {
+  explicit Client(Options options = {}) : Client(std::move(options), nullptr) {
+    std::optional<Unreachable> first;  // of several refusals the first one where there is something at all
+    for (auto& path : std::exchange(paths_, {})) {
       try {
-        path_ = path;
+        paths_ = {std::move(path)};
         connect();
         return;
       } catch (const Unreachable& error) {
         if (error.code() == "no_answer") throw;  // it is there: the next one might serve another map
-        if (!telling || telling->code() == "no_socket") telling = error;
+        if (!first || first->code() == "no_socket") first = error;
       }
     }
-    throw *telling;
+    throw *first;
   }
   Client(Client&&) = default;
   Client& operator=(Client&&) = default;
   ~Client() {
     try {
-      if (socket_.is_open()) socket_.send(begun("bye", next_request(), 0).data());
+      if (socket_.is_open() && !hello_) socket_.send(begun("bye", next_request(), 0).data());
     } catch (const std::exception&) {  // it is over anyway
     }
   }
@@ -154,13 +170,7 @@ class Client {
                       std::optional<double> wait = default_wait,
                       const std::optional<Intent>& intent = std::nullopt) {
     return cells("differential", wait, [&](detail::Writer& to) {
-      detail::write(to, area);
-      detail::write(to, layers);
-      to.array(held.size());
-      for (const Held& one : held) detail::write(to, one);
-      to.binary(packed.data(), packed.size() * sizeof(std::uint64_t));
-      detail::write(to, wait);
-      detail::write(to, intent);
+      write_differential(to, area, held, packed, layers, wait, intent);
     }, 6);
   }
 
@@ -194,6 +204,8 @@ class Client {
 
   /// Counts the daemon's lives.
   [[nodiscard]] std::uint64_t epoch() const noexcept { return welcome_.epoch; }
+  /// Which state of the map the last answer was about; 0 before the first one.
+  [[nodiscard]] std::uint64_t map_version() const noexcept { return map_version_; }
   /// The session's number, as in `shmmap top`.
   [[nodiscard]] std::uint64_t session() const noexcept { return welcome_.session; }
   [[nodiscard]] const std::string& instance() const noexcept { return welcome_.instance; }
@@ -204,15 +216,17 @@ class Client {
   /// Whether the connection stands, as far as the kernel knows; the next request makes another one.
   [[nodiscard]] bool is_connected() const noexcept { return socket_.stands(); }
   /// The daemon's socket.
-  [[nodiscard]] const std::string& path() const noexcept { return path_; }
+  [[nodiscard]] const std::string& path() const noexcept { return path_.empty() ? paths_.front() : path_; }
 
  private:
   friend class Window;
   friend class EventStream;
-  friend class detail::NothingNew;
   using Clock = detail::Clock;
 
   static constexpr double greeting_s = 1.0;
+  static constexpr std::size_t most_request_bytes = std::size_t{4} << 20;  // more ends the connection
+  static constexpr std::chrono::milliseconds look_again{20};  // for a daemon that does not listen
+  static constexpr double attach_s = 0.2;  // for the daemon to have looked at a segment
   static constexpr int attempts = 8;
   static constexpr int rounds = 5;  // a listing is begun again when the map has changed meanwhile
   static constexpr std::uint64_t page_rows = 10'000;
@@ -231,77 +245,214 @@ class Client {
     return message;
   }
 
+  /// A client that connects with its first request.
+  Client(Options options, std::nullptr_t)
+      : options_(std::move(options)), paths_(detail::endpoints(options_.endpoint)) {
+    if (options_.shm_dir.empty()) options_.shm_dir = detail::variable("SHMMAP_SHM_DIR");
+  }
+
   // --- the connection ---
 
   void connect() {
-    socket_ = detail::Socket(path_, detail::ready_of_dealer);
-    const auto number = next_request();
-    auto message = begun("hello", number, 4);
+    if (is_welcome(after(greeting_s))) return;
+    disconnect();
+    throw Unreachable("no_answer", path() + ": the daemon does not answer", "it is stopped, hung or overloaded");
+  }
+
+  void disconnect() {
+    socket_ = detail::Socket();
+    hello_.reset();
+    if (exchange_) exchange_->pause = 0.0, exchange_->since = Clock::now();
+  }
+
+  /// Connect where there is no connection; returns whether the daemon has said welcome, false if not until then.
+  bool is_welcome(Clock::time_point until) {
+    if (!socket_.is_open()) greet();
+    if (!hello_) return true;
+    try {
+      std::string reply;
+      if (!is_answered(*hello_, "welcome", reply, until)) return false;
+      detail::Reader reader(reply);
+      detail::Row row(reader);
+      row.get().skip(1);
+      row.get().skip(1);
+      welcome_ = detail::read_welcome(row);
+    } catch (const Unreachable&) {
+      throw;
+    } catch (const Interrupted&) {
+      throw;
+    } catch (const Error&) {  // the connection is of no use
+      disconnect();
+      throw;
+    }
+    hello_.reset();
+    paths_ = {path_};
+    look_whose_segments();
+    return true;
+  }
+
+  /// Connect to the first socket at which a daemon listens, and say hello.
+  void greet() {
+    std::optional<Unreachable> first;
+    for (const auto& path : paths_) {
+      try {
+        socket_ = detail::Socket(path, detail::ready_of_dealer);
+        path_ = path;
+        break;
+      } catch (const Unreachable& error) {
+        if (error.code() == "no_answer") throw;  // it is there
+        if (!first || first->code() == "no_socket") first = error;
+      }
+    }
+    if (!socket_.is_open()) throw *first;
+    hello_ = next_request();
+    auto message = begun("hello", *hello_, 4);
     message.number(1);
     message.number(4);
     message.text(options_.name);
     message.number(welcome_.session);
     socket_.send(message.data());
-    std::string reply;
-    const auto until = after(greeting_s);
-    while (socket_.receive(reply, until)) {
-      detail::Reader reader(reply);
-      detail::Row row(reader);
-      if (const auto tag = row.get().text(); is_answer(row, number, tag)) {
-        if (tag == "error") detail::read_error(row);
-        if (tag != "welcome") throw ProtocolMismatch("protocol_mismatch", "hello was answered by " + std::string(tag));
-        welcome_ = detail::read_welcome(row);
-        ++handshakes_;
-        look_whose_segments();
-        return;
-      }
-      row.end();
-    }
-    socket_ = detail::Socket();
-    throw Unreachable("no_answer", path_ + ": the daemon does not answer", "it is stopped, hung or overloaded");
   }
 
-  static bool is_answer(detail::Row& row, std::uint64_t number, std::string_view tag) {
-    const auto found = row.get().number();
-    return found == number || (found == 0 && tag == "error");
+  /// Receive until the answer to a request has come; false if it has not until then.  Throws what it says is wrong.
+  bool is_answered(std::uint64_t number, std::string_view tag, std::string& reply, Clock::time_point until) {
+    while (received(reply, until)) {
+      detail::Reader reader(reply);
+      detail::Row row(reader);
+      const auto kind = row.get().text();
+      const auto answered = row.get().number();
+      if (answered == number || (answered == 0 && kind == "error")) {
+        check_kind(row, kind, tag);
+        return true;
+      }
+      row.end();
+      if (exchange_ && answered == exchange_->number) exchange_->reply = reply;
+    }
+    return false;
+  }
+
+  static void check_kind(detail::Row& row, std::string_view kind, std::string_view tag) {
+    if (kind == tag) return;
+    if (kind == "error") detail::read_error(row);
+    const std::string asked(tag == "welcome" ? "hello" : tag);
+    throw ProtocolMismatch("protocol_mismatch", asked + " was answered by " + std::string(kind));
+  }
+
+  bool received(std::string& reply, Clock::time_point until) {
+    while (true) {
+      if (!options_.keep_waiting) return socket_.receive(reply, until);
+      if (socket_.receive(reply, std::min(until, after(0.1)))) return true;
+      if (Clock::now() >= until) return false;
+      check_waiting();
+    }
+  }
+
+  /// Throws Interrupted where the program does not want to wait any longer.
+  void check_waiting() const {
+    if (options_.keep_waiting && !options_.keep_waiting())
+      throw Interrupted("interrupted", path() + ": the program has ended the wait for the daemon's answer");
+  }
+
+  static void check_size(const std::string& message) {
+    if (message.size() > most_request_bytes)
+      throw BadRequest("bad_request", "the request has " + std::to_string(message.size()) +
+                                          " bytes, and a daemon takes at most 4 MiB",
+                       "ask for fewer cells at a time, or send versions (packed) in place of names");
   }
 
   /// Send a request until it is answered; `reply` is what came.
   void ask(std::uint64_t number, const std::string& message, std::string_view tag, double wait, std::string& reply) {
+    check_size(message);
     const auto deadline = after(wait + options_.patience);
     double pause = wait + 1.0;
     bool may_be_back = true;  // the first time it is asked at once
     while (true) {
       try {
-        if (!socket_.is_open()) connect();
+        connect();
         socket_.send(message);
         const auto until = std::min(deadline, after(pause));
         pause *= 2.0;
-        while (socket_.receive(reply, until)) {
-          detail::Reader reader(reply);
-          detail::Row row(reader);
-          const auto kind = row.get().text();
-          if (!is_answer(row, number, kind)) {
-            row.end();
-            continue;
-          }
-          if (kind == tag) return;
-          if (kind != "error")
-            throw ProtocolMismatch("protocol_mismatch", std::string(tag) + " was answered by " + std::string(kind));
-          detail::read_error(row);
-        }
+        if (is_answered(number, tag, reply, until)) return;
         if (Clock::now() >= deadline)
-          throw Unreachable("no_answer", path_ + ": no answer within " + detail::short_text(wait + options_.patience) +
+          throw Unreachable("no_answer", path() + ": no answer within " + detail::short_text(wait + options_.patience) +
                                              " s", "is the daemon stopped, hung or overloaded? see `shmmap health`");
       } catch (const Refused& error) {
         if (error.code() != "no_session" || Clock::now() >= deadline) throw;
-        socket_ = detail::Socket();  // hello on a new connection takes the session over
+        disconnect();  // hello on a new connection takes the session over
       } catch (const Unreachable& error) {
-        socket_ = detail::Socket();
+        disconnect();
         if (error.code() == "no_answer" || error.code() == "no_permission" || Clock::now() >= deadline) throw;
-        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, 20);  // nobody says when it listens again
+        check_waiting();
+        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // nobody says when it listens
       }
     }
+  }
+
+  // --- a request that outlasts a call ---
+
+  /// Have a request sent by `is_finished`.
+  void begin(std::uint64_t number, const std::string& message, std::string_view tag, double wait) {
+    check_size(message);
+    exchange_ = detail::Exchange{number, message, tag, wait};
+  }
+
+  /// Go on with the request that was begun: connect, greet, send, receive.  Returns whether its answer is in `reply`;
+  /// false if it has not come until then.  Unreachable: it is sent when a daemon listens again, or is on its way still;
+  /// other errors are its answer.
+  bool is_finished(std::string& reply, Clock::time_point until) {
+    for (bool may_be_back = true;; may_be_back = false) {
+      try {
+        const auto overdue = exchange_->overdue(options_.patience);
+        if (const auto limit = std::min(until, overdue); is_welcome(limit) && is_exchanged(reply, limit)) {
+          exchange_.reset();
+          return true;
+        }
+        if (Clock::now() < overdue) return false;
+        exchange_->since = Clock::now();
+        throw silent();
+      } catch (const Unreachable& error) {
+        if (error.code() == "no_answer" && socket_.is_open()) throw;
+        disconnect();
+        if (!may_be_back || error.code() == "no_answer" || error.code() == "no_permission") throw;
+      } catch (const Refused& error) {
+        if (may_be_back && error.code() == "no_session") {
+          disconnect();  // hello on a new connection takes the session over
+          continue;
+        }
+        exchange_.reset();
+        throw;
+      } catch (const Interrupted&) {
+        throw;
+      } catch (const Error&) {
+        exchange_.reset();
+        throw;
+      }
+    }
+  }
+
+  [[nodiscard]] Unreachable silent() const {
+    return Unreachable("no_answer", path() + ": the daemon does not answer",
+                       "is it stopped, hung or overloaded? see `shmmap health`");
+  }
+
+  bool is_exchanged(std::string& reply, Clock::time_point until) {
+    detail::Exchange& one = *exchange_;
+    while (one.reply.empty()) {
+      if (one.pause == 0.0 || Clock::now() >= one.repeat_at) {
+        socket_.send(one.message);
+        one.pause = one.pause == 0.0 ? one.wait + 1.0 : 2.0 * one.pause;
+        one.repeat_at = after(one.pause);
+      }
+      if (is_answered(one.number, one.tag, reply, std::min(until, one.repeat_at))) return true;
+      if (Clock::now() >= until) return false;
+    }
+    reply = std::move(one.reply);  // it came while another answer was waited for
+    detail::Reader reader(reply);
+    detail::Row row(reader);
+    const auto kind = row.get().text();
+    row.get().skip(1);
+    check_kind(row, kind, one.tag);
+    return true;
   }
 
   /// All pages of the map's list; nothing if it changed between them.
@@ -310,28 +461,52 @@ class Client {
     std::optional<std::uint64_t> start = 0;
     for (bool first = true; start; first = false) {
       const auto number = next_request();
-      auto message = begun("metadata", number, 4);
-      if (area) detail::write(message, *area);
-      else message.nil();
-      message.nil();
-      message.number(*start);
-      message.number(page_rows);
       std::string reply;
-      ask(number, message.data(), "metadata_page", 0.0, reply);
-      detail::Reader reader(reply);
-      detail::Row row(reader);
-      row.get().skip(1);
-      row.get().skip(1);
-      const auto epoch = row.get().number(), map_version = row.get().number();
+      ask(number, page_request(number, area, *start), "metadata_page", 0.0, reply);
+      const auto epoch = listing.epoch, map_version = listing.map_version;
+      start = read_listing(reply, listing);
       if (!first && (epoch != listing.epoch || map_version != listing.map_version)) return std::nullopt;
-      listing.epoch = epoch, listing.map_version = map_version;
-      start = detail::read_page(row, listing.cells);
     }
-    for (auto& cell : listing.cells) cell.id = whole(cell.id);
     return listing;
   }
 
+  static std::string page_request(std::uint64_t number, const std::optional<Area>& area, std::uint64_t start) {
+    auto message = begun("metadata", number, 4);
+    if (area) detail::write(message, *area);
+    else message.nil();
+    message.nil();
+    message.number(start);
+    message.number(page_rows);
+    return message.data();
+  }
+
+  /// Add a page of the map's list; returns where the next one starts.
+  std::optional<std::uint64_t> read_listing(const std::string& reply, MapListing& listing) {
+    detail::Reader reader(reply);
+    detail::Row row(reader);
+    row.get().skip(1);
+    row.get().skip(1);
+    listing.epoch = row.get().number();
+    listing.map_version = map_version_ = row.get().number();
+    const auto before = static_cast<std::ptrdiff_t>(listing.cells.size());
+    const auto next = detail::read_page(row, listing.cells);
+    for (auto cell = listing.cells.begin() + before; cell != listing.cells.end(); ++cell) cell->id = whole(cell->id);
+    return next;
+  }
+
   // --- cells ---
+
+  static void write_differential(detail::Writer& to, const Area& area, const std::vector<Held>& held,
+                                 const std::vector<std::uint64_t>& packed, const std::vector<std::string>& layers,
+                                 const std::optional<double>& wait, const std::optional<Intent>& intent) {
+    detail::write(to, area);
+    detail::write(to, layers);
+    to.array(held.size());
+    for (const Held& one : held) detail::write(to, one);
+    to.binary(packed.data(), packed.size() * sizeof(std::uint64_t));
+    detail::write(to, wait);
+    detail::write(to, intent);
+  }
 
   template <typename Write>
   Answer cells(std::string_view tag, const std::optional<double>& wait, const Write& write, std::size_t elements) {
@@ -340,13 +515,11 @@ class Client {
     tell_unmapped();
     const auto deadline = after(wait.value_or(0.0) + options_.patience);
     auto found = one_reply(tag, wait.value_or(0.0), write, elements);
-    Answer answer = std::move(found.answer);
-    for (auto& [id, layer] : answer.pending) id = whole(id);
-    for (auto& failure : answer.failed)
-      if (failure.code != "unknown_cell") failure.id = whole(failure.id);
+    Answer& answer = found.answer;
     std::vector<CellPtr> places(found.handles.size());
     std::vector<std::size_t> gone;
-    for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer);
+    const auto patience = [] { return after(attach_s); };
+    for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer, patience());
     for (int attempt = 0; !gone.empty() && attempt < attempts && Clock::now() < deadline; ++attempt) {
       ask_again(found.handles, places, gone, answer);
       if (!gone.empty()) check_visible();  // not at first: a daemon that ends takes all its segments away
@@ -354,7 +527,7 @@ class Client {
     for (const auto at : gone) answer.pending.emplace_back(whole(found.handles[at].id), found.handles[at].layer);
     for (auto& cell : places)
       if (cell) answer.cells.push_back(std::move(cell));
-    return answer;
+    return std::move(answer);
   }
 
   template <typename Write>
@@ -364,18 +537,28 @@ class Client {
     write(message);
     std::string reply;
     ask(number, message.data(), "cells", wait, reply);
+    return read_reply(reply);
+  }
+
+  /// The answer to a request for cells, before anything is mapped.
+  detail::Cells read_reply(const std::string& reply) {
     SHMMAP_FAILPOINT("client.answer");
     detail::Reader reader(reply);
     detail::Row row(reader);
     row.get().skip(1);
     row.get().skip(1);
-    return detail::read_cells(reader, row);
+    auto found = detail::read_cells(reader, row);
+    map_version_ = found.answer.map_version;
+    for (auto& [id, layer] : found.answer.pending) id = whole(id);
+    for (auto& failure : found.answer.failed)
+      if (failure.code != "unknown_cell") failure.id = whole(failure.id);
+    return found;
   }
 
   void take(const detail::Handle& handle, std::size_t at, std::vector<CellPtr>& places,
-            std::vector<std::size_t>& gone, Answer& answer) {
+            std::vector<std::size_t>& gone, Answer& answer, Clock::time_point until) {
     try {
-      places[at] = attached(handle);
+      places[at] = attached(handle, until);
     } catch (const SegmentError& error) {  // one cell must not cost the others
       if (error.code() == "stale_handle") gone.push_back(at);
       else if (error.code() == "segment_corrupt")
@@ -400,16 +583,18 @@ class Client {
     }, 3);
     std::vector<std::size_t> still;
     for (const auto at : std::exchange(gone, {})) {
-      const auto is_it = [&](const auto& one) { return one.id == handles[at].id && one.layer == handles[at].layer; };
+      const auto is_it = [&](const auto& one) {
+        return whole(one.id) == whole(handles[at].id) && one.layer == handles[at].layer;
+      };
       if (const auto handle = std::find_if(found.handles.begin(), found.handles.end(), is_it);
           handle != found.handles.end()) {
         handles[at] = *handle;
-        take(handles[at], at, places, still, answer);
+        take(handles[at], at, places, still, answer, after(attach_s));
         continue;
       }
       const auto& failed = found.answer.failed;
       if (const auto failure = std::find_if(failed.begin(), failed.end(), is_it); failure != failed.end())
-        answer.failed.push_back({whole(failure->id), failure->layer, failure->code, failure->message});
+        answer.failed.push_back(*failure);
       else answer.pending.emplace_back(whole(handles[at].id), handles[at].layer);
     }
     gone = std::move(still);
@@ -439,16 +624,16 @@ class Client {
     owner_ = ::lstat(path.c_str(), &status) == 0 ? std::optional<uid_t>(status.st_uid) : std::nullopt;
   }
 
-  CellPtr attached(const detail::Handle& handle) {
+  CellPtr attached(const detail::Handle& handle, Clock::time_point until) {
     auto& known = cells_[{handle.version, handle.layer}];
     if (CellPtr there = known.lock()) return there;
-    CellPtr cell = attach(handle);
+    CellPtr cell = attach(handle, until);
     known = cell;
     return cell;
   }
 
-  [[nodiscard]] detail::Descriptor opened(const detail::Handle& handle, const std::string& path) const {
-    const auto until = Clock::now() + std::chrono::milliseconds(200);
+  [[nodiscard]] static detail::Descriptor opened(const detail::Handle& handle, const std::string& path,
+                                                 Clock::time_point until) {
     while (true) {
       detail::Descriptor fd(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK));  // NOLINT
       if (fd.get() >= 0) return fd;
@@ -465,9 +650,9 @@ class Client {
     throw SegmentError("stale_handle", handle.segment + " (" + handle.id + ") is gone", "ask the daemon again");
   }
 
-  CellPtr attach(const detail::Handle& handle) const {
+  CellPtr attach(const detail::Handle& handle, Clock::time_point until) const {
     using detail::read_at;
-    const auto fd = opened(handle, shm_dir() + welcome_.segment_prefix + handle.segment);
+    const auto fd = opened(handle, shm_dir() + welcome_.segment_prefix + handle.segment, until);
     SHMMAP_FAILPOINT("client.open");
     struct stat status {};
     if (::fstat(fd.get(), &status) != 0) throw SegmentError("segment_error", detail::error_text(errno));
@@ -483,7 +668,7 @@ class Client {
     const auto size = static_cast<std::uint64_t>(status.st_size);
     if (handle.offset > size || handle.bytes > size - handle.offset || size - handle.offset < 4096)
       detail::corrupt(handle, "it has not the bytes of its handle");
-    const auto mapping = std::make_shared<const detail::Mapping>(fd.get(), static_cast<std::size_t>(size));
+    const auto mapping = std::make_shared<const detail::Mapping>(fd.get(), size);
     SHMMAP_FAILPOINT("client.map");
     const unsigned char* segment = mapping->data() + handle.offset;
     if (std::memcmp(segment, "SHMMAP\0\1", 8) != 0) detail::corrupt(handle, "it is no segment");
@@ -493,7 +678,7 @@ class Client {
     if (header_bytes < 4096 || header_bytes > total || total > size - handle.offset)
       detail::corrupt(handle, "its sizes are wrong");
     const std::uint64_t end = header_bytes - 72;
-    if (detail::crc32(segment, static_cast<std::size_t>(end)) != read_at<std::uint32_t>(segment, end))
+    if (detail::crc32(segment, end) != read_at<std::uint32_t>(segment, end))
       detail::corrupt(handle, "the header's checksum is wrong");
     const std::shared_ptr<Cell> cell(
         new Cell, [unmapped = unmapped_, key = detail::CellKey(handle.version, handle.layer)](Cell* one) {
@@ -544,10 +729,13 @@ class Client {
   }
 
   Options options_;
-  std::string path_;
+  std::vector<std::string> paths_;  // sockets to try
+  std::string path_;                // the one connected to
   detail::Socket socket_;
+  std::optional<std::uint64_t> hello_;  // its number, while it is not answered
+  std::optional<detail::Exchange> exchange_;
   detail::Welcome welcome_;
-  std::uint64_t request_ = 0, handshakes_ = 0;
+  std::uint64_t request_ = 0, map_version_ = 0;
   std::optional<uid_t> owner_;
   std::unordered_map<detail::CellKey, std::weak_ptr<const Cell>, detail::HashOfCellKey> cells_;
   std::shared_ptr<detail::Unmapped> unmapped_ = std::make_shared<detail::Unmapped>();

@@ -32,6 +32,8 @@ struct BadRequest : Error { using Error::Error; };
 struct NoColumn : BadRequest { using BadRequest::BadRequest; };
 /// Nobody answers: `no_socket`, `no_permission`, `stale_socket`, `connection_lost` or `no_answer`.
 struct Unreachable : Error { using Error::Error; };
+/// `Options::keep_waiting` has ended a wait (`interrupted`).
+struct Interrupted : Error { using Error::Error; };
 /// The daemon speaks another version, or no shmmap at all.
 struct ProtocolMismatch : Error { using Error::Error; };
 /// The daemon refused: any other code.

@@ -33,6 +33,7 @@
 #include <shmmap/answer.hpp>
 #include <shmmap/client.hpp>
 #include <shmmap/points_around.hpp>
+#include <shmmap/point_cloud2.hpp>
 #include <shmmap/window.hpp>
 #include <shmmap/events.hpp>
 #include <shmmap/statistics.hpp>

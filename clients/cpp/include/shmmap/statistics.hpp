@@ -156,7 +156,7 @@ class StatisticsFile {
   /// These bytes, all of them.
   [[nodiscard]] std::string bytes(std::uint64_t at, std::uint64_t count) const {
     if (at > size_ || count > size_ - at) damaged(path_, "its tables lie outside of it");
-    std::string found(static_cast<std::size_t>(count), '\0');
+    std::string found(count, '\0');
     for (std::size_t got = 0; got < found.size();) {
       const auto part = ::pread(fd_.get(), &found[got], found.size() - got, static_cast<off_t>(at + got));
       if (part <= 0) damaged(path_, "it cannot be read");
@@ -203,29 +203,6 @@ inline StatisticsHeader read_statistics_header(const StatisticsFile& file) {
   return header;
 }
 
-/// The change counter of one life of the daemon, mapped: reading it costs nothing.
-class ChangeCounter {
- public:
-  /// Throws SegmentError where there is none.
-  explicit ChangeCounter(const std::string& path) : ChangeCounter(StatisticsFile(path)) {}
-  [[nodiscard]] std::uint64_t epoch() const { return load(0); }
-  [[nodiscard]] std::uint64_t read() const { return load(8); }
-
- private:
-  explicit ChangeCounter(const StatisticsFile& file) {
-    if (!file.is_there()) damaged(file.path(), "there is none");
-    at_ = read_statistics_header(file).changes;
-    if (at_ == 0 || at_ % 8 != 0 || at_ > file.size() || file.size() - at_ < 16)
-      damaged(file.path(), "it has no change counter");
-    mapping_ = std::make_shared<const Mapping>(file.fd(), static_cast<std::size_t>(at_ + 16));
-  }
-  [[nodiscard]] std::uint64_t load(std::size_t at) const {
-    return __atomic_load_n(reinterpret_cast<const std::uint64_t*>(mapping_->data() + at_ + at), __ATOMIC_ACQUIRE);
-  }
-  std::uint64_t at_ = 0;
-  std::shared_ptr<const Mapping> mapping_;
-};
-
 }  // namespace detail
 
 /// Reads an instance's statistics, again and again; the daemon need not run yet.
@@ -263,7 +240,7 @@ class StatisticsReader {
   static T at(const std::string& text, std::uint64_t offset) {
     if (offset > text.size() || sizeof(T) > text.size() - offset)
       throw SegmentError("segment_corrupt", "the statistics end too early");
-    return detail::read_at<T>(detail::raw(text), static_cast<std::size_t>(offset));
+    return detail::read_at<T>(detail::raw(text), offset);
   }
 
   /// The newer one of two blocks of which one is always whole.

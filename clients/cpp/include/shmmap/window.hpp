@@ -2,18 +2,18 @@
 //
 // The cells around a moving pose, kept current.
 //
-//     shmmap::Window window(shmmap::Client{}, {150.0, {"points"}});
+//     shmmap::Window window(shmmap::Options{}, {150.0, {"points"}});
 //     while (driving) {
-//       const auto update = window.move_to({x, y});
-//       for (const auto& id : update.removed) drop(id);                // removals first
-//       for (const auto& cell : update.added) add(cell->id, cell->column<float>("xyz"));
-//       for (const auto& cell : update.changed) replace(cell->id, cell->column<float>("xyz"));
+//       try {
+//         const auto update = window.move_to({x, y});                    // 0.02 s at most
+//         for (const auto& id : update.removed) drop(id);                // removals first
+//         for (const auto& cell : update.added) add(cell->id, cell->column<float>("xyz"));
+//         for (const auto& cell : update.changed) replace(cell->id, cell->column<float>("xyz"));
+//       } catch (const shmmap::Unreachable&) {}                          // the window keeps what it has
 //     }
 
 #ifndef SHMMAP_WINDOW_HPP
 #define SHMMAP_WINDOW_HPP
-
-#include <poll.h>
 
 #include <algorithm>
 #include <cmath>
@@ -25,12 +25,12 @@
 #include <set>
 #include <string>
 #include <string_view>
+#include <thread>
 #include <utility>
 #include <vector>
 
 #include <shmmap/areas.hpp>
 #include <shmmap/client.hpp>
-#include <shmmap/detail/nothing_new.hpp>
 #include <shmmap/points_around.hpp>
 
 namespace shmmap {
@@ -101,19 +101,47 @@ struct WindowUpdate {
   [[nodiscard]] bool complete() const { return current && covered && pending.empty() && failed.empty(); }
 };
 
-/// The cells around a moving pose.  Everything happens in `move_to`, in the thread that calls it.
+namespace detail {
+
+/// A reply that is being taken over: its cells are mapped as time allows.
+struct Arriving {
+  Cells reply;
+  std::vector<CellPtr> places;
+  std::vector<std::size_t> gone;
+  std::size_t next = 0;
+};
+
+/// What a window has asked for.
+struct Question {
+  Intent pose;
+  Area area;
+  Clock::time_point asked;
+  bool by_name = false;  // what is held, as it has to be after a daemon's restart
+};
+
+}  // namespace detail
+
+/// The cells around a moving pose.  Everything happens in `move_to`, in the thread that calls it, and takes no longer
+/// than the call may: what has not come by then stays on its way, and is taken over by the next call.  So it can be
+/// called in a control loop.
 ///
 /// The daemon fetches what the window will ask for next: along the route of the pose, without one straight ahead and
 /// to both sides of that.  A radius larger than what is needed brings nothing.
 ///
 /// A daemon that fails costs an exception there, and the window keeps what it has; a restarted one is found again
-/// by itself, and nothing that has not changed is mapped anew.
+/// by itself, and nothing that has not changed is mapped again.
 class Window {
  public:
   using Clock = detail::Clock;
   using LayerKey = std::pair<std::string, std::string>;  ///< id and layer
 
-  /// Throws BadRequest where an option makes no sense.
+  static constexpr double default_wait = 0.02;
+
+  /// A window that connects in `move_to`.  Throws BadRequest where an option makes no sense.
+  explicit Window(Options client, WindowOptions options = {})
+      : Window(Client(std::move(client), nullptr), std::move(options)) {}
+
+  /// The same, through a client that is connected.
   explicit Window(Client client, WindowOptions options = {})
       : client_(std::move(client)), options_(std::move(options)) {
     detail::check_circle(0.0, 0.0, options_.radius);
@@ -124,24 +152,41 @@ class Window {
       throw BadRequest("bad_request", "a window's lowest z lies above its highest");
   }
 
-  /// Tell the window the pose, and have it current: within `wait` seconds, or no longer than half a second where
-  /// what is missing does not fit in the daemon's memory, or cannot be reached.  Returns what has changed since the
-  /// last call.  Throws BadRequest, and whatever keeps the daemon from being asked; the window keeps what it has.
-  WindowUpdate move_to(const Intent& pose, double wait = Client::default_wait) {
-    bool is_finite = std::isfinite(pose.x) && std::isfinite(pose.y) && std::isfinite(pose.vx) &&
-                     std::isfinite(pose.vy) && std::isfinite(pose.heading.value_or(0.0));
-    for (const auto& [x, y] : pose.route) is_finite = is_finite && std::isfinite(x) && std::isfinite(y);
-    if (!is_finite) throw BadRequest("bad_request", "every number of a pose must be finite");
+  /// Give the window the pose, and what has come for it; returns what has changed since the last call.
+  ///
+  /// Waits until nothing is missing, at most `wait` seconds, and no longer than half a second where what is missing
+  /// does not fit in the daemon's memory, or cannot be reached.  Throws BadRequest, and whatever keeps the daemon from
+  /// being asked: Unreachable at once where nobody listens and `wait` is below 20 ms, else when that time is over, and
+  /// `no_answer` where it has been silent for `Options::patience` seconds.  The window keeps what it has.
+  WindowUpdate move_to(const Intent& pose, double wait = default_wait) {
+    check_pose(pose);
     if (!(wait >= 0.0)) throw BadRequest("bad_request", "wait must not be below zero");
     pose_ = pose;
-    try {
-      become_current(wait);
-    } catch (const Error& error) {
-      error_ = error;  // NOLINT(cppcoreguidelines-slicing): its code says what it was
-      if (!stale_since_) stale_since_ = Clock::now();
-      throw;
-    }
+    become_current(Client::after(wait), stalled_s);
     return changes_since_last();
+  }
+
+  /// Wait until nothing is missing around a pose, for a program's start; the next `move_to` returns what has come.
+  /// Returns whether it is so: false when `seconds` are over, also without a daemon, and at once when all that is
+  /// missing has failed.
+  bool wait_until_complete(const Intent& pose, double seconds) {
+    check_pose(pose);
+    pose_ = pose;
+    return wait_until_complete(seconds);
+  }
+
+  /// The same around the pose of the last `move_to`; throws BadRequest before the first one.
+  bool wait_until_complete(double seconds) {
+    if (!pose_) throw BadRequest("bad_request", "a window waits for what is around a pose", "call move_to first");
+    if (!(seconds >= 0.0)) throw BadRequest("bad_request", "the seconds to wait must not be below zero");
+    for (const auto until = Client::after(seconds);; std::this_thread::sleep_for(Client::look_again)) {
+      try {
+        become_current(until, std::numeric_limits<double>::infinity());
+        return complete();
+      } catch (const Unreachable&) {  // `error()` says why
+        if (Clock::now() + Client::look_again >= until) return complete();
+      }
+    }
   }
 
   /// Cells in the window, in the order of ids and layers.
@@ -191,10 +236,11 @@ class Window {
 
   /// Why the daemon cannot be asked, or could not the last time; nothing if it could.
   [[nodiscard]] std::optional<Error> error() const {
-    if (!error_ && !client_.is_connected())
-      return Error("connection_lost", client_.path() + ": the daemon ended, or was restarted",
-                   "the window serves what it has, and connects again by itself");
-    return error_;
+    if (error_ || client_.is_connected()) return error_;
+    if (client_.epoch() == 0)
+      return Error("no_answer", client_.path() + ": not connected yet", "the window connects by itself");
+    return Error("connection_lost", client_.path() + ": the daemon ended, or was restarted",
+                 "the window serves what it has, and connects again by itself");
   }
   /// Since when; a daemon that ends is noticed when this or `error` is asked, one that hangs when a reply is overdue.
   [[nodiscard]] std::optional<Clock::time_point> stale_since() {
@@ -214,7 +260,15 @@ class Window {
     Clock::time_point since;
   };
 
-  static constexpr double pending_wait_s = 0.25, first_pause_s = 0.005, stalled_s = 0.5;
+  static constexpr double pending_wait_s = 0.25, first_pause_s = 0.005, longest_pause_s = 0.5, stalled_s = 0.5;
+  static constexpr double tell_s = 1.0, tell_m = 5.0, tell_mps = 1.0;  // the daemon learns of a pose that differs so much
+
+  static void check_pose(const Intent& pose) {
+    bool is_finite = std::isfinite(pose.x) && std::isfinite(pose.y) && std::isfinite(pose.vx) &&
+                     std::isfinite(pose.vy) && std::isfinite(pose.heading.value_or(0.0));
+    for (const auto& [x, y] : pose.route) is_finite = is_finite && std::isfinite(x) && std::isfinite(y);
+    if (!is_finite) throw BadRequest("bad_request", "every number of a pose must be finite");
+  }
 
   static Box4 sides_of(const Cell& cell) { return {cell.min_x, cell.min_y, cell.max_x, cell.max_y}; }
 
@@ -239,78 +293,141 @@ class Window {
            });
   }
 
-  /// Ask until nothing is missing, nothing more comes, or time is up.
-  void become_current(double wait) {
-    auto now = Clock::now();
-    const bool is_to_tell = told_ && detail::NothingNew::says_more(*pose_, *told_) &&
-                            now - told_at_ >= detail::NothingNew::tell;
-    const bool is_due = seconds(now - asked_at_) >= options_.refresh_interval || error_ || is_to_tell;
-    if (is_settled() && !is_due && !has_moved(*pose_)) return;
-    const auto deadline = now + std::chrono::duration_cast<Clock::duration>(detail::Seconds(std::min(wait, 1e6)));
-    auto progressed = now;
-    double pause = first_pause_s;
-    std::optional<double> patience;
+  /// Whether the daemon should be asked again: the pose has moved, time has passed, or it goes elsewhere.
+  [[nodiscard]] bool is_due(Clock::time_point now) const {
+    if (has_moved(*pose_) || error_ || seconds(now - asked_at_) >= options_.refresh_interval) return true;
+    return asked_ && seconds(now - asked_at_) >= tell_s &&
+           (pose_->route != asked_->route || std::hypot(pose_->vx - asked_->vx, pose_->vy - asked_->vy) >= tell_mps ||
+            std::hypot(pose_->x - asked_->x, pose_->y - asked_->y) >= tell_m);
+  }
+
+  /// Ask until nothing is missing, nothing more has come for `stalled` seconds, or time is up.
+  void become_current(Clock::time_point until, double stalled) {
+    auto progressed = Clock::now();
     while (true) {
-      const bool progress = refresh(patience);
-      error_.reset();
-      stale_since_.reset();
-      asked_at_ = now = Clock::now();
-      if (is_settled() || now >= deadline) return;
-      const double left = seconds(deadline - now);
-      if (progress || !pending_.empty()) {
-        progressed = now;
-        pause = first_pause_s;
-      } else if (seconds(now - progressed) >= stalled_s) {
-        return;  // what is missing waits for memory that others have
-      } else {
-        ::poll(nullptr, 0, static_cast<int>(1000.0 * std::min(pause, left)));  // what was dropped has to be freed
-        pause *= 2.0;
+      auto pause_until = Clock::now();
+      try {
+        client_.check_waiting();
+        if (!is_under_way()) {
+          const bool is_same_place = asked_ && !has_moved(*pose_);
+          if (wants_boxes()) ask_boxes();
+          else if (is_settled() && !is_due(pause_until)) return;
+          else if (pause_until < not_before_ && (is_same_place || error_)) pause_until = not_before_;
+          else ask(is_same_place && !is_settled() ? std::optional(pending_wait_s) : std::nullopt, false);
+        }
+        if (is_under_way()) {
+          if (!take_over(until)) {
+            if (error_ && error_->code() == "no_answer") throw client_.silent();
+            return;
+          }
+          if (is_under_way() || wants_boxes()) continue;
+          if (is_settled() && !has_moved(*pose_)) return;
+          if (made_progress_ || !pending_.empty()) progressed = Clock::now();
+        }
+      } catch (const Error& error) {
+        error_ = error;  // NOLINT(cppcoreguidelines-slicing): its code says what it was
+        if (!stale_since_) stale_since_ = Clock::now();
+        if (dynamic_cast<const Unreachable*>(&error) == nullptr) not_before_ = Client::after(0.1);
+        pause_until = Clock::now() + Client::look_again;  // nobody says when it listens
+        if (not_before_ > pause_until || error.code() == "no_permission" || error.code() == "no_answer" ||
+            pause_until >= until)
+          throw;
+        progressed = Clock::now();
       }
-      patience = std::max(0.0, std::min(pending_wait_s, left));
+      const auto now = Clock::now();
+      if (now >= until || seconds(now - progressed) >= stalled) return;
+      if (pause_until > now) std::this_thread::sleep_until(std::min(pause_until, until));
     }
   }
 
   // --- asking ---
 
-  /// Ask the daemon once, unless it is certain that nothing would come; returns whether cells came or went.
-  bool refresh(std::optional<double> wait) {
-    const Intent pose = *pose_;
-    const Area area = area_around(pose);
-    const auto asked_at = Clock::now();
-    if (asked_ && area_ && nothing_new_.certain(client_, pose, area, *asked_, *area_, map_version_, asked_at)) {
-      asked_ = pose, area_ = area;
-      retain(asked_at);
-      return false;
+  [[nodiscard]] bool is_under_way() const { return arriving_ || client_.exchange_; }
+
+  /// Begin to ask for what the area around the pose has, and is not here.
+  void ask(std::optional<double> wait, bool by_name) {
+    client_.tell_unmapped();
+    question_ = detail::Question{*pose_, area_around(*pose_), Clock::now(), by_name};
+    const auto number = client_.next_request();
+    auto message = Client::begun("differential", number, 6);
+    Client::write_differential(message, question_.area, by_name ? named() : std::vector<Held>{},
+                               by_name ? std::vector<std::uint64_t>{} : packed(), options_.layers, wait,
+                               question_.pose);
+    client_.begin(number, message.data(), "cells", wait.value_or(0.0));
+    asks_boxes_ = false;
+  }
+
+  /// Take over what has come; returns whether nothing more of it is to come.
+  bool take_over(Clock::time_point until) {
+    if (!arriving_) {
+      std::string reply;
+      if (asks_boxes_) return take_boxes(reply, until);
+      if (!client_.is_finished(reply, until)) return false;
+      arriving_.emplace();
+      arriving_->reply = client_.read_reply(reply);
+      arriving_->places.resize(arriving_->reply.handles.size());
     }
-    const auto changes = nothing_new_.changes(client_);
-    const auto ask = [&](const std::vector<Held>& by_name, const std::vector<std::uint64_t>& by_version) {
-      return client_.differential(area, by_name, by_version, options_.layers, wait, pose);
-    };
-    Answer answer = ask({}, packed());
-    if (answer.epoch != epoch_ && !cells_.empty()) {
-      // Another life of the daemon cannot know what versions of an earlier one belonged to, and takes those that are
-      // not current for strangers.  What was attached stays so while asking again.
-      const Answer first = std::exchange(answer, ask(named(), {}));
+    try {
+      if (!map(until)) return false;
+      finish();
+    } catch (...) {
+      arriving_.reset();
+      throw;
+    }
+    return true;
+  }
+
+  /// Map the cells of the reply, one at least; returns whether all are.
+  bool map(Clock::time_point until) {
+    auto& [reply, places, gone, next] = *arriving_;
+    while (next < places.size()) {
+      client_.take(reply.handles[next], next, places, gone, reply.answer, until);
+      ++next;
+      if (Clock::now() >= until && next < places.size()) return false;
+    }
+    return true;
+  }
+
+  /// Take over a reply whose cells are mapped.
+  void finish() {
+    Answer answer = std::move(arriving_->reply.answer);
+    for (auto& cell : arriving_->places)
+      if (cell) answer.cells.push_back(std::move(cell));
+    for (const auto at : arriving_->gone) {  // evicted in this moment: they come with the next reply
+      const auto& handle = arriving_->reply.handles[at];
+      answer.pending.emplace_back(client_.whole(handle.id), handle.layer);
+    }
+    const bool are_gone = !arriving_->gone.empty();
+    if (are_gone && were_gone_) client_.check_visible();
+    were_gone_ = are_gone;
+    arriving_.reset();
+    error_.reset();
+    stale_since_.reset();
+    if (answer.epoch != epoch_ && !cells_.empty() && !question_.by_name) {
+      // A daemon that was restarted cannot know what versions of an earlier run belonged to, and takes those that are
+      // not current for unknown ones.  What was mapped stays so while it is asked again.
+      earlier_ = std::move(answer.cells);
+      ask(std::nullopt, true);
+      made_progress_ = true;
+      return;
     }
     const auto now = Clock::now();
-    told_ = pose, told_at_ = asked_at;
     if (answer.map_version != map_version_ || std::any_of(answer.failed.begin(), answer.failed.end(), [](const auto& one) {
           return one.code == "over_budget";
         }))
       retained_.clear();  // it may be outdated, or in the way of what is in the window
-    const bool progress = apply(answer, now);
-    asked_ = pose, area_ = area;
+    made_progress_ = apply(answer, now);
+    asked_ = question_.pose, area_ = question_.area, asked_at_ = question_.asked;
     epoch_ = answer.epoch, map_version_ = answer.map_version, covered_ = answer.covered;
     if (!answer.layers.empty()) canonical_ = std::move(answer.layers);
     pending_ = std::move(answer.pending);
     failed_ = std::move(answer.failed);
-    find_failed_boxes();
     retain(now);
     answer.cells.clear();
+    earlier_.clear();
     client_.tell_unmapped();
-    if (covered_ && pending_.empty() && failed_.empty())
-      nothing_new_.got_everything(changes, epoch_, pose, asked_at);
-    return progress;
+    pause_s_ = made_progress_ || !pending_.empty() ? 0.0 : std::clamp(2.0 * pause_s_, first_pause_s, longest_pause_s);
+    not_before_ = is_settled() ? now : now + std::chrono::duration_cast<Clock::duration>(detail::Seconds(pause_s_));
   }
 
   [[nodiscard]] Area area_around(const Intent& pose) const {
@@ -360,24 +477,42 @@ class Window {
     return !answer.cells.empty() || !removed.empty();
   }
 
-  /// Where the cells lie that cannot be had: replies name them, only the map's list says where they are.
-  void find_failed_boxes() {
+  // --- where the cells lie that cannot be had: replies name them, only the map's list says where they are ---
+
+  [[nodiscard]] bool wants_boxes() const {
+    return std::any_of(failed_.begin(), failed_.end(), [this](const auto& one) {
+      return boxes_of_ != map_version_ || sought_.count(one.id) == 0;
+    });
+  }
+
+  void ask_boxes() {
     if (boxes_of_ != map_version_) {
       boxes_of_ = map_version_;
       failed_boxes_.clear();
       sought_.clear();
     }
-    bool is_known = true;
-    for (const auto& one : failed_) is_known = sought_.count(one.id) != 0 && is_known;
-    if (is_known) return;
+    for (const auto& one : failed_) sought_.insert(one.id);
+    ask_boxes_from(0);
+  }
+
+  void ask_boxes_from(std::uint64_t start) {
+    const auto number = client_.next_request();
+    client_.begin(number, Client::page_request(number, area_, start), "metadata_page", 0.0);
+    asks_boxes_ = true;
+  }
+
+  bool take_boxes(std::string& reply, Clock::time_point until) {
     try {
-      std::set<std::string> failed;
-      for (const auto& one : failed_) failed.insert(one.id);
-      for (const auto& cell : client_.metadata(*area_).cells)
-        if (failed.count(cell.id) != 0) failed_boxes_[cell.id] = {cell.min_x, cell.min_y, cell.max_x, cell.max_y};
-      sought_.insert(failed.begin(), failed.end());
-    } catch (const Error&) {  // not where they lie, then: they are taken to be near
+      if (!client_.is_finished(reply, until)) return false;
+      MapListing listing;
+      const auto next = client_.read_listing(reply, listing);
+      for (const auto& cell : listing.cells)
+        if (sought_.count(cell.id) != 0)
+          failed_boxes_[cell.id] = {cell.min_x, cell.min_y, cell.max_x, cell.max_y};
+      if (next && listing.map_version == boxes_of_) ask_boxes_from(*next);
+    } catch (const Refused&) {  // not where they lie, then: they are taken to be near
     }
+    return true;
   }
 
   void retain(Clock::time_point now) {
@@ -425,7 +560,12 @@ class Window {
 
   Client client_;
   WindowOptions options_;
-  detail::NothingNew nothing_new_;
+  std::optional<detail::Arriving> arriving_;
+  detail::Question question_;
+  bool asks_boxes_ = false;      // what is under way are these, not cells
+  bool made_progress_ = false;   // with the last reply
+  bool were_gone_ = false;       // segments of the last reply
+  std::vector<CellPtr> earlier_;  // of a reply that is asked for again
   std::map<LayerKey, CellPtr> cells_;
   std::map<LayerKey, Kept> retained_;
   std::map<LayerKey, std::uint64_t> seen_;
@@ -434,11 +574,12 @@ class Window {
   std::vector<std::string> canonical_;
   std::map<std::string, Box4> failed_boxes_;
   std::set<std::string> sought_;
-  std::optional<Intent> pose_, asked_, told_;
+  std::optional<Intent> pose_, asked_;
   std::optional<Area> area_;
   std::optional<Error> error_;
   std::optional<Clock::time_point> stale_since_;
-  Clock::time_point asked_at_{}, told_at_{};
+  Clock::time_point asked_at_{}, not_before_{};  // when it was asked for the last time; when it may be again
+  double pause_s_ = 0.0;
   std::uint64_t epoch_ = 0, map_version_ = 0, boxes_of_ = 0;
   bool covered_ = true;
 };

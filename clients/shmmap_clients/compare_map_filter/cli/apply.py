@@ -18,13 +18,14 @@ from shmmap_clients.command_line import (
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from
-from shmmap_clients.shared_options import add_scan_option
+from shmmap_clients.shared_options import add_scan_option, reader_from
 
 __all__ = ["add_parser", "run"]
 
 _EPILOG: Final = """\
 JSON (fields may be added, none is removed):
-  {"points", "kept", "no_map": bool, "compare_ms"}
+  {"points", "kept", "no_map": bool, "too_near", "not_finite": points left out,
+   "compare_ms"}
 The file written has the kept points with all fields, and a column index: their
 rows in the scan; with --mask all points, and a column kept (1: not explained by
 the map).
@@ -75,13 +76,15 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.compare_map_filter.output import PcdDirectory
     from shmmap_clients.compare_map_filter.picture import TopView
     from shmmap_clients.map_extent import extent_text
-    from shmmap_clients.scans.scan_file import read_scan, read_scan_fields
+    from shmmap_clients.scans.scan_names import stem
     from shmmap_clients.scans.scan_sequence import Scan
 
     rule = rule_from(args)
     T = pose_from(args, "--pose") if args.pose is not None else np.eye(4)
-    scan = Scan(Path(args.scan).stem, 0.0, read_scan_fields(args.scan), T)
-    table = build_layer(rule.layer, read_scan(args.map))
+    reader = reader_from(args, "shmmap-compare")
+    columns, rows = reader.screened(reader.read(args.scan))
+    scan = Scan(stem(Path(args.scan)), 0.0, columns, T, rows=rows)
+    table = build_layer(rule.layer, reader_from(args, "shmmap-compare", min_range=0.0).points(args.map))
     compare = CompareMapFilter(rule, backend=args.backend).use_tables([table])
     comparison = compare.apply(scan.xyz, T)
     kept = int(comparison.kept.sum())
@@ -96,9 +99,10 @@ def run(args: argparse.Namespace) -> int:
     milliseconds = comparison.compare_s * 1e3
     if args.json:
         found = {"points": len(scan.xyz), "kept": kept, "no_map": comparison.no_map}
-        print_json({**found, "compare_ms": milliseconds})
+        print_json({**found, **reader.counts, "compare_ms": milliseconds})
     else:
-        print(f"{len(scan.xyz)} points, {kept} kept, {milliseconds:.1f} ms")
+        left_out = f"; left out: {reader.left_out}" if reader.left_out else ""
+        print(f"{len(scan.xyz)} points, {kept} kept, {milliseconds:.1f} ms{left_out}")
     if comparison.no_map:
         x, y = T[:2, 3]
         where = f"{extent_text(compare.bounds)}, the pose is at ({x:.3f}, {y:.3f})"

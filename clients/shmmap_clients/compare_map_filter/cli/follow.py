@@ -25,7 +25,7 @@ from shmmap_clients.command_line import (
     writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
-from shmmap_clients.shared_options import add_quiet_option, add_radius_option, add_scans_option
+from shmmap_clients.shared_options import add_quiet_option, add_radius_option, add_scans_option, reader_from
 
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.statistics import DriveStatistics
@@ -36,7 +36,8 @@ _NAME: Final = "shmmap-compare"
 _EPILOG: Final = """\
 JSON (fields may be added, none is removed).
 --json prints one document at the end:
-  {"scans", "points", "kept", "no_map_scans": without a map around them,
+  {"scans", "points", "kept", "too_near", "not_finite": points left out,
+   "no_map_scans": without a map around them,
    "incomplete_scans": compared while cells around them were missing,
    "first_missing": the first of these and what it lacked, or null,
    "updates": how often the cells around the vehicle changed,
@@ -124,8 +125,9 @@ def run(args: argparse.Namespace) -> int:
     statistics, view = DriveStatistics(), TopView()
     wait_s = args.wait if args.wait is not None else (None if is_endpoint(args.scans) else 30.0)
     code = 0
+    reader = reader_from(args, _NAME)
     with ExitStack() as stack:
-        scans = open_scans(args.scans, args.poses, stack)
+        scans = open_scans(args.scans, args.poses, stack, reader)
         client = stack.enter_context(connect(args, _NAME))
         window = stack.enter_context(
             MapWindow(client, args.map_radius, layers=rule.layer, update_distance=args.update_distance)
@@ -166,18 +168,19 @@ def run(args: argparse.Namespace) -> int:
         )
         write_text(args.picture, view.svg(_NAME, note))
     if args.json:
-        print_json(statistics.summary())
+        print_json({**statistics.summary(), **reader.counts})
     else:
-        _print(statistics)
+        _print(statistics, reader.left_out)
     return max(code, _exit_code(args, statistics))
 
 
-def _print(statistics: DriveStatistics) -> None:
+def _print(statistics: DriveStatistics, left_out: str) -> None:
     times = statistics.summary()["compare_ms"]
     spent = f" {times['p50']:.1f} ms each (p99 {times['p99']:.1f});" if times else ""
     print(
         f"{statistics.scans} scans, {statistics.points} points, {statistics.kept} kept;{spent}"
         f" {statistics.incomplete} scans with cells missing, {statistics.no_map} without a map"
+        + (f"; left out: {left_out}" if left_out else "")
     )
 
 

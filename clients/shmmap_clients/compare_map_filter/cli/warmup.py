@@ -14,7 +14,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "warmup",
         help="compile the kernel and cache it",
-        description="Compile the kernel and keep it in numba's cache (NUMBA_CACHE_DIR where it is set), so"
+        description="Compile the kernel and keep it (~/.cache/shmmap/kernels, or NUMBA_CACHE_DIR), so"
         " that no filter has to wait for the compiler.",
     )
     parser.set_defaults(run=run)

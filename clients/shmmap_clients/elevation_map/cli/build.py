@@ -37,6 +37,7 @@ __all__ = ["add_parser", "run"]
 
 _ATTEMPTS = 3
 _EVERY_S = 0.5
+_NAMED: Final = 5  # of the cells that were left out
 _NAME: Final = "shmmap-elevation"
 _FEW: Final = 0.5
 """Share of the columns with points that should have a height; a map of sparse points has fewer."""
@@ -49,7 +50,8 @@ JSON (fields may be added, none is removed):
    points,
    "measured_share": of the occupied ones, or null, "filled": columns whose
    height was filled in from others near,
-   "stray": points outside their cell, "failed": [{"id", "code", "message"}],
+   "stray": points outside their cell,
+   "far": [{"id", "metres"}] cells left out, far from all others, "failed": [{"id", "code", "message"}],
    "files": [path]}
 Exit code: 0; 1 when cells could not be loaded, or no column has a height."""
 
@@ -203,6 +205,7 @@ def run(args: argparse.Namespace) -> int:
         "failed": [
             {"id": error.cell_id, "code": error.code, "message": str(error)} for error in built.failed
         ],
+        "far": [{"id": cell, "metres": metres} for cell, metres in built.far],
         "files": [str(path) for path in written],
     }
     if args.json:
@@ -213,9 +216,19 @@ def run(args: argparse.Namespace) -> int:
             f" {grid.resolution:g} m, {built.occupied} with points, {measured} with a height,"
             f" {counts[FILLED]} more with heights filled in"
         )
-        print(f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out")
+        print_line(
+            f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out"
+        )
         for error in built.failed:
             print_line(f"missing: {error}", file=sys.stderr)
+    for cell, metres in built.far[:_NAMED]:
+        complain(
+            _NAME,
+            f"warning: {cell} lies {metres / 1000:.1f} km from all other cells and holds next to nothing:"
+            " left out",
+        )
+    if len(built.far) > _NAMED:
+        complain(_NAME, f"warning: {len(built.far) - _NAMED} more cells lie far from all others: left out")
     code = 1 if built.failed else 0
     if not measured:
         why = "no cell has a point" if not built.occupied else _sparse(rule, measured, built.occupied)

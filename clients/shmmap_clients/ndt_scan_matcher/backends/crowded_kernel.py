@@ -8,7 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numba import types
 
-from shmmap_clients.compiling import compiled, float64_at, inlined, int32_at, read_only
+from shmmap.compiling import compiled, inlined, read_only
+from shmmap_clients.elements_at import float64_at, int32_at
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import NEGLIGIBLE_EXPONENT
 
 __all__ = ["MAP", "SCRATCH", "add_nearest", "exp_of_negated"]

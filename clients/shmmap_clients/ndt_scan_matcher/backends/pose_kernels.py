@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numba import types
 
-from shmmap_clients.compiling import compiled, read_only
+from shmmap.compiling import compiled, read_only
 from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import SMALL_ANGLE
 from shmmap_clients.ndt_scan_matcher.matching.steps import FLAT, SINGULAR
 

@@ -16,7 +16,7 @@ from shmmap_clients.command_line import (
 )
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options, matcher_from
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
-from shmmap_clients.shared_options import add_leaf_option, add_scan_option, add_thin_option
+from shmmap_clients.shared_options import add_leaf_option, add_scan_option, add_thin_option, reader_from
 
 __all__ = ["add_parser", "run"]
 
@@ -30,8 +30,8 @@ JSON (fields may be added, none is removed):
      left out by limits, and "deadline": whether time was up,
    "worst_case_ms": for the largest scan that the limits allow, estimated on
      this machine,
-   "align_ms": measured, "points", "voxels", "variant", "convention": the same,
-   "neighbors", "backend"}
+   "align_ms": measured, "points", "too_near", "not_finite": points left out,
+   "voxels", "variant", "convention": the same, "neighbors", "backend"}
   failed_limits names what did not hold: no_map, converged (it did not
   converge), nvtl, transform_probability, oscillations.
 Exit code: 0; 1 when the alignment did not converge, or no point of the scan has
@@ -71,11 +71,12 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.map.voxel_cell import voxel_cell
     from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
     from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_time_bound
-    from shmmap_clients.scans.scan_file import read_scan
     from shmmap_clients.scans.thinning import thinned
 
     T_guess = pose_from(args, "--guess") if args.guess is not None else np.eye(4)
-    cloud, scan = read_scan(args.map), thinned(read_scan(args.scan), args.thin or None)
+    cloud = reader_from(args, "shmmap-ndt", min_range=0.0).points(args.map)
+    reader = reader_from(args, "shmmap-ndt")
+    scan = thinned(reader.points(args.scan), args.thin or None)
     with matcher_from(args) as matcher:
         voxel_map = VoxelMap(
             {args.map: voxel_cell(cloud, args.leaf)},
@@ -111,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
             "worst_case_ms": bound.total_ms,
             "align_ms": took_ms,
             "points": len(scan) - result.cut.points,
+            **reader.counts,
             "voxels": voxel_map.voxels,
             "variant": args.variant,
             "convention": args.variant,
@@ -142,7 +144,7 @@ def _print(document: dict[str, Any], failed: list[str], bound: str) -> None:
     for row in rows:
         print("  " + " ".join(f"{value:12.6f}" for value in row))
     names = ("iterations", "converged", "transform_probability", "nvtl", "oscillations", "evaluations")
-    for name in (*names, "points", "voxels"):
+    for name in (*names, "points", "too_near", "not_finite", "voxels"):
         value = document[name]
         print(f"{name:24}{value:.6f}" if isinstance(value, float) else f"{name:24}{value}")
     print(f"{'trusted':24}{'no: ' + ', '.join(failed) if failed else 'yes'}")

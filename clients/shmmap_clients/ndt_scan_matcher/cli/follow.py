@@ -14,6 +14,7 @@ from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from, 
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.pose_option import pose_from
+from shmmap_clients.shared_options import reader_from
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     statistics, plot = DriveStatistics(), DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
+    reader = reader_from(args, "shmmap-ndt")
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: who waits for this program's subscription finds it
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
@@ -62,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         if args.odometry is not None and is_endpoint(args.odometry):
             listener = OdometryListener(args.odometry)
             stack.callback(listener.close)
-        source = open_scans(args.scans, args.truth, stack)
+        source = open_scans(args.scans, args.truth, stack, reader)
         scans = iter(_paced(source, args.rate) if args.rate and not is_endpoint(args.scans) else source)
         if publisher is not None and args.listener_wait > 0:
             publisher.wait_for_listener(args.listener_wait)
@@ -72,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         if first is None:
             return report.no_scans()
         T_first, known = _start(args, first)
-        prediction = _prediction(args, T_first, listener)
+        prediction = _prediction(args, T_first, listener, source)
         matcher = stack.enter_context(matcher_from(args))
         rules = MapRules(
             args.update_distance,
@@ -87,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
             MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
         )
         relocalizer = None
-        if args.relocalize or args.rough is not None:
+        by_default = args.rough is not None or not is_endpoint(args.scans)
+        if by_default if args.relocalize is None else args.relocalize:
             relocalizer = _relocalizer(args, stack)
         follower = Follower(
             matcher,
@@ -116,9 +119,9 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         write_text(args.plot, plot.svg())
     if args.json:
-        print_json(summary.as_document())
+        print_json({**summary.as_document(), **reader.counts})
     else:
-        print_summary(summary)
+        print_summary(summary, reader.left_out)
     allowed = summary.no_map if args.allow_empty else 0
     return 0 if summary.trustworthy + allowed == summary.frames and not summary.too_slow else 1
 
@@ -137,14 +140,26 @@ def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], 
 
 
 def _prediction(
-    args: argparse.Namespace, T_first: NDArray[np.float64], listener: OdometryListener | None
+    args: argparse.Namespace,
+    T_first: NDArray[np.float64],
+    listener: OdometryListener | None,
+    source: Iterable[Scan],
 ) -> MotionPrediction:
+    """Return what predicts the next pose; the first velocity is the truth's, or that of the route's times."""
+    from shmmap_clients.ndt_scan_matcher.drive import motion_prediction
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry
+    from shmmap_clients.scans.scan_sequence import ScanSequence
     from shmmap_clients.scans.trajectory import read_trajectory
 
     if listener is not None:
         return Odometry(T_first, lambda: listener.trajectory)
     if args.odometry is None:
+        truth = source.trajectory if isinstance(source, ScanSequence) else None
+        if truth is not None:
+            return ConstantVelocity(T_first, motion_prediction.first_twist(truth))
+        if args.route is not None and not args.route.lower().endswith(".csv"):
+            route = read_trajectory(args.route)
+            return ConstantVelocity(T_first, motion_prediction.twist_on_route(route, T_first))
         return ConstantVelocity(T_first)
     read = read_trajectory(args.odometry)
     return Odometry(T_first, lambda: read)

@@ -37,11 +37,14 @@ A scan's result is trusted when it is within all limits of trust.  A vehicle is
   lost       after --lost-after such results in a row, or where there is no map.
 A pose that is not trusted is marked so; the next scan is then predicted from
 odometry or constant velocity alone, and without odometry a lost vehicle stands.
+A time that is not 0 to 1 s after the one before (a clock that was set, a pause)
+says nothing of motion: without odometry none is predicted there.
 
 JSON (fields may be added, none is removed).
 --json prints one document at the end:
   {"frames", "converged", "trustworthy", "no_map": scans, "lost": scans,
-   "relocalized": times, "failed_limits": {name: scans},
+   "relocalized": times, "clock_jumps": scans, "too_near", "not_finite": points
+   of the scans left out, "failed_limits": {name: scans},
    "trust": {"nvtl", "transform_probability", "oscillations"}: limits in force,
    "waited": for the map, "too_slow": times that the map did not keep up,
    "cut_frames": cut by limits, "cut_by": {limit: scans}: points, neighbors,
@@ -60,8 +63,8 @@ JSON (fields may be added, none is removed).
 --json-lines writes a line for each scan, as soon as it is localized:
   {"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged",
    "trustworthy", "failed_limits": [name], "no_map",
-   "state": tracking, uncertain or lost, "relocalized", "iterations",
-   "transform_probability", "nvtl", "waited", "latency_ms",
+   "state": tracking, uncertain or lost, "relocalized", "clock_jumped": bool,
+   "iterations", "transform_probability", "nvtl", "waited", "latency_ms",
    "error_m", "error_deg": to the true pose, null without a truth}
 failed_limits names what did not hold: no_map, converged (the alignment did not
 converge), nvtl, transform_probability, oscillations.
@@ -143,13 +146,17 @@ def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--relocalize",
-        action="store_true",
+        action=argparse.BooleanOptionalAction,
+        default=None,
         help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose and what"
         " odometry has added: with each scan until it is found, each time twice as far, up to eight times"
-        " --sigma",
+        " --sigma; without odometry, at the beginning and after a jump of the clock, with the first scan that"
+        " is not trusted (default: for a directory, not for a publisher)",
     )
     add_pose_option(
-        group, "--rough", "start pose that is metres and degrees off: search around it; implies --relocalize"
+        group,
+        "--rough",
+        "start pose that is metres and degrees off: search around it; --relocalize is then the default",
     )
     add_sigma_options(group)
     add_height_option(group, default=None, shown="keep the z of the pose that is searched around")

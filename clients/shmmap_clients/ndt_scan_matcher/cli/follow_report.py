@@ -44,8 +44,11 @@ class FollowReport:
         self._too_slow = 0
         self._state = ""
         self._no_map_told = False
+        self._hinted = False
         self._error_told = ""
         self._fault_told = False
+        self._jump_told = False
+        self._last_stamp_s = 0.0
 
     def __enter__(self) -> FollowReport:
         args = self._args
@@ -99,6 +102,14 @@ class FollowReport:
         if too_slow > self._too_slow:
             self._too_slow = too_slow
             self._say(f"the map did not keep up with the vehicle: scan {frame.name} waited for it")
+        if frame.clock_jumped and not self._jump_told:
+            self._jump_told = True
+            step_s = frame.stamp_s - self._last_stamp_s
+            self._say(
+                f"the clock jumped at scan {frame.name}, {step_s:+.6g} s: no motion is predicted there"
+                " (said once)"
+            )
+        self._last_stamp_s = frame.stamp_s
         self._tell_state(frame, trust, relocalizer)
         self._progress(frame)
 
@@ -124,7 +135,7 @@ class FollowReport:
             self._say(f"relocalized {where}: ({x:.2f}, {y:.2f})")
         elif frame.state == "lost" and before != "lost":
             failed = ", ".join(trust.describe(name) for name in frame.result.failed_limits)
-            self._say(f"lost {where}: {failed}")
+            self._say(f"lost {where}: {failed}", self._lost_hint(relocalizer))
         elif frame.state == "tracking" and before == "lost":
             self._say(f"tracking again {where}")
         error = "" if relocalizer is None or relocalizer.error is None else str(relocalizer.error)
@@ -132,10 +143,17 @@ class FollowReport:
             self._say(f"relocalization failed {where}: {error}")
         self._error_told = error
 
-    def _say(self, text: str) -> None:
+    def _lost_hint(self, relocalizer: Relocalizer | None) -> str:
+        """Say, once, what finds a lost vehicle again, where nothing searches and nothing forbids it."""
+        if relocalizer is not None or self._args.relocalize is False or self._hinted:
+            return ""
+        self._hinted = True
+        return "--relocalize searches for it"
+
+    def _say(self, text: str, hint: str = "") -> None:
         if self._terminal and self._frames > 1:
             print(file=sys.stderr)  # the progress stands there
-        complain(_NAME, text)
+        complain(_NAME, text, hint)
 
     def _progress(self, frame: Frame) -> None:
         if self._terminal:
@@ -148,13 +166,17 @@ class FollowReport:
             print(line, end="", file=sys.stderr, flush=True)
 
 
-def print_summary(summary: DriveSummary) -> None:
+def print_summary(summary: DriveSummary, left_out: str = "") -> None:
     """Print the summary of a drive for people; rows without data (scores without a map) are left out."""
     s = summary
     print(
         f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} trusted,"
         f" {s.cut_frames} shortened by the limits"
     )
+    if left_out:
+        print(f"  left out      {left_out}")
+    if s.clock_jumps:
+        print(f"  clock         jumped before {s.clock_jumps} of them")
     if s.cut_by:
         print(f"  shortened by  {', '.join(f'{name} ({count})' for name, count in s.cut_by.items())}")
     if s.fault is not None:

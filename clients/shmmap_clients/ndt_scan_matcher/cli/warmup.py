@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ndt warmup``: compile the kernels and keep them in numba's, or the device driver's, cache."""
+"""``shmmap-ndt warmup``: compile the kernels and keep them on disk, or in the device driver's cache."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "warmup",
         help="compile the kernels and cache them",
-        description="Compile the kernels and keep them in numba's cache (NUMBA_CACHE_DIR where it is set), so"
+        description="Compile the kernels and keep them (~/.cache/shmmap/kernels, or NUMBA_CACHE_DIR), so"
         " that no program that aligns has to wait for the compiler.  With --backend opencl, build the"
         " device's programs, which its driver keeps (PoCL in POCL_CACHE_DIR).",
     )

@@ -29,8 +29,9 @@ class DriveSummary:
         Scans, and how many of their alignments were that.
     no_map
         Scans that had no map around them.
-    lost, relocalized
-        Scans after which the vehicle was lost, and searches that found it again.
+    lost, relocalized, clock_jumps
+        Scans after which the vehicle was lost, searches that found it again, and scans before which the
+        clock had jumped.
     failed_limits
         How many results failed each limit of trust, by its name.
     trust
@@ -71,6 +72,7 @@ class DriveSummary:
     no_map: int
     lost: int
     relocalized: int
+    clock_jumps: int
     failed_limits: dict[str, int]
     trust: TrustLimits
     waited: int
@@ -111,6 +113,7 @@ class DriveStatistics:
     def __init__(self) -> None:
         self.frames = self.trustworthy = self.no_map = 0
         self._converged = self._waited = self._cut = self._lost = self._relocalized = 0
+        self._clock_jumps = 0
         self._failed_limits: Counter[str] = Counter()
         self._cut_by: Counter[str] = Counter()
         self._errors = RunningErrors()
@@ -130,6 +133,7 @@ class DriveStatistics:
         self._cut_by.update(result.cut.by)
         self._lost += frame.state == "lost"
         self._relocalized += frame.relocalized
+        self._clock_jumps += frame.clock_jumped
         if frame.T_truth is not None:
             self._errors.add(result.T_map_base, frame.T_truth)
         for name, running in self._results.items():
@@ -155,6 +159,7 @@ class DriveStatistics:
             no_map=self.no_map,
             lost=self._lost,
             relocalized=self._relocalized,
+            clock_jumps=self._clock_jumps,
             failed_limits=dict(self._failed_limits),
             trust=trust,
             waited=self._waited,

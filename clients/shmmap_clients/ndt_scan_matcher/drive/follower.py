@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,11 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.thinning import thinned
 
 __all__ = ["Follower", "Frame", "Relocalize"]
+
+_BLIND_SEARCHES: Final = 4
+"""With one scan, each twice as far: a vehicle that was not lost cannot be farther."""
+_SHORT_S: Final = 0.2  # in which a vehicle goes no farther than an alignment finds back
+_SAME_M: Final = 0.5
 
 Relocalize = Callable[[NDArray[np.floating], NDArray[np.float64]], Result | None]
 
@@ -42,6 +48,8 @@ class Frame:
         Whether the vehicle is followed or lost, see `Tracking`.
     relocalized
         Whether the result is one of a search for the lost vehicle.
+    clock_jumped
+        Whether the time since the scan before makes no sense: no motion was predicted.
     thin_s, map_s, align_s, relocalize_s
         Seconds for thinning the scan, for taking the map, for the alignment, for the search.
     waited
@@ -55,6 +63,7 @@ class Frame:
     T_truth: NDArray[np.float64] | None = field(repr=False)
     state: State
     relocalized: bool
+    clock_jumped: bool
     thin_s: float
     map_s: float
     align_s: float
@@ -79,8 +88,10 @@ class Follower:
     tracking
         Says when the vehicle is lost.
     relocalize
-        Called with each scan of a lost vehicle, (N, 3), metres, and the pose where it probably is, (4, 4):
-        returns a result that is trusted, or None.
+        Called with each scan of a lost vehicle, (N, 3), metres, and the last pose that was known, (4, 4):
+        returns a result that is trusted, or None.  Where little says how the vehicle has moved (at the
+        beginning, after a jump of the clock), already with the first scan whose result is not trusted, and
+        with a trusted one where much may have happened.
     """
 
     def __init__(
@@ -113,6 +124,8 @@ class Follower:
         begin = time.perf_counter()
         points = thinned(scan.xyz, self._thin)
         T_guess = self._prediction.predict(scan.stamp_s)
+        blind = self._prediction.is_blind(scan.stamp_s)
+        step_s = self._prediction.step(scan.stamp_s)
         thinned_at = time.perf_counter()
         vx, vy = self._prediction.velocity
         voxel_map, waited = self._maps.map_at(
@@ -127,14 +140,23 @@ class Follower:
         aligned_at = time.perf_counter()
         state = self._tracking.update(result)
         relocalized = False
-        if state == "lost" and self._relocalize is not None:
-            found = self._relocalize(points, T_guess)
-            if found is not None:
+        if state == "lost":
+            searches = 1
+        elif blind and not result.trustworthy:
+            searches = _BLIND_SEARCHES
+        else:  # from metres off an alignment may end in a wrong place that looks right
+            unknown = step_s is None or (step_s > _SHORT_S and not self._prediction.knows_velocity)
+            searches = int(blind and unknown)
+        for _ in range(searches if self._relocalize is not None else 0):
+            assert self._relocalize is not None  # noqa: S101  # no search otherwise
+            found = self._relocalize(points, self._prediction.T_known)
+            if found is not None and _is_better(found, result):
                 result, relocalized, self._jumped = found, True, True
                 state = self._tracking.update(result)
-        # a pose that is not trusted teaches the prediction nothing but to go on
-        self._prediction.correct(scan.stamp_s, result.T_map_base if result.trustworthy else T_guess)
-        if relocalized or state == "lost":
+            if result.trustworthy:
+                break
+        self._prediction.correct(scan.stamp_s, result.T_map_base if result.trustworthy else None)
+        if state == "lost" or (relocalized and not blind):
             self._prediction.hold()
         return Frame(
             name=scan.name,
@@ -144,9 +166,18 @@ class Follower:
             T_truth=scan.T_map_sensor,
             state=state,
             relocalized=relocalized,
+            clock_jumped=step_s is None,
             thin_s=thinned_at - begin,
             map_s=had_map_at - thinned_at,
             align_s=aligned_at - had_map_at,
             relocalize_s=time.perf_counter() - aligned_at,
             waited=waited,
         )
+
+
+def _is_better(found: Result, result: Result) -> bool:
+    """Whether a search has found another place than an alignment, where the scan fits better."""
+    if not result.trustworthy:
+        return True
+    apart = float(np.linalg.norm(found.T_map_base[:3, 3] - result.T_map_base[:3, 3]))
+    return apart > _SAME_M and found.transform_probability > result.transform_probability

@@ -20,10 +20,10 @@ def frame_document(frame: Frame) -> dict[str, Any]:
     dict
         ``name``; ``stamp_s``; ``pose``: x, y, z (metres, map frame) and the quaternion qx, qy, qz, qw;
         ``converged``, ``trustworthy``, and ``failed_limits``: why not, see `TrustLimits.failed`;
-        ``no_map``; ``state``: ``tracking``, ``uncertain`` or ``lost``; ``relocalized``; ``iterations``,
-        ``transform_probability``, ``nvtl``; ``waited``: for the map; ``latency_ms``: from having the scan to
-        having the pose; ``error_m`` and ``error_deg``: distance and angle to the true pose, null where the
-        scan has none.
+        ``no_map``; ``state``: ``tracking``, ``uncertain`` or ``lost``; ``relocalized``; ``clock_jumped``;
+        ``iterations``, ``transform_probability``, ``nvtl``; ``waited``: for the map;
+        ``latency_ms``: from having the scan to having the pose; ``error_m`` and ``error_deg``: distance
+        and angle to the true pose, null where the scan has none.
     """
     result = frame.result
     T = result.T_map_base
@@ -41,6 +41,7 @@ def frame_document(frame: Frame) -> dict[str, Any]:
         "no_map": result.no_map,
         "state": frame.state,
         "relocalized": frame.relocalized,
+        "clock_jumped": frame.clock_jumped,
         "iterations": result.iterations,
         "transform_probability": result.transform_probability,
         "nvtl": result.nvtl,

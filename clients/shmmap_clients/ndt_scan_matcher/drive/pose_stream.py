@@ -28,6 +28,7 @@ _VERSION = 1
 _QUEUE = 1000  # messages that wait for a slow reader; what comes meanwhile is lost
 _LINGER_MS = 2000
 _POLL_MS = 100
+_RESTARTED_S = 1.0  # back by more is no message that was overtaken
 _KEPT = 1000  # odometry entries: ten seconds at 100 Hz
 
 
@@ -148,6 +149,9 @@ class OdometryListener:
                 except BadRequest:
                     continue  # somebody else's message
                 with self._heard:
+                    if entry.stamp_s < self._latest_s - _RESTARTED_S:
+                        self._entries.clear()  # its clock was set back, or it began again
+                        self._latest_s = -math.inf
                     self._entries.append(entry)
                     del self._entries[:-_KEPT]
                     self._latest_s = max(self._latest_s, entry.stamp_s)

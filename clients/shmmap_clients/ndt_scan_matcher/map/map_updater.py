@@ -30,7 +30,8 @@ from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 __all__ = ["MapRules", "MapUpdater"]
 
 _REFRESH_S: Final = 1.0  # Autoware's timer; also how soon a changed map is noticed
-_REQUEST_S: Final = 60.0
+_STEP_S: Final = 5.0  # how often the daemon is asked whether a map is still being loaded
+_ARRIVAL_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,8 @@ class MapRules:
     max_voxels, max_bytes
         Limits on the map, see `VoxelMap`.
     wait_s
-        How long a map that has to be waited for may take.
+        How long a map that has to be waited for may take, from when the daemon last said that it is being
+        loaded: the first time kernels are compiled for it, on a slow machine for minutes.
     """
 
     update_distance: float = 20.0
@@ -133,6 +135,7 @@ class MapUpdater:
         self._asked: tuple[float, float, float, float] | None = None
         self._failed: tuple[float, float, float, float] | None = None
         self._error: ShmmapError | None = None
+        self._loading_s = -math.inf  # when the daemon last said that it loads
         self._closing = False
         self._busy = False
         self._thread = threading.Thread(target=self._run, name="ndt-map", daemon=True)
@@ -178,7 +181,8 @@ class MapUpdater:
         Raises
         ------
         NoAnswer
-            There is still no map that reaches far enough after ``wait_s``.
+            There is no map that reaches far enough, and for ``wait_s`` the daemon has not said that one is
+            being loaded.
         ShmmapError
             The first map could not be loaded.
         """
@@ -206,12 +210,11 @@ class MapUpdater:
             return self._changed.wait_for(lambda: self._asked is None and not self._busy, timeout_s)
 
     def _wait_for(self, x: float, y: float) -> None:
-        deadline_s = time.monotonic() + self.rules.wait_s
-        rules = self.rules
+        rules, begin_s = self.rules, time.monotonic()
         while self._latest is None or self._distance(x, y) + rules.lidar_radius > rules.map_radius:
             if self._error is not None and self._latest is None:
                 raise self._error
-            left_s = deadline_s - time.monotonic()
+            left_s = max(begin_s, self._loading_s) + rules.wait_s - time.monotonic()
             if left_s <= 0:
                 raise NoAnswer(
                     f"the map around ({x:.1f}, {y:.1f}) was not loaded within {rules.wait_s:.0f} s",
@@ -260,8 +263,7 @@ class MapUpdater:
 
     def _follow(self, x: float, y: float, vx: float, vy: float) -> None:
         begin_s = time.perf_counter()
-        self._window.move_to(x, y, vx=vx, vy=vy, route=self._route, wait=_REQUEST_S)
-        cells = self._window.cells
+        cells = self._loaded(x, y, vx, vy)
         if not cells and not self._window.complete:
             raise NoAnswer("none of the cells could be loaded", hint="`shmmap status` tells why")
         request_s = time.perf_counter() - begin_s
@@ -298,6 +300,20 @@ class MapUpdater:
             if self._asked is not None and self._distance(*self._asked[:2]) <= self.rules.update_distance:
                 self._asked = None  # asked again while this was on its way
             self._changed.notify_all()
+
+    def _loaded(self, x: float, y: float, vx: float, vy: float) -> tuple[Cell, ...]:
+        """Wait for the window's cells; those of which none follows another for long are left out."""
+        arrived_s = time.monotonic()
+        while True:
+            update = self._window.move_to(
+                x, y, vx=vx, vy=vy, route=self._route, wait=min(_STEP_S, self.rules.wait_s / 4)
+            )
+            now_s, cells = time.monotonic(), self._window.cells
+            if update.added or update.changed:
+                arrived_s = now_s
+            if not update.pending or self._closing or (cells and now_s - arrived_s > _ARRIVAL_S):
+                return cells
+            self._loading_s = now_s
 
     def _voxels(self, cell: Cell) -> tuple[Cell, VoxelCell]:
         known = self._known.get(cell.id)

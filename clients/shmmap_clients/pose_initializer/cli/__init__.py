@@ -27,6 +27,7 @@ from shmmap_clients.shared_options import (
     add_scan_option,
     add_sigma_options,
     add_thin_option,
+    reader_from,
 )
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ JSON (fields may be added, none is removed):
    "ground_z": height of the map's ground there, or null,
    "covariance": 6x6 of x y z roll pitch yaw, or null,
    "alternatives": [{"T_map_base", "score", "nvtl"}] other poses, best first,
-   "candidates", "map_ms", "search_ms"}
+   "candidates", "map_ms", "search_ms",
+   "too_near", "not_finite": points of the scan left out}
   Where there is no map, "no_map" is true and the others are null, false, 0 or
   empty.  failed_limits names what did not hold where a pose is not reliable
   (converged: the alignment did not converge).
@@ -92,7 +94,6 @@ def _run(args: argparse.Namespace) -> int:
     from shmmap_clients.map_extent import NoMapHere
     from shmmap_clients.ndt_scan_matcher import pose_from_matrix
     from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
-    from shmmap_clients.scans.scan_file import read_scan
     from shmmap_clients.scans.thinning import thinned
 
     x, y, z, roll, pitch, yaw = pose_from_matrix(pose_from(args, "--pose")).tolist()
@@ -104,7 +105,8 @@ def _run(args: argparse.Namespace) -> int:
         candidates=args.candidates,
         seed=args.seed,
     )
-    scan = thinned(read_scan(args.scan), args.thin or None)
+    reader = reader_from(args, _NAME)
+    scan = thinned(reader.points(args.scan), args.thin or None)
     with (
         connect(args, _NAME) as client,
         PoseInitializer(client, rules, threads=args.threads, **scoring_settings(args)) as initializer,
@@ -113,19 +115,19 @@ def _run(args: argparse.Namespace) -> int:
             found = initializer.initialize(scan, rough)
         except NoMapHere as error:
             if args.json:
-                print_json(_document(None))
+                print_json(_document(None, reader.counts))
             return nothing_found(args, error.message, name=_NAME)
         if initializer.fault is not None:
             complain(_NAME, f"{args.fallback} went on without the device: {initializer.fault}")
     if args.json:
-        print_json(_document(found))
+        print_json(_document(found, reader.counts))
     else:
         failed = [initializer.trust.describe(name) for name in found.result.failed_limits]
-        _print(found, args.pose_format, failed)
+        _print(found, args.pose_format, failed, reader.left_out)
     return 0 if found.reliable else 1
 
 
-def _document(found: InitialPose | None) -> dict[str, Any]:
+def _document(found: InitialPose | None, left_out: dict[str, int]) -> dict[str, Any]:
     """Return the JSON; None: there is no map."""
     result = None if found is None else found.result
     covariance = None if result is None else result.covariance
@@ -146,10 +148,11 @@ def _document(found: InitialPose | None) -> dict[str, Any]:
         "candidates": 0 if found is None else found.candidates,
         "map_ms": None if found is None else found.map_s * 1e3,
         "search_ms": None if found is None else found.search_s * 1e3,
+        **left_out,
     }
 
 
-def _print(found: InitialPose, pose_format: str, failed: list[str]) -> None:
+def _print(found: InitialPose, pose_format: str, failed: list[str], left_out: str) -> None:
     result = found.result
     print(f"pose          {pose_text(found.T_map_base, pose_format)}")
     print("T_map_base")
@@ -161,4 +164,6 @@ def _print(found: InitialPose, pose_format: str, failed: list[str]) -> None:
     for one in found.alternatives:
         x, y, z = one.T_map_base[:3, 3]
         print(f"alternative   ({x:.2f}, {y:.2f}, {z:.2f}) score {one.score:.3f}, NVTL {one.nvtl:.3f}")
+    if left_out:
+        print(f"left out      {left_out}")
     print(f"time          map {found.map_s * 1e3:.0f} ms, search {found.search_s * 1e3:.0f} ms")

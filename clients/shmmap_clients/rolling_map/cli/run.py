@@ -32,7 +32,7 @@ from shmmap_clients.rolling_map.cli.map_options import (
     scan_filter_from,
     shown_from,
 )
-from shmmap_clients.shared_options import add_quiet_option, add_scans_option
+from shmmap_clients.shared_options import add_quiet_option, add_scans_option, reader_from
 
 if TYPE_CHECKING:
     from shmmap import LiveMap, LiveMapper
@@ -70,7 +70,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )
     parser.add_argument("--live", required=True, metavar="NAME", help="name of the live map")
-    add_scans_option(parser)
+    add_scans_option(parser, min_range=False)
     parser.add_argument(
         "--poses",
         metavar="FILE",
@@ -137,7 +137,8 @@ def run(args: argparse.Namespace) -> int:
         )
     statistics = DriveStatistics()
     with contextlib.ExitStack() as stack:
-        scans = open_scans(args.scans, args.poses, stack)
+        # the map's own limits leave out points and count them
+        scans = open_scans(args.scans, args.poses, stack, reader_from(args, _NAME, min_range=None))
         client = stack.enter_context(connect(args, _NAME))
         live = client.live(args.live, frame_id=_frame(args, parameters))
         if parameters is not None:

@@ -16,12 +16,13 @@ from shmmap.protocol.messages import Selected
 from tests.support.divided_map import make_map
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
+pytestmark = pytest.mark.usefixtures("layer_kernels")
 NDT = "ndt(leaf=5.0,min_points=3)"
 
 
 def ask(one: InnerDaemon, session: Any, number: int, layer: str) -> m.Cells:
     ids = tuple(one.cache.catalogue.id(i) for i in range(len(one.cache.catalogue)))
-    one.ask(session, Selected(number, ids, (layer,), 30.0))
+    one.ask(session, Selected(number, ids, (layer,), 600.0))
     return one.cells_of(number)
 
 
@@ -61,7 +62,7 @@ def test_any_number_of_layers_is_in_memory(
     first, session, warm = (made.id("0_0.pcd"),), one.session(), one.cache.warm
     layers = [f"voxel(leaf={number}.0)" for number in range(1, 9)]
     for number, layer in enumerate(layers):
-        one.ask(session, Selected(number + 1, first, (layer,), 30.0))
+        one.ask(session, Selected(number + 1, first, (layer,), 600.0))
         assert len(one.cells_of(number + 1).cells) == 1
     assert set(warm.layers) == set(layers)
     assert list(warm.tables) == layers[:2]

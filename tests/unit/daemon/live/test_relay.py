@@ -65,7 +65,9 @@ class World:
         monkeypatch.setattr(relay, "time", SimpleNamespace(monotonic=lambda: self.now_s))
         self.statistics: list[tuple[str, int]] = []
         shown = SimpleNamespace(
-            set=lambda name, value: self.statistics.append((name, value)), show_live_maps=lambda _rows: None
+            set=lambda name, value: self.statistics.append((name, value)),
+            show_live_maps=lambda _rows: None,
+            beat=lambda: None,
         )
         events = LiveEvents(EventLog(1), cast("StatisticsWriter", shown))
         self.relay = LiveRelay(BEGIN, self.watched, lambda peer, _now_s: peer.pid != 2, events)

@@ -28,7 +28,7 @@ struct Handle {
 inline std::string text_in(const unsigned char* header, std::uint64_t end, std::size_t at, const Handle& handle) {
   const std::uint64_t offset = read_at<std::uint32_t>(header, at), size = read_at<std::uint32_t>(header, at + 4);
   if (offset > end || size > end - offset) corrupt(handle, "a text of the header lies outside of it");
-  return std::string(reinterpret_cast<const char*>(header) + offset, static_cast<std::size_t>(size));
+  return std::string(reinterpret_cast<const char*>(header) + offset, size);
 }
 
 /// Read the table of columns; each is checked against what the segment has.
@@ -38,7 +38,7 @@ inline void read_columns(Cell& cell, const Handle& handle, const unsigned char* 
   const std::uint64_t count = read_at<std::uint32_t>(segment, 172), start = read_at<std::uint32_t>(segment, 176);
   const std::uint64_t row_bytes = read_at<std::uint32_t>(segment, 180);
   if (row_bytes < 128 || start > end || count > (end - start) / row_bytes) corrupt(handle, "no table of columns");
-  cell.columns.reserve(static_cast<std::size_t>(count));
+  cell.columns.reserve(count);
   for (std::uint64_t number = 0; number < count; ++number) {
     const unsigned char* row = segment + start + number * row_bytes;
     Column column;

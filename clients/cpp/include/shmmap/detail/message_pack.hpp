@@ -186,8 +186,8 @@ class Reader {
   }
   std::string_view take(std::uint64_t size) {
     if (size > data_.size() - at_) bad("as many bytes as it says");
-    const auto found = data_.substr(at_, static_cast<std::size_t>(size));
-    at_ += static_cast<std::size_t>(size);
+    const auto found = data_.substr(at_, size);
+    at_ += size;
     return found;
   }
   std::uint64_t big_endian(unsigned bytes) {

@@ -16,6 +16,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <ctime>
 #include <string>
 #include <string_view>
 #include <system_error>
@@ -95,14 +96,15 @@ class Socket {
     write_some();
   }
 
-  /// The next message; nothing if there is none until then.  Throws Unreachable when the connection is over.
+  /// The next message; false if there is none until then.  What has come by then is read in any case, and no more
+  /// than one read after it, however much comes.  Throws Unreachable when the connection is over.
   bool receive(std::string& message, Clock::time_point until) {
-    while (true) {
+    for (bool is_over = false;; is_over = Clock::now() >= until) {
       write_some();
       while (parse(message)) {
         if (complete_) return true;
       }
-      if (!wait(until)) return false;
+      if (is_over || !is_ready(until)) return false;
       read_some();
     }
   }
@@ -158,11 +160,17 @@ class Socket {
   }
 
   /// Wait until there is something to be read or written; false when that time is over.
-  bool wait(Clock::time_point until) const {
-    const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - Clock::now()).count() + 1;
+  bool is_ready(Clock::time_point until) const {
     pollfd one{fd_.get(), static_cast<short>(POLLIN | (output_.empty() ? 0 : POLLOUT)), 0};
-    const auto ready = ::poll(&one, 1, static_cast<int>(std::clamp<long long>(left, 0, 1 << 30)));
-    return ready > 0 || Clock::now() < until;
+    while (true) {
+      const auto left = std::max<std::int64_t>(
+          0, std::chrono::duration_cast<std::chrono::nanoseconds>(until - Clock::now()).count());
+      timespec span{};
+      span.tv_sec = left / 1'000'000'000;
+      span.tv_nsec = left % 1'000'000'000;
+      if (::ppoll(&one, 1, &span, nullptr) > 0) return true;
+      if (Clock::now() >= until) return false;
+    }
   }
 
   /// Take the next frame out of what has come; `complete_` says whether it was a message, and not a command.
@@ -187,10 +195,10 @@ class Socket {
     for (const char one : input.substr(1, head - 1)) size = (size << 8) | static_cast<unsigned char>(one);
     if ((flags & ~6U) != 0 || size > most_bytes) lost("what came is no message of a daemon");
     if (input.size() - head < size) {
-      wanted_ = head + static_cast<std::size_t>(size);
+      wanted_ = head + size;
       return false;
     }
-    const auto body = input.substr(head, static_cast<std::size_t>(size));
+    const auto body = input.substr(head, size);
     start_ += head + body.size();
     if ((flags & 4U) == 0) {
       message.assign(body);

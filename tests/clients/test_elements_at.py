@@ -9,7 +9,9 @@ import numba
 import numpy as np
 import pytest
 from numba import types
-from shmmap_clients.compiling import compiled, float32_at, float64_at, int32_at, read_only
+from shmmap_clients.elements_at import float32_at, float64_at, int32_at
+
+from shmmap.compiling import compiled, read_only
 
 
 def total(values: Any) -> Any:

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells that go from one process to another: what travels is the handle, and the other side attaches it.
+
+So a pool of processes, a DataLoader, dask or ray send a few hundred bytes for a cell of megabytes.  Nothing
+but a mapping keeps a segment: until the other side has attached it, the sender has to keep its cell.
+
+What cannot be attached is a `StaleHandle`.  It is raised where it is unpickled, except by `multiprocessing`,
+whose pools and queues wait without end for a message that did not unpickle.  There the cell comes without its
+data, and raises the error when it is first used.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable
+from functools import cache
+from types import FrameType
+from typing import Any, Final, NoReturn
+
+from shmmap.client.attaching import Attacher
+from shmmap.client.cell import Access, Cell
+from shmmap.client.visible import owner_of_segments
+from shmmap.errors import SegmentCorrupt, ShmmapError, StaleHandle
+from shmmap.protocol.messages import Handle
+from shmmap.segment.names import retired_name
+
+__all__ = ["hand_over"]
+
+_COPY_HINT: Final = (
+    "keep the cell until the other process has it, or hand over cell.copy(), which has the points"
+)
+_PLUMBING: Final = frozenset(
+    f"multiprocessing.{name}" for name in ("connection", "forkserver", "queues", "reduction", "spawn")
+)
+"""Modules that unpickle, and lose whoever waits for what did not."""
+
+
+class _Gone:
+    """Stands for the data of a cell that could not be attached."""
+
+    def __init__(self, error: ShmmapError) -> None:
+        self._error = error
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise type(self._error)(self._error.message, hint=self._error.hint)
+
+
+@cache
+def _boot() -> str:
+    """Name this run of this machine, which containers share; empty where the kernel does not tell."""
+    try:
+        with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:
+            return file.read().strip()
+    except OSError:
+        return ""
+
+
+def hand_over(cell: Cell, access: Access, handle: Handle) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
+    """Return what pickle makes an attached cell of: a function, and what it is called with."""
+    published = cell._attached.published
+    epoch = published.epoch if published is not None else 0
+    return _take, (_boot(), access.shm_dir, access.slot, epoch, cell.id, handle)
+
+
+def _take(boot: str, shm_dir: str, slot: int | None, epoch: int, cell_id: str, handle: Handle) -> Cell:
+    """Attach a cell that another process has handed over."""
+    access = Access(os.environ.get("SHMMAP_SHM_DIR") or shm_dir, slot, None)
+    named = f"{cell_id} ({handle.layer})"
+    try:
+        if boot and _boot() and boot != _boot():
+            raise StaleHandle(
+                f"{named}: it was pickled on another machine, or before this one was restarted: a pickled"
+                " cell names shared memory of its machine",
+                hint="pickle cell.copy(), which has the points, or ask for the cell where it is needed",
+            )
+        return _attached(access, epoch, cell_id, handle, named)
+    except ShmmapError as error:
+        if not _loses_errors(sys._getframe(1)):
+            raise
+        return Cell(cell_id, handle.segment, handle, _Gone(error), access)  # type: ignore[arg-type]
+
+
+def _attached(access: Access, epoch: int, cell_id: str, handle: Handle, named: str) -> Cell:
+    owner = owner_of_segments(access.shm_dir, f"{handle.segment.rpartition('.')[0]}.")
+    access = access._replace(owner=owner)
+    for name in (handle.segment, retired_name(handle.segment)):
+        try:
+            with _lock:
+                cell = _attacher.attach(handle, cell_id, name, access)
+            published = cell._attached.published
+        except (StaleHandle, SegmentCorrupt):
+            continue
+        if published is None or (published.epoch, published.version) == (epoch, handle.version):
+            cell.segment = handle.segment
+            return cell
+    where = (
+        ""
+        if owner is not None
+        else f" (no daemon's segments are in {access.shm_dir}, as this process sees it)"
+    )
+    raise StaleHandle(
+        f"{named}: the segment {handle.segment} is gone since it was pickled: evicted, replaced, or its"
+        f" daemon stopped{where}",
+        hint=_COPY_HINT,
+    )
+
+
+def _loses_errors(frame: FrameType | None) -> bool:
+    """Whether it is `multiprocessing` itself that unpickles, and no program that it runs."""
+    while frame is not None:
+        module: str = frame.f_globals.get("__name__", "")
+        if module.startswith("multiprocessing."):
+            return module in _PLUMBING
+        frame = frame.f_back
+    return False
+
+
+_attacher: Final = Attacher()
+_lock = threading.Lock()
+
+
+def _after_fork_in_child() -> None:
+    global _lock
+    _lock = threading.Lock()
+    _attacher.restart_in_child()
+
+
+os.register_at_fork(after_in_child=_after_fork_in_child)

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a process may have no more of: descriptors, threads, memory; the limit is named with its value.
+
+libzmq ends the process where it gets no descriptor or thread (``epoll.cpp``, ``thread.cpp``), so whether
+there are enough is found out before, by taking them for a moment.
+"""
+
+from __future__ import annotations
+
+import _thread
+import errno
+import os
+import time
+from typing import Final
+
+from shmmap.errors import LimitReached
+
+__all__ = ["check_files", "check_threads", "no_files_left", "no_memory_left", "no_threads_left"]
+
+_GONE_S: Final = 0.0001
+_PIDS: Final = "/sys/fs/cgroup"
+
+
+def check_files(count: int, what: str) -> None:
+    """Find out whether this process may open so many files more.
+
+    Raises
+    ------
+    LimitReached
+        It may not; ``what`` needs them.
+    """
+    fds: list[int] = []
+    try:
+        try:
+            for _ in range(count):
+                fds.append(os.eventfd(0))  # noqa: PERF401  those that there are have to be closed
+        finally:
+            for fd in fds:
+                os.close(fd)
+    except OSError as error:
+        limit = no_files_left(error, f"{what} needs {count} more descriptors, {len(fds)} are left: ")
+        if limit is None:
+            raise
+        raise limit from None
+
+
+def no_files_left(error: Exception, what: str = "") -> LimitReached | None:
+    """Return the error that names the limit of open files which an error means; None where it means none."""
+    number = getattr(error, "errno", None)
+    if number == errno.ENFILE:
+        return LimitReached(
+            f"{what}the machine has as many files open as it may (fs.file-max)",
+            hint="close some, or raise it: sysctl fs.file-max",
+        )
+    if number == errno.EMFILE or (number is None and _may_open_none()):
+        most = os.sysconf("SC_OPEN_MAX")  # as `resource` says, which would have to be loaded from a file
+        return LimitReached(
+            f"{what}this process has as many files open as it may, {most} (RLIMIT_NOFILE)",
+            hint="close some, or raise the limit: ulimit -n, in a unit LimitNOFILE=",
+        )
+    return None
+
+
+def _may_open_none() -> bool:
+    try:
+        os.close(os.eventfd(0))
+    except OSError as error:
+        return error.errno == errno.EMFILE
+    return False
+
+
+def check_threads(count: int, what: str) -> None:
+    """Find out whether so many threads more may be started.
+
+    Raises
+    ------
+    LimitReached
+        They may not; ``what`` needs them.
+    """
+    stay = _thread.allocate_lock()
+    started: list[str] = []
+
+    def wait() -> None:
+        started.append(f"/proc/self/task/{_thread.get_native_id()}")
+        with stay:
+            pass
+
+    begun = 0
+    with stay:
+        try:
+            for _ in range(count):
+                _thread.start_new_thread(wait, ())
+                begun += 1
+        except RuntimeError:
+            raise no_threads_left(f"{what} needs {count} more threads, {begun} can be started: ") from None
+        finally:
+            while len(started) < begun:
+                time.sleep(0)
+    # a thread counts until the kernel has taken it off its list
+    while any(map(os.path.exists, started)):
+        time.sleep(_GONE_S)
+
+
+def no_threads_left(what: str = "") -> LimitReached:
+    """Return the error that names what limits threads, and how far each limit is."""
+    limits = []
+    if (most := os.sysconf("SC_CHILD_MAX")) >= 0:
+        limits.append(f"{most} processes and threads of this user (RLIMIT_NPROC)")
+    if (group := _group_limit()) is not None:
+        limits.append(group)
+    limits += _memory_limits()
+    named = ", ".join(limits) or "those of the machine (kernel.threads-max)"
+    return LimitReached(
+        f"{what}the limits of this process are {named}",
+        hint="end some, or raise the limit: ulimit -u, in a unit LimitNPROC= or TasksMax=",
+    )
+
+
+def _group_limit() -> str | None:
+    """What the control group of this process allows."""
+    try:
+        with open("/proc/self/cgroup", encoding="utf-8") as file:
+            paths = [line.rstrip("\n").split(":", 2) for line in file]
+        for _, controllers, path in paths:
+            if controllers in ("", "pids"):
+                directory = f"{_PIDS}{'/pids' if controllers else ''}{path.rstrip('/')}"
+                with open(f"{directory}/pids.max", encoding="utf-8") as file:
+                    most = file.read().strip()
+                if most != "max":
+                    return f"{most} in the control group (pids.max)"
+    except (OSError, ValueError):
+        pass
+    return None
+
+
+def no_memory_left(nbytes: int) -> LimitReached:
+    """Return the error of a process that gets no more memory of its own, with what limits it."""
+    limits = ", ".join(_memory_limits()) or "no limit is set"
+    return LimitReached(
+        f"{nbytes} bytes of private memory are not to be had ({limits})",
+        hint="raise the limit: ulimit -d and -v, or free memory",
+    )
+
+
+def _memory_limits() -> list[str]:
+    import resource
+
+    limits = {
+        "data (RLIMIT_DATA)": resource.getrlimit(resource.RLIMIT_DATA)[0],
+        "address space (RLIMIT_AS)": resource.getrlimit(resource.RLIMIT_AS)[0],
+    }
+    return [f"{most >> 20} MiB of {name}" for name, most in limits.items() if most != resource.RLIM_INFINITY]

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever is wrong with compiled kernels, daemon, live maps and programs run, and the kernels come back."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap import kernel_cache
+from shmmap.layers.compiling import compile_kernels
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+def a_directory(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+@pytest.fixture
+def kernels(tmp_path: Path) -> Path:
+    """Return a copy of the kernels that all tests use."""
+    import shmmap.chunks.applying_kernels
+    import shmmap.chunks.marking_kernels  # noqa: F401  compiled as they are imported
+
+    compile_kernels()
+    used = kernel_cache.kernel_directory()
+    assert used is not None
+    copy = tmp_path / "kernels"
+    shutil.copytree(used, copy)
+    copy.chmod(0o700)
+    return copy
+
+
+def one_of(kernels: Path, name: str) -> Path:
+    found = list(kernels.glob(f"{name}-*.kernel"))
+    assert found
+    return max(found, key=lambda path: path.stat().st_mtime)
+
+
+def serve(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, kernels: Path) -> DaemonProcess:
+    file = tmp_path / "shmmap.toml"
+    file.write_text(f'[live.lidar]\nresolution = 0.2\npath = "{tmp_path}/lidar"\n')
+    environment = {"NUMBA_CACHE_DIR": str(kernels)}
+    return daemon(divided_map.root, "--config", str(file), "--live-budget", "8MiB", environment=environment)
+
+
+@pytest.mark.parametrize("damage", [empty, flip, a_directory])
+def test_points_and_live_maps_are_served(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, kernels: Path,
+    damage: Callable[[Path], None],
+) -> None:  # fmt: skip
+    harmed = one_of(kernels, "applying_kernels.end_writing")
+    damage(harmed)
+    one = serve(daemon, divided_map, tmp_path, kernels)
+    with shmmap.connect(one.endpoint) as client:
+        assert client.around(0, 0, 30).cells
+        with client.live("lidar").mapper("front") as mapper:
+            mapper.add(np.arange(3.0, 9.0, 0.1).reshape(20, 3), np.eye(4))
+            assert mapper.wait_applied() == 1
+    assert str(harmed) in one.log
+    assert harmed.is_file() == (damage is not a_directory)
+    if damage is a_directory:
+        harmed.rmdir()
+    one.stop()
+    before = one.log.count("compiled kernel discarded")
+    one.start()  # the cause is gone: it is kept again
+    assert harmed.is_file()
+    assert one.log.count("compiled kernel discarded") == before
+
+
+def test_a_program_that_finds_nothing_but_damage(kernels: Path) -> None:
+    for path in kernels.glob("*.kernel"):
+        empty(path)
+    program = "from shmmap.chunks import applying_kernels; print('begun')"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(kernels)}
+    for expected in (1, 0):
+        done = subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == "begun\n"
+        assert done.stderr.count("compiled kernel discarded") == expected

@@ -1,0 +1,390 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled kernels on disk: whatever is wrong with them they are compiled, and only trusted ones are run."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import importlib.util
+import logging
+import os
+import pickle
+import resource
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmmap import kernel_cache
+
+pytest.importorskip("numba", reason="needs the package numba")
+
+SOURCE = """
+from numba import types
+from shmmap.compiling import compiled
+
+@compiled(types.int64(types.int64))
+def doubled(value):
+    return 2 * value
+"""
+
+
+class Kernel:
+    """A module with a kernel, imported as by another process each time."""
+
+    def __init__(self, folder: Path, directory: Path) -> None:
+        self.module = folder / "doubling.py"
+        self.module.write_text(SOURCE)
+        self.directory = directory
+
+    def hits(self) -> int:
+        """Import it and compute; returns how many variants came from the disk."""
+        spec = importlib.util.spec_from_file_location("doubling", self.module)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        assert module.doubled(21) == 42
+        return sum(module.doubled.stats.cache_hits.values())
+
+    @property
+    def file(self) -> Path:
+        """The one file of the kernel."""
+        (found,) = self.directory.glob("*.kernel")
+        return found
+
+
+@pytest.fixture
+def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Kernel]:
+    directory = tmp_path / "kernels"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(directory))
+    monkeypatch.setattr(kernel_cache, "_said", set())
+    monkeypatch.setattr(kernel_cache, "_unkept", [])
+    yield Kernel(tmp_path, directory)
+    for path in (directory, *directory.glob("*")) if directory.is_dir() else ():
+        path.chmod(0o700)
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_what_is_compiled_is_kept(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
+    assert [kernel.hits(), kernel.hits(), kernel.hits()] == [0, 1, 1]
+    assert stat.S_IMODE(kernel.directory.stat().st_mode) == 0o700
+    assert kernel_cache.all_kept()
+    assert not warnings(caplog)
+
+
+def test_another_source_is_another_kernel(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
+    kernel.hits()
+    kernel.module.write_text(SOURCE.replace("2 * value", "value + value"))
+    assert [kernel.hits(), kernel.hits()] == [0, 1]
+    assert kernel.file  # in place of the other
+    assert not warnings(caplog)
+
+
+# --- damage ----------------------------------------------------------------------------------------
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def shorten(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def flip(at: int) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        data = bytearray(path.read_bytes())
+        data[at] ^= 1
+        path.write_bytes(data)
+
+    damage.__name__ = f"flip_{at}"
+    return damage
+
+
+def zeros(path: Path) -> None:
+    """What a power cut leaves of a file that was not flushed."""
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def enlarge(path: Path) -> None:
+    os.truncate(path, 1 << 40)
+
+
+def a_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def a_link(path: Path) -> None:
+    path.rename(path.with_suffix(".elsewhere"))
+    path.symlink_to(path.with_suffix(".elsewhere"))
+
+
+def a_loop(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path)
+
+
+def unreadable(path: Path) -> None:
+    path.chmod(0)
+
+
+def _with_payload(path: Path, payload: bytes) -> None:
+    head = path.read_bytes()[:40]
+    path.write_bytes(head + hashlib.sha256(payload).digest() + payload)
+
+
+def no_pickle(path: Path) -> None:
+    _with_payload(path, b"no pickle")
+
+
+def of_a_module_that_is_gone(path: Path) -> None:
+    _with_payload(path, b"cnumba.gone\nName\n.")
+
+
+def of_something_else(path: Path) -> None:
+    _with_payload(path, pickle.dumps(("a", 1)))
+
+
+DAMAGES = [
+    empty, shorten, flip(0), flip(20), flip(50), flip(-1), zeros, enlarge, a_pipe, a_link, a_loop, unreadable,
+    no_pickle, of_a_module_that_is_gone, of_something_else,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+def test_a_damaged_kernel_is_compiled_and_replaced(
+    kernel: Kernel, damage: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    kernel.hits()
+    (mark := kernel_cache.compiled_mark() or Path()).touch()
+    damage(file := kernel.file)
+    if damage is unreadable and os.geteuid() == 0:
+        assert kernel.hits() == 1
+        return
+    assert [kernel.hits(), kernel.hits()] == [0, 1]
+    if damage.__name__ == "flip_20":
+        return  # as of another version: nothing to be said
+    assert not mark.exists()  # the next daemon looks after all of them
+    (line,) = warnings(caplog)
+    assert line.startswith(f"compiled kernel discarded path={file} reason=")
+
+
+def test_damage_is_said_once(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(3):
+        kernel.hits()
+        empty(kernel.file)
+    assert len(warnings(caplog)) == 1
+
+
+def test_a_directory_where_a_kernel_should_be_stays(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
+    kernel.hits()
+    path = kernel.file
+    path.unlink()
+    (path / "somebody's").mkdir(parents=True)
+    assert [kernel.hits(), kernel.hits()] == [0, 0]
+    assert str(path) in warnings(caplog)[0]
+    (path / "somebody's").rmdir()
+    path.rmdir()
+    assert [kernel.hits(), kernel.hits()] == [0, 1]
+
+
+# --- nowhere to keep them --------------------------------------------------------------------------
+
+
+def a_file(directory: Path) -> Callable[[], object]:
+    directory.write_text("")
+    return directory.unlink
+
+
+def below_a_file(directory: Path) -> Callable[[], object]:
+    os.environ["NUMBA_CACHE_DIR"] = str(directory / "below")
+    return a_file(directory)
+
+
+def a_link_to_nothing(directory: Path) -> Callable[[], object]:
+    directory.symlink_to("nothing")
+    return directory.unlink
+
+
+def written_by_others(directory: Path) -> Callable[[], object]:
+    directory.mkdir()
+    directory.chmod(0o777)
+    return lambda: directory.chmod(0o700)
+
+
+def read_only(directory: Path) -> Callable[[], object]:
+    directory.mkdir()
+    directory.chmod(0o500)
+    return lambda: directory.chmod(0o700)
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [a_file, below_a_file, a_link_to_nothing, written_by_others, read_only],
+    ids=lambda obstacle: obstacle.__name__,
+)
+def test_where_none_can_be_kept_each_process_compiles(
+    kernel: Kernel, obstacle: Callable[[Path], Callable[[], object]], caplog: pytest.LogCaptureFixture
+) -> None:
+    remove = obstacle(kernel.directory)
+    if obstacle is read_only and os.geteuid() == 0:
+        return  # which stops nobody who is root
+    assert [kernel.hits(), kernel.hits()] == [0, 0]
+    (line,) = warnings(caplog)
+    assert line.startswith(f"compiled kernels are not kept path={kernel.directory}")
+    assert kernel_cache.compiled_mark() is None
+    remove()
+    assert [kernel.hits(), kernel.hits()] == [0, 1]  # back by itself
+
+
+def test_without_a_home(monkeypatch: pytest.MonkeyPatch, kernel: Kernel) -> None:
+    for name in ("NUMBA_CACHE_DIR", "CACHE_DIRECTORY", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    assert kernel.hits() == 0
+    assert kernel_cache.kernel_directory() is None
+
+
+def _import_twice(kernel: Kernel, before: Callable[[], None]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import doubling; print(doubling.doubled(21), sum(doubling.doubled.stats.cache_hits.values()))",
+        ],
+        cwd=kernel.module.parent, env={**os.environ, "PYTHONPATH": os.pathsep.join(["", *sys.path])},
+        preexec_fn=before, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+
+def test_a_file_too_large_for_a_limit(kernel: Kernel) -> None:
+    """As a full disk: the file is begun, and cannot be finished."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+
+    done = _import_twice(kernel, limit)
+    assert done.stdout == "42 0\n"
+    assert done.stderr.count("compiled kernels are not kept") == 1
+    assert os.strerror(errno.EFBIG) in done.stderr
+    assert not list(kernel.directory.iterdir())
+    assert [kernel.hits(), kernel.hits()] == [0, 1]
+
+
+@pytest.mark.root
+def test_a_full_disk(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
+    kernel.directory.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16k,mode=700", "tmpfs", str(kernel.directory)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("cannot mount a tmpfs")
+    try:
+        (kernel.directory / "filler").write_bytes(bytes(16384))
+        assert [kernel.hits(), kernel.hits()] == [0, 0]
+        (line,) = warnings(caplog)
+        assert os.strerror(errno.ENOSPC) in line
+        assert not kernel_cache.all_kept()
+        (kernel.directory / "filler").unlink()
+        subprocess.run(["mount", "-o", "remount,size=1m", str(kernel.directory)], check=True)
+        assert [kernel.hits(), kernel.hits()] == [0, 1]
+    finally:
+        subprocess.run(["umount", str(kernel.directory)], check=True)
+
+
+def test_what_was_left_unfinished_is_removed(kernel: Kernel) -> None:
+    kernel.hits()
+    left, begun = kernel.directory / "a.kernel.12.tmp", kernel.directory / "b.kernel.34.tmp"
+    left.write_bytes(b"half")
+    os.utime(left, (0, 0))
+    begun.write_bytes(b"half")
+    assert kernel_cache.all_kept()
+    assert (left.exists(), begun.exists()) == (False, True)
+
+
+# --- whose they are --------------------------------------------------------------------------------
+
+
+def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a file or directory another user's."""
+    if os.geteuid() == 0:
+        os.chown(path, 65534, 65534)
+    else:
+        real = os.fstat
+        others = (path.stat().st_dev, path.stat().st_ino)
+
+        def fstat(fd: int) -> Any:
+            found = real(fd)
+            if (found.st_dev, found.st_ino) != others:
+                return found
+            return os.stat_result([*found[:4], found.st_uid + 1, *found[5:]])
+
+        monkeypatch.setattr(os, "fstat", fstat)
+
+
+class Harm:
+    """What runs a program of its own when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o620, 0o602, 0o666])
+@pytest.mark.parametrize("others", [False, True])
+def test_a_file_that_others_may_have_written_is_not_run(
+    kernel: Kernel, tmp_path: Path, mode: int, others: bool, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    kernel.hits()
+    path = kernel.file
+    _with_payload(path, pickle.dumps(Harm(tmp_path / "harm")))
+    path.chmod(mode)
+    if others:
+        give_away(path, monkeypatch)
+    trusted = mode == 0o600 and not others
+    assert kernel.hits() == 0
+    assert (tmp_path / "harm").exists() == trusted  # else it was not even unpickled
+    monkeypatch.undo()
+    (line,) = warnings(caplog)
+    assert trusted or "belongs to another user" in line or f"chmod go-w {path}" in line
+
+
+@pytest.mark.parametrize(("mode", "others"), [(0o770, False), (0o1777, False), (0o707, False), (0o700, True)])
+def test_a_directory_where_others_may_write_is_not_used(
+    kernel: Kernel, mode: int, others: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    kernel.hits()
+    kernel.directory.chmod(mode)
+    if others:
+        give_away(kernel.directory, monkeypatch)
+    before = kernel.file.stat()
+    assert kernel.hits() == 0
+    assert kernel.file.stat() == before
+    (line,) = warnings(caplog)
+    assert "belongs to another user" in line or f"chmod go-w {kernel.directory}" in line
+
+
+def test_a_link_to_the_directory_is_followed(kernel: Kernel, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    kernel.directory.symlink_to(tmp_path / "elsewhere")
+    assert [kernel.hits(), kernel.hits()] == [0, 1]
+
+
+def test_kernels_that_came_with_an_image_are_used(
+    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Where they cannot be written they can be read."""
+    kernel.hits()
+    kernel.directory.chmod(0o500)
+    assert kernel.hits() == 1
+    assert not warnings(caplog)
