@@ -62,6 +62,11 @@ class FileThreads:
         """Wait until there is something to tell, at most so long; not at all if nothing is being done."""
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
+    def stop(self) -> None:
+        """Begin with nothing more, and wait for nothing; nobody is told any more."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        self._running.clear()
+
     def close(self) -> list[Any]:
         """Wait until all is done; returns what came of it and was not told, but errors."""
         self._threads.shutdown()
