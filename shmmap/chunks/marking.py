@@ -17,11 +17,11 @@ import numpy as np
 from shmmap.chunks import marking_kernels as kernels
 from shmmap.chunks.marks import MOST_CHUNKS, Marks
 from shmmap.chunks.scan_filter import Counts, ScanFilter
-from shmmap.chunks.voxels import CHUNK_SHIFT, CHUNK_SIDE, WORDS, voxel_indices
+from shmmap.chunks.voxels import CHUNK_SHIFT, CHUNK_SIDE, FURTHEST_SENSOR, WORDS, voxel_indices
 from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["Counts", "Marker", "ScanFilter"]
 
@@ -69,13 +69,14 @@ class Marker:
         self._misses = np.zeros(count * WORDS, np.uint64)
         self._used = np.zeros(count + 1, np.int32)
 
-    def mark(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> tuple[Marks, Counts]:
+    def mark(self, points: ArrayLike, pose: ArrayLike) -> tuple[Marks, Counts]:
         """Mark a scan.
 
         Parameters
         ----------
         points
-            (N, 3) float32 or float64, metres in the sensor's frame; those that are not finite are left out.
+            (N, 3) float32 or float64, metres in the sensor's frame; those that are masked or not finite are
+            left out.
         pose
             (3, 4) or (4, 4): rotation and position of the sensor in the map's frame.
 
@@ -85,10 +86,16 @@ class Marker:
             A shape is wrong, the pose is not a rotation and a finite position, the sensor is further away
             than voxels reach, or the scan touches more than 4096 chunks.
         """
-        points = np.ascontiguousarray(points, None if points.dtype == np.float32 else np.float64)
+        points = _numbers("points", points)
         if points.ndim != 2 or points.shape[1] != 3:
             raise BadRequest(f"points: need the shape (N, 3), not {points.shape}")
         rigid = _rigid(pose)
+        reach_m = FURTHEST_SENSOR * self.resolution
+        if not (np.abs(rigid[:, 3]) < reach_m).all():
+            raise BadRequest(
+                f"pose: sensor at {rigid[:, 3].tolist()}, further than {reach_m:.4g} m from the map's origin",
+                hint="map in a frame whose origin is nearer, or make the map with larger voxels",
+            )
         sensor = voxel_indices(rigid[None, :, 3], self.resolution)[0].astype(np.int64)
         reach = self._reach * CHUNK_SIDE
         voxel_indices(rigid[None, :, 3] + self.resolution * 2 * reach, self.resolution)
@@ -148,14 +155,31 @@ class Marker:
         return Marks(keys[order].astype(np.int32), counts[:, 0].copy(), counts[:, 1].copy(), bits, words)
 
 
-def _rigid(pose: NDArray[np.floating]) -> NDArray[np.float64]:
+def _numbers(what: str, values: ArrayLike) -> NDArray[np.floating]:
+    """Real numbers as float32 where they are that, else as float64; NaN where an element is masked."""
+    try:
+        array = np.asanyarray(values)
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"{type(values).__name__} of {array.dtype}")
+        kind = np.float32 if array.dtype == np.float32 else np.float64
+        if isinstance(array, np.ma.MaskedArray):
+            return np.ascontiguousarray(np.ma.filled(array.astype(kind), np.nan), kind)
+        return np.ascontiguousarray(array, kind)
+    except (TypeError, ValueError) as error:  # rows of several lengths, texts, None
+        raise BadRequest(f"{what}: need an array of numbers: {error}") from None
+
+
+def _rigid(pose: ArrayLike) -> NDArray[np.float64]:
     """A pose as (3, 4), checked."""
-    rigid = np.ascontiguousarray(np.asarray(pose, dtype=np.float64)[:3])
-    if rigid.shape != (3, 4):
-        raise BadRequest(f"pose: need the shape (3, 4) or (4, 4), not {np.shape(pose)}")
+    whole = _numbers("pose", pose).astype(np.float64)
+    if whole.shape not in ((3, 4), (4, 4)):
+        raise BadRequest(f"pose: need the shape (3, 4) or (4, 4), not {whole.shape}")
+    rigid = np.ascontiguousarray(whole[:3])
     rotation = rigid[:, :3]
     if not np.isfinite(rigid).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
         raise BadRequest("pose: need a rotation and a finite position")
     if np.linalg.det(rotation) < 0:
         raise BadRequest("pose: it mirrors what it should turn")
+    if len(whole) == 4 and not np.allclose(whole[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=1e-6):
+        raise BadRequest(f"pose: its last row is {whole[3].tolist()}, not 0 0 0 1: is it transposed?")
     return rigid

@@ -26,6 +26,7 @@ __all__ = [
     "CHUNK_SIDE",
     "CHUNK_VOXELS",
     "FURTHEST_INDEX",
+    "FURTHEST_SENSOR",
     "WORDS",
     "ChunkKey",
     "in_chunk",
@@ -47,6 +48,8 @@ WORDS: Final = CHUNK_VOXELS // 64
 """Words of a chunk: 64 voxels of equal z each, x fastest."""
 FURTHEST_INDEX: Final = 1 << 30
 """Voxels have indices from minus this up to this less one: half of what a chunk key could name."""
+FURTHEST_SENSOR: Final = FURTHEST_INDEX // 2
+"""Sensors and readers are nearer to the map's origin: what they see has to have indices, too."""
 
 
 class ChunkKey(NamedTuple):

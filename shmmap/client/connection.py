@@ -23,8 +23,8 @@ from shmmap.client.connection_watch import CONNECTION, FILES, ConnectionWatch
 from shmmap.client.discovery import find_socket
 from shmmap.client.orphans import stop_orphans
 from shmmap.client.program_name import program_name
-from shmmap.errors import LimitReached, NoAnswer, ProtocolMismatch, ShmmapError, error_from_wire
-from shmmap.protocol.codec import decode_reply, encode
+from shmmap.errors import BadRequest, LimitReached, NoAnswer, ProtocolMismatch, ShmmapError, error_from_wire
+from shmmap.protocol.codec import decode_reply, encode, encode_request
 from shmmap.protocol.messages import PROTOCOL_VERSION, ErrorReply, Hello, Reply, Request, Welcome
 from shmmap.segment.process_limits import check_files
 
@@ -125,7 +125,7 @@ class Connection:
 
     def tell(self, message: Request) -> None:
         """Send a message whose reply nobody waits for; lost if the daemon is away."""
-        self._send(encode(message))
+        self._send(encode_request(message))
 
     def ask(self, message: Request, kind: type[R], *, timeout_s: float, quiet_s: float = 0.0) -> R:
         """Send a request and return its reply; begins a new session where the daemon lost it.
@@ -141,12 +141,17 @@ class Connection:
 
         Raises
         ------
+        BadRequest
+            The request is larger than the daemon takes: nothing was sent.
         NoAnswer
             No reply before the deadline.
         ShmmapError
             The error with which the daemon refused the request.
         """
-        data = encode(message)
+        try:
+            data = encode_request(message)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise BadRequest(f"the request cannot be sent: {error}") from None
         deadline_s = time.monotonic() + timeout_s
         while True:
             if self._greeting:

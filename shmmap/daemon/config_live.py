@@ -6,6 +6,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -20,6 +21,8 @@ __all__ = ["SERVICE_STATE", "LiveSettings", "live_directory", "live_settings"]
 
 SERVICE_STATE: Final = "/var/lib/shmmap/state"
 """Where each instance of the installed service has its state directory (StateDirectory= of the units)."""
+
+REAL_S: Final = 0.5
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _RANGES: Final = {
@@ -105,12 +108,21 @@ def live_settings(
         found[name] = msgspec.structs.replace(base, path=os.path.abspath(path) if path else base.path)
     paths: dict[str, str] = {}
     for one in found.values():
-        if one.path and (other := paths.setdefault(os.path.realpath(one.path), one.name)) != one.name:
+        if one.path and (other := paths.setdefault(_real(one.path), one.name)) != one.name:
             raise ConfigError(
                 f"live maps {other} and {one.name} are both in {one.path}", key="live", origin=origin,
                 hint="give each a directory of its own",
             )  # fmt: skip
     return tuple(found.values())
+
+
+def _real(path: str) -> str:
+    """A path without links, as far as that is known at once: a directory may hang."""
+    found = [os.path.normpath(path)]
+    looking = threading.Thread(target=lambda: found.append(os.path.realpath(path)), daemon=True)
+    looking.start()
+    looking.join(REAL_S)
+    return found[-1]
 
 
 def _checked_name(name: str, origin: str) -> str:

@@ -67,7 +67,11 @@ def check_live_maps(patient: Patient) -> Finding:
     fact = f"{', '.join(row.name for row in rows)}: {counted(unsaved, 'chunk')} not saved yet"
     if failing := [row for row in rows if row.problem]:
         what = "; ".join(f"{row.name}: {row.problem}" for row in failing)
-        return fail(name, what, "what is in memory stays there until it is saved: see to the disk")
+        return fail(
+            name,
+            what,
+            "see to its files and its disk: it is tried again, and what is in memory stays there meanwhile",
+        )
     if damaged := sum(row.damaged for row in rows):
         texts = [f"{row.name}: {text}" for row in _told(patient) for text in row.damaged][:NAMED]
         named = f" ({'; '.join(texts)}{'; …' if damaged > NAMED else ''})" if texts else ""

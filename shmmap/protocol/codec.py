@@ -21,6 +21,7 @@ __all__ = [
     "encode",
     "encode_cells",
     "encode_handle",
+    "encode_request",
     "pack_versions",
     "request_number",
     "unpack_versions",
@@ -40,6 +41,17 @@ def _plain(value: object) -> object:
 
 _encoder: Final = msgspec.msgpack.Encoder(enc_hook=_plain)
 encode: Final = _encoder.encode
+
+
+def encode_request(message: Request) -> bytes:
+    """Return a request's bytes; `BadRequest` of one that no daemon takes: it would end the connection."""
+    data = encode(message)
+    if len(data) > MAX_REQUEST_BYTES:
+        raise BadRequest(
+            f"the request has {len(data):,} bytes; {MAX_REQUEST_BYTES:,} are the most",
+            hint="ask for an area, or for some ids at a time",
+        )
+    return data
 
 
 @cache  # made when it is first needed: a client never decodes requests, and importing it should be cheap
@@ -147,4 +159,4 @@ def decode_reply(data: bytes | memoryview) -> Reply:
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise ProtocolMismatch(
             f"the daemon's reply does not decode: {error}", hint="update the older of client and daemon"
-        ) from error
+        ) from None

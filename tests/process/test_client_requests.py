@@ -538,6 +538,24 @@ def test_another_major_version_is_refused(
         shmmap.connect(one.endpoint)
 
 
+def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(
+    daemon: Factory, divided_map: DividedMap
+) -> None:
+    """It would end the connection, again and again; the error names the limit, and the client goes on."""
+    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+        session = client.welcome.session
+        for ids in (["x" * (5 << 20)], [f"{number:0100}.pcd" for number in range(45_000)]):
+            for ask in (client.selected, client.evict):
+                with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
+                    ask(ids)
+                assert "some ids at a time" in refused.value.hint
+        held = [shmmap.HeldCell(f"{number:0100}.pcd", 1) for number in range(45_000)]
+        with pytest.raises(BadRequest, match="4,194,304"):
+            client.differential(shmmap.Circle(0.0, 0.0, 5.0), held)
+        assert len(client.selected(["0_0.pcd"])) == 1
+        assert client.welcome.session == session, "the connection has not broken"
+
+
 # --- the client's own life ----------------------------------------------------------------------
 
 

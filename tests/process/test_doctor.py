@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -15,27 +14,8 @@ import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap
+from tests.support.doctor_verb import doctor
 from tests.support.patience import Patience
-
-
-def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
-    """Exit code, and the findings by name."""
-    done = subprocess.run(
-        [
-            sys.executable, "-m", "shmmap.cli", "doctor", "--json", "--instance", one.instance,
-            "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir, *words,
-        ],
-        env={**{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )  # fmt: skip
-    assert done.stdout, done.stderr
-    told = json.loads(done.stdout)
-    found = {finding["name"]: finding for finding in told["findings"]}
-    states = [finding["state"] for finding in told["findings"]]
-    assert told["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
-    return done.returncode, found
 
 
 def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) -> None:

@@ -207,10 +207,16 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
     undo = Path(f"{start}.undo")
     undo.write_bytes(bytes(1000))
     os.chown(undo, STRANGER, -1)
-    process = one.spawn()
-    assert process.wait(60) not in (0, None), "what it would be put back from is somebody else's"
-    assert f"{undo} is not a file of this user" in one.log or "Permission denied" in one.log
-    undo.unlink(missing_ok=True)
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        (row,) = client.live_maps()
+        assert row.problem, "what it would be put back from is somebody else's"
+        assert f"{undo} is not a file of this user" in row.problem or "Permission denied" in row.problem
+        undo.unlink()
+        waiting = Patience()
+        while waiting(client.live_maps()[0].problem != ""):
+            pass
+        assert held(client.live("lidar")) == before
 
 
 def test_a_reader_that_lets_no_chunk_go_has_no_memory_of_them(service: LiveService) -> None:

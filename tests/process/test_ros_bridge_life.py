@@ -149,6 +149,42 @@ def test_a_flood_of_requests_keeps_nobody_out(bridge: BridgeProcess, peer: RosPe
     assert len(asked(peer, "selected", ids=[]).cells) == 0
 
 
+def test_what_is_more_than_the_daemon_takes_at_once(bridge: BridgeProcess, peer: RosPeer) -> None:
+    """Ids in slices, of the known ones: never an empty answer for a full one, and nobody else waits."""
+    everything = asked(peer, "partial", area=(0, 0, 1e6))
+    known, unknown = everything.ids, [f"/nowhere/{number:080}.pcd" for number in range(60_000)]
+    assert sum(map(len, unknown)) > 4 << 20
+    few = [f"{number}.pcd" for number in range(25_000)]
+    for more in (few, unknown):
+        assert asked(peer, "selected", ids=[*more, *known, known[0]]).ids == [*known, known[0]]
+        found = asked(peer, "differential", area=(0, 0, 5), ids=[*more, *known[1:]])
+        near = asked(peer, "partial", area=(0, 0, 5)).ids
+        assert found.removed == [one for one in (*more, *known[1:]) if one not in set(near)]
+        assert found.ids == [one for one in near if one == known[0]]
+    greedy = peer.client(NAMES["selected"], SELECTED)
+    greedy.wait_for_service()
+    greedy.send(cell_ids=known * 3000)
+    bridge.wait_said("not answered: 108,000 cells in one request")
+    assert asked(peer, "partial", area=(0, 0, 5)).ids == near, "while its sender still waits"
+
+
+def test_a_request_whose_cells_do_not_come_holds_up_nobody(
+    bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
+) -> None:
+    """Its loaders stand still: those who ask for what is in memory are answered meanwhile."""
+    warm = asked(peer, "partial", area=(-50, -50, 2))
+    assert warm.ids
+    loaders = served.stop_loaders()
+    slow = peer.client(NAMES["partial"], PARTIAL)
+    slow.wait_for_service()
+    number = slow.send(area=AreaInfo(50.0, 50.0, 2.0))
+    for _ in range(3):
+        assert asked(peer, "partial", area=(-50, -50, 2)).ids == warm.ids
+    for pid in loaders:
+        os.kill(pid, signal.SIGCONT)
+    assert from_message(slow.receive(number)).ids
+
+
 def test_a_client_that_has_stopped_holds_up_nobody(
     daemon: DaemonFactory, dds: int, peer: RosPeer, tmp_path: Path
 ) -> None:

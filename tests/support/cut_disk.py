@@ -101,6 +101,10 @@ class CutDisk:
         self._count()
         self._safe, self._changes = dict(self._names), []
 
+    def moved(self) -> str:
+        """Never."""
+        return ""
+
     def after(self, keeps: Callable[[], bool], part: Callable[[int], int]) -> CutDisk:
         """The disk as it is found when the power is back.
 

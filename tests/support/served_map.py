@@ -74,7 +74,7 @@ class Served:
     def open(self, name: str = "front", session: int = 1) -> messages.LiveOpened:
         """Map under a name."""
         ticket = self.ask(lambda n: messages.LiveOpen(n, "lidar", name), session)
-        reply: messages.LiveOpened = self.answers[ticket]
+        reply: messages.LiveOpened = self.answer(ticket)
         return reply
 
     def send(self, marks: Marks, mapper: int, scan: int, session: int = 1, at: float = 0.0) -> int:

@@ -10,26 +10,36 @@
 Different, because the message says nothing of it: a cell that cannot be loaded is left out, where Autoware
 sends it empty and the client believes that nothing is there; an id that was given twice is not removed for
 being there twice; and a cell whose file has changed since the client got it is sent again.
+
+What is more than the daemon answers at once is asked for in slices.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 from shmmap import Cell, CellSet, Client
 from shmmap_clients.ros_bridge.areas import sensible, touches
 from shmmap_clients.ros_bridge.catalogue import Catalogue
-from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
+from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.messages.autoware import GetDifferentialRequest, GetPartialRequest
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
 from shmmap_clients.ros_bridge.recent_cells import RecentCells
 from shmmap_clients.ros_bridge.requesters import Requesters
+from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge
 
 __all__ = ["MapAnswers"]
 
 _PAUSE_S: Final = 0.2
+_TURN_S: Final = 1.0
+"""How long others wait for cells that one client's request has loaded."""
+_SLICE_CELLS: Final = 10_000
+_SLICE_BYTES: Final = 1 << 20
+"""Of one request to the daemon: it refuses those for more than 20 000 cells, or of more than 4 MiB."""
+_MOST_CELLS: Final = 100_000
+"""Of one answer, repetitions included."""
 _NAMED: Final = 3
 _REUSED_BYTES: Final = 16 << 20
 _LAYOUTS: Final = 64
@@ -64,30 +74,38 @@ class MapAnswers:
         self._log = log
         self._recent = RecentCells()
         self._layouts: dict[Hashable, CloudLayout] = {}
+        self._until_s = 0.0
         self._sent: Content | None = None  # the reply before: its memory is used again
 
-    def answer(self, message: Any, requester: str) -> tuple[Content, Callable[[], None]]:
+    def answer(
+        self, message: Any, requester: str, begun_s: float | None = None
+    ) -> tuple[Content, Callable[[], None]]:
         """Return a reply, and what to call when it was sent.
 
-        It has to be sent before the next one is asked for.
+        It has to be sent before the next one is asked for.  ``begun_s`` is when this request was tried first.
 
         Raises
         ------
+        StillLoading
+            Not all is there yet: it is to be tried again, others first.
+        TooLarge
+            No reply can hold it.
         ShmmapError
             The daemon does not answer, or refuses; nothing has changed then.
-        ValueError
-            The reply is larger than DDS can send.
         """
+        self._until_s = (time.monotonic() if begun_s is None else begun_s) + self._wait_s
         if isinstance(message, GetDifferentialRequest):
             return self._differential(message, requester)
         if isinstance(message, GetPartialRequest):
             area = sensible(message.area)
-            if area is not None:
-                cells = self._all(lambda wait: self._client.area(area, wait=wait))
+            if area is not None and self._is_small(message.area):
+                cells: Sequence[Cell] = self._all(
+                    lambda wait: self._client.area(area, wait=wait, strict=None)
+                )
             else:
                 cells = self._selected(self._touched(message.area))
         else:
-            cells = self._selected(message.cell_ids)
+            cells = self._selected(self._known(message.cell_ids))
         return self._reply(message, cells), _nothing
 
     def empty(self, message: Any) -> Content:
@@ -99,8 +117,8 @@ class MapAnswers:
     ) -> tuple[Content, Callable[[], None]]:
         held = self._requesters.held(requester, message.cached_ids, self._catalogue.versions)
         area = sensible(message.area)
-        if area is not None:
-            found = self._all(lambda wait: self._client.differential(area, held, wait=wait))
+        if area is not None and _is_one_slice(message.cached_ids) and self._is_small(message.area):
+            found = self._all(lambda wait: self._client.differential(area, held, wait=wait, strict=None))
             cells: Sequence[Cell] = found
             removed: Collection[str] = found.removed
         else:
@@ -108,7 +126,8 @@ class MapAnswers:
             versions = {one.id: one.version for one in held}
             current = self._catalogue.versions
             cells = self._selected([one for one in wanted if versions.get(one) != current[one]])
-            removed = [one.id for one in held if one.id not in set(wanted)]
+            inside = set(wanted)
+            removed = [one.id for one in held if one.id not in inside]
         sent = {cell.id: cell.version for cell in cells}
 
         def done() -> None:
@@ -116,23 +135,41 @@ class MapAnswers:
 
         return self._reply(message, cells, removed), done
 
+    def _is_small(self, area: Any) -> bool:
+        """Whether the daemon answers with the cells of an area at once."""
+        few = len(self._catalogue.cells) <= _SLICE_CELLS
+        return few or int(touches(area, self._catalogue.boxes()).sum()) <= _SLICE_CELLS
+
     def _touched(self, area: Any) -> list[str]:
         self._catalogue.refresh(self._client)
         inside = touches(area, self._catalogue.boxes())
         return [one for one, take in zip(self._catalogue.cells, inside, strict=True) if take]
 
-    def _selected(self, ids: Sequence[str]) -> CellSet:
-        if not ids:
-            return CellSet()
-        return self._all(lambda wait: self._client.selected(ids, wait=wait))
+    def _known(self, ids: Sequence[str]) -> Sequence[str]:
+        """These ids, of very many those that the map has: the others are left out of answers anyway."""
+        if _is_one_slice(ids):
+            return ids
+        self._catalogue.refresh(self._client)
+        known = self._catalogue.cells.keys() | {one.rpartition("/")[2] for one in self._catalogue.cells}
+        return [one for one in ids if one in known]
+
+    def _selected(self, ids: Sequence[str]) -> Sequence[Cell]:
+        if len(ids) > _MOST_CELLS:
+            raise TooLarge(f"{len(ids):,} cells in one request", hint=f"ask for at most {_MOST_CELLS:,}")
+        found: list[Cell] = []
+        for some in _slices(ids):
+            found += self._all(lambda wait, some=some: self._client.selected(some, wait=wait, strict=None))  # type: ignore[misc]
+        return found
 
     def _all(self, ask: Callable[[float], CellSet]) -> CellSet:
-        """Ask until the daemon knows what there is; what is missing is told."""
-        until_s = time.monotonic() + self._wait_s
-        cells = ask(self._wait_s)
-        while not cells.covered and time.monotonic() + _PAUSE_S < until_s:
-            time.sleep(_PAUSE_S)
-            cells = ask(max(until_s - time.monotonic(), 0.0))
+        """Ask the daemon; what is missing although it has had time is logged, and left out."""
+        left_s = max(0.0, self._until_s - time.monotonic())
+        cells = ask(min(left_s, _TURN_S))
+        if left_s > _TURN_S:
+            if not cells.covered:
+                time.sleep(_PAUSE_S)
+            if cells.pending or not cells.covered:
+                raise StillLoading
         missing = [str(error) for error in cells.failed]
         missing += [f"{one.id}: not loaded after {self._wait_s:g} s" for one in cells.pending]
         if missing:
@@ -155,7 +192,10 @@ class MapAnswers:
         self._write_cells(writer, self._recent.kept(cells))
         if isinstance(message, GetDifferentialRequest):
             writer.texts(removed or ())
-        content = writer.content(self._sent)
+        try:
+            content = writer.content(self._sent)
+        except ValueError as error:
+            raise TooLarge(f"an answer of {error}", hint="ask for fewer cells at once") from error
         self._sent = content if len(content) <= _REUSED_BYTES else None
         return content
 
@@ -173,6 +213,26 @@ class MapAnswers:
             writer.text(cell.id)
             write_cloud(writer, columns, cell.origin, layout)
             writer.float32(*cell.box)
+            if writer.size > MOST_BYTES:  # repetitions of a large cell: thousands more would take long
+                raise TooLarge(
+                    f"an answer of more than {MOST_BYTES} bytes", hint="ask for fewer cells at once"
+                )
+
+
+def _is_one_slice(ids: Sequence[str]) -> bool:
+    return len(ids) <= _SLICE_CELLS and sum(map(len, ids)) <= _SLICE_BYTES // 4  # bytes of a character
+
+
+def _slices(ids: Sequence[str]) -> Iterator[Sequence[str]]:
+    """Ids in parts, in their order, each of which is one request."""
+    begin = nbytes = 0
+    for at, one in enumerate(ids):
+        nbytes += 4 * len(one)
+        if at - begin >= _SLICE_CELLS or nbytes > _SLICE_BYTES:
+            yield ids[begin:at]
+            begin, nbytes = at, 4 * len(one)
+    if begin < len(ids):
+        yield ids[begin:]
 
 
 def _nothing() -> None:

@@ -95,7 +95,7 @@ class MapWorker(Worker):
         if self._client.disconnected_since is not None:
             # a request for cells has longer than this to find out that the daemon is away
             self._catalogue.refresh(self._client)
-        return self._answers.answer(message, request.requester.name)
+        return self._answers.answer(message, request.requester.name, request.tries.begun_s)
 
     def empty(self, message: Any) -> Content:
         """Return a reply without cells."""

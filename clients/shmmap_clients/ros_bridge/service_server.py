@@ -32,7 +32,7 @@ from shmmap_clients.ros_bridge.messages.wire import Damaged, ServiceKind, ready_
 from shmmap_clients.ros_bridge.names import reply_topic, request_topic
 from shmmap_clients.ros_bridge.participant import endpoint_qos
 
-__all__ = ["Request", "Requester", "ServiceServer"]
+__all__ = ["Request", "Requester", "ServiceServer", "Tries"]
 
 _KNOWN_AT_FIRST_S: Final = 1.0
 _KNOWN_WITHIN_S: Final = 0.1
@@ -66,6 +66,28 @@ class Requester:
     found_s: float = field(default=0.0, compare=False)
 
 
+@dataclass(slots=True)
+class Tries:
+    """How often a request has been tried.
+
+    Attributes
+    ----------
+    begun_s
+        When the first time that the daemon was there, on the clock of `time.monotonic`; 0: not yet.
+    again
+        It has been put back: its client may have gone.
+    failed
+        How often it failed although the daemon answered something else in between.
+    answers
+        How much the daemon had answered at the last failure.
+    """
+
+    begun_s: float = 0.0
+    again: bool = False
+    failed: int = 0
+    answers: int = -1
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """A request that has come.
@@ -78,12 +100,15 @@ class Request:
         What is asked; its ``client`` and ``number`` go into the reply.
     requester, handle
         Who asks; DDS's number of its writer.
+    tries
+        What came of it so far.
     """
 
     server: ServiceServer
     message: Any
     requester: Requester
     handle: int
+    tries: Tries = field(default_factory=Tries, compare=False)
 
 
 class ServiceServer:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What answers requests that need the daemon: one after another, in a thread of its own.
+"""What answers requests that need the daemon: in a thread of its own, and clients take turns.
 
 A ROS client waits for ever. So while the daemon is away a request is kept, and answered when it is back,
-unless the client has gone meanwhile. What the daemon refuses is answered with nothing, and logged.
+unless the client has gone meanwhile. One that takes long, or fails while others succeed, waits behind those
+of other clients, and is given up after some tries. What the daemon refuses is answered with nothing, and
+logged; what is too large is not answered at all, because an answer without cells would be taken for one.
 """
 
 from __future__ import annotations
@@ -13,19 +15,29 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Final
 
-from shmmap import Busy, DaemonUnreachable, LiveInterrupted, NoSession, ShmmapError, StaleHandle
+from shmmap import BadRequest, Busy, DaemonUnreachable, LiveInterrupted, NoSession, ShmmapError, StaleHandle
 from shmmap_clients.ros_bridge.cdr import Content
 from shmmap_clients.ros_bridge.listening import Listening
-from shmmap_clients.ros_bridge.service_server import Request
+from shmmap_clients.ros_bridge.service_server import Request, Tries
 from shmmap_clients.ros_bridge.waiting import WaitingRequests
 
-__all__ = ["Worker"]
+__all__ = ["StillLoading", "TooLarge", "Worker"]
 
 LATER: Final = (DaemonUnreachable, NoSession, Busy, LiveInterrupted, StaleHandle)
 """What passes by itself."""
 _AGAIN_S: Final = 0.2
+_MOST_FAILED: Final = 5
+"""Tries of one request that fail while the daemon answers others."""
 
 Answer = tuple[Content, Callable[[], None]]
+
+
+class StillLoading(Exception):
+    """Cells are still being loaded: others' requests come first."""
+
+
+class TooLarge(BadRequest):
+    """No answer can hold what was asked for."""
 
 
 class Worker(ABC):
@@ -52,6 +64,7 @@ class Worker(ABC):
         self._every_s = every_s
         self._log = log
         self._away = ""
+        self._answered = 0
 
     @abstractmethod
     def answer(self, message: Any, request: Request) -> Answer:
@@ -82,27 +95,49 @@ class Worker(ABC):
                 self._serve(self._waiting.get())
 
     def _serve(self, request: Request) -> None:
-        server = request.server
-        while not self._stop.is_set():
-            try:
-                content, done = self.answer(request.message, request)
-                self._back()
-            except LATER as error:
-                self._gone(error)
-                self._stop.wait(_AGAIN_S)
-                if server.gone(request):
-                    return
-                continue
-            except (ShmmapError, ValueError) as error:
-                self._log(f"{server.name}: answered with nothing: {error}")
-                content, done = self.empty(request.message), _nothing
-            if server.present(request):
-                why = server.reply(content)
-                if why:
-                    self._log(f"{server.name}: an answer of {len(content)} bytes was not sent: {why}")
-                else:
-                    done()
+        server, tries = request.server, request.tries
+        if tries.again and server.gone(request):
             return
+        tries.begun_s = tries.begun_s or time.monotonic()
+        try:
+            content, done = self.answer(request.message, request)
+            self._back()
+        except StillLoading:
+            self._back()
+            self._try_again(request)
+            return
+        except LATER as error:
+            self._gone(error)
+            if self._has_failed(tries):
+                self._log(f"{server.name}: not answered after {tries.failed} tries: {error}")
+                return
+            tries.begun_s = 0.0  # cells have all their time when the daemon is back
+            self._try_again(request)
+            self._stop.wait(_AGAIN_S)
+            return
+        except TooLarge as error:
+            self._log(f"{server.name}: not answered: {error}")
+            return
+        except (ShmmapError, ValueError) as error:
+            self._log(f"{server.name}: answered with nothing: {error}")
+            content, done = self.empty(request.message), _nothing
+        if server.present(request):
+            why = server.reply(content)
+            if why:
+                self._log(f"{server.name}: an answer of {len(content)} bytes was not sent: {why}")
+            else:
+                done()
+
+    def _try_again(self, request: Request) -> None:
+        request.tries.again = True
+        self._waiting.again(request)
+
+    def _has_failed(self, tries: Tries) -> bool:
+        """Whether it is this request that fails, and not the daemon that is away."""
+        if self._answered > tries.answers:
+            tries.answers = self._answered
+            tries.failed += 1
+        return tries.failed >= _MOST_FAILED
 
     def _guarded_tick(self) -> None:
         try:
@@ -119,6 +154,7 @@ class Worker(ABC):
             self._log(f"requests wait: {error.message}")
 
     def _back(self) -> None:
+        self._answered += 1
         if self._away:
             self._away = ""
             self._log("requests are answered again")

@@ -16,7 +16,7 @@ from shmmap import geometry
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
-from shmmap.client.live.patience import until_served
+from shmmap.client.live.patience import checked_seconds, until_served
 from shmmap.client.live.voxels import Voxels, read_voxels
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, StaleHandle
@@ -35,6 +35,8 @@ R = TypeVar("R")
 LIST_S: Final = 60.0
 """How long putting voxels together may take, beside what any request may."""
 SAVE_S: Final = 300.0
+MOST_RAY_VOXELS: Final = 100_000
+"""Along an axis, of a ray that is followed: 5 km of voxels of 5 cm take about half a second."""
 LISTS: Final = 4
 """Lists of voxels that are asked for, one after the other, until one is there while it is read."""
 
@@ -128,8 +130,8 @@ class LiveMap:
 
     def move_to(self, x: float, y: float, z: float) -> None:
         """Say where this process is, metres in the map's frame: chunks around it stay in memory."""
-        here = _metres(x, y, z)
-        self._ask(lambda n: messages.LiveMove(n, self.name, (here[0], here[1], here[2])), messages.LiveMoved)
+        place = _points("position", [x, y, z])[0].tolist()
+        self._ask(lambda n: messages.LiveMove(n, self.name, tuple(place)), messages.LiveMoved)
 
     def save(self, *, timeout_s: float = SAVE_S) -> int:
         """Have everything that is applied by now saved; returns how many files there are.
@@ -141,7 +143,8 @@ class LiveMap:
         NoAnswer
             It took longer: a disk is full, or slow; see `status`.
         """
-        reply = self._ask(lambda n: messages.LiveSave(n, self.name), messages.LiveDurable, quiet_s=timeout_s)
+        seconds = checked_seconds("timeout_s", timeout_s)
+        reply = self._ask(lambda n: messages.LiveSave(n, self.name), messages.LiveDurable, quiet_s=seconds)
         return reply.files
 
     def status(self) -> messages.LiveMapRow:
@@ -266,7 +269,7 @@ class LiveMap:
         -------
         (N,) int16, thousandths: above `occupied_above` occupied, below `free_below` free, 0 unknown.
         """
-        return self._reader.look_up(np.asarray(xyz, np.float64).reshape(-1, 3))
+        return self._reader.look_up(_points("xyz", xyz))
 
     @property
     def occupied_above(self) -> int:
@@ -292,10 +295,36 @@ class LiveMap:
         -------
         (N,) float64, metres from the origin to the middle of the first occupied voxel; infinity where there
         is none on the way, the last voxel included.
+
+        Raises
+        ------
+        BadRequest
+            A ray is longer than 100 000 voxels along an axis, or is none.
         """
-        ends = np.asarray(ends, np.float64).reshape(-1, 3)
-        origins = np.broadcast_to(np.asarray(origins, np.float64).reshape(-1, 3), ends.shape)
+        ends = _points("ends", ends)
+        origins = _points("origins", origins)
+        if len(origins) not in (1, len(ends)):
+            raise BadRequest(
+                f"{len(origins)} origins of {len(ends)} rays: give each its own, or all the same one"
+            )
+        origins = np.broadcast_to(origins, ends.shape)
+        longest = float(np.abs(ends - origins).max(initial=0.0))
+        if not longest <= MOST_RAY_VOXELS * self.resolution:  # nor NaN
+            most = f"{MOST_RAY_VOXELS * self.resolution:.6g} m for voxels of {self.resolution} m"
+            raise BadRequest(
+                f"a ray is {longest:.6g} m long; at most {most}", hint="cut it where the map ends"
+            )
         return self._reader.first_hits(origins, ends)
+
+
+def _points(what: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Places as (N, 3); BadRequest where they are none, or masked."""
+    try:
+        if np.ma.is_masked(values):
+            raise ValueError("some are masked")
+        return np.asarray(values, np.float64).reshape(-1, 3)
+    except (TypeError, ValueError) as error:
+        raise BadRequest(f"{what}: need numbers of the shape (N, 3): {error}") from None
 
 
 def _area(area: geometry.Box | Sphere | None) -> messages.LiveArea | None:

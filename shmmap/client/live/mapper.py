@@ -18,10 +18,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from shmmap.chunks.marking import Counts, Marker, ScanFilter
 from shmmap.chunks.marks import encode_marks
 from shmmap.client.connection import Connection
-from shmmap.client.live.patience import PAUSE_S, until_served
+from shmmap.client.live.patience import PAUSE_S, checked_seconds, until_served
 from shmmap.client.session import Session
 from shmmap.errors import (
     BadRequest,
@@ -35,11 +37,12 @@ from shmmap.errors import (
 from shmmap.protocol import live as messages
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike
 
 __all__ = ["LiveMapper"]
 
+PASSING: Final = (LiveInterrupted, Busy, DaemonUnreachable)
+"""What passes by itself."""
 ON_THE_WAY: Final = 3
 """Scans that are marked and not answered; `LiveMapper.add` waits when there are more."""
 LAST_S: Final = 1.0
@@ -66,6 +69,8 @@ class _Sender:
         Numbers of scans, as of the last answer.
     error
         Why a scan, and all after it, did not get into the map.
+    trouble
+        Why the next one is not in the map yet: it is sent again and again.
     changed
         Told of changes of the three, and of `waiting`.
     """
@@ -77,6 +82,7 @@ class _Sender:
         self._map, self._name, self._frame_id, self._timeout_s = live_map, name, frame_id, timeout_s
         self.changed = threading.Condition()
         self.error: ShmmapError | None = None
+        self.trouble: ShmmapError | None = None
         self._waiting: deque[_Marked] = deque()
         self._ending = False
         self._connection = Connection((path,), name=f"mapper {name}"[:64], timeout_s=connect_s)
@@ -90,11 +96,24 @@ class _Sender:
         self._thread.start()
 
     def put(self, scan: _Marked) -> None:
-        """Send a scan when those before are answered; waits while too many are on the way."""
+        """Send a scan when those before are answered; waits while too many are on the way.
+
+        Raises
+        ------
+        ShmmapError
+            `error`; or it was not taken in time, and may be added again.
+        """
         with self.changed:
-            self.changed.wait_for(lambda: len(self._waiting) < ON_THE_WAY or self.error is not None)
+            taken = self.changed.wait_for(
+                lambda: len(self._waiting) < ON_THE_WAY or self.error is not None, self._timeout_s
+            )
             if self.error is not None:
                 raise self.error
+            if not taken:
+                raise self.trouble or NoAnswer(
+                    f"earlier scans were not applied within {self._timeout_s:.3g} s",
+                    hint="they are still being sent: add this one again",
+                )
             self._waiting.append(scan)
             self.changed.notify_all()
 
@@ -129,12 +148,15 @@ class _Sender:
                 durable = self._send(scan)
             except ShmmapError as error:
                 with self.changed:
+                    if isinstance(error, PASSING) and not self._ending:
+                        continue
                     self.error = error
                     self._waiting.clear()  # what comes later cannot go in before it
                     self.changed.notify_all()
             else:
                 with self.changed:
                     self.applied, self.durable = scan.number, max(self.durable, durable)
+                    self.trouble = None
                     self._waiting.popleft()
                     self.changed.notify_all()
         self._connection.close()
@@ -155,11 +177,12 @@ class _Sender:
         while True:
             try:
                 return self._try(scan, max(0.1, end_s - time.monotonic()))
-            except (LiveInterrupted, Busy, DaemonUnreachable) as error:  # noqa: PERF203  until it is there again
+            except PASSING as error:  # noqa: PERF203  until it is there again
+                self.trouble = error
                 if time.monotonic() >= end_s:
                     raise
                 time.sleep(PAUSE_S)
-                with contextlib.suppress(LiveInterrupted, Busy, DaemonUnreachable):
+                with contextlib.suppress(*PASSING):
                     if not isinstance(error, Busy):
                         self.opened = self._open()
 
@@ -200,7 +223,7 @@ class LiveMapper:
             raise BadRequest("a mapper needs a name", hint="one that the program keeps: 'front_lidar'")
         self.name = name
         self.counts = Counts(0, 0, 0, 0, 0)
-        self._timeout_s = timeout_s
+        timeout_s = self._timeout_s = checked_seconds("timeout_s", timeout_s)
         sender = self._sender = _Sender(
             session.path, live_map, name, frame_id, session.timeout_s, timeout_s, resume=resume
         )
@@ -220,13 +243,14 @@ class LiveMapper:
         if self._end.detach() is not None:
             self._sender.end()
 
-    def add(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> int:
+    def add(self, points: ArrayLike, pose: ArrayLike) -> int:
         """Add a scan; waits while earlier ones are still on the way.
 
         Parameters
         ----------
         points
-            (N, 3) float32 or float64, metres in the sensor's frame; those that are not finite are left out.
+            (N, 3) float32 or float64, metres in the sensor's frame; those that are masked or not finite are
+            left out.
         pose
             (3, 4) or (4, 4): rotation and position of the sensor in the map's frame, metres.
 
@@ -237,8 +261,11 @@ class LiveMapper:
         Raises
         ------
         BadRequest
-            A shape is wrong, the pose is no rotation and finite position, the scan touches too much, or the
-            mapper is closed.
+            A shape is wrong, the pose is no rotation and finite position within the map's reach, the scan
+            touches too much, or the mapper is closed.
+        LiveInterrupted, Busy, DaemonUnreachable
+            Earlier scans could not be sent for as long as the mapper's timeout.  They are still being sent;
+            this one was not taken and may be added again.
         ShmmapError
             Why an earlier scan, and all after it, did not get into the map.
         """
@@ -252,7 +279,7 @@ class LiveMapper:
                 f"the scan's marks have {len(data)} bytes; {opened.most_marks_bytes} are the most",
                 hint="lower max_range, make the map with larger voxels, or raise --live-budget",
             )
-        x, y, z = (float(pose[axis][3]) for axis in range(3))
+        x, y, z = (float(value) for value in np.asarray(pose, np.float64)[:3, 3])
         self._sender.put(_Marked(number, data, (x, y, z)))
         self._last = number
         return number
@@ -277,7 +304,7 @@ class LiveMapper:
         ShmmapError
             Why one could not be applied.
         """
-        patience_s = self._timeout_s if timeout_s is None else timeout_s
+        patience_s = self._timeout_s if timeout_s is None else checked_seconds("timeout_s", timeout_s)
         sender = self._sender
         with sender.changed:
             sender.changed.wait_for(
@@ -286,7 +313,7 @@ class LiveMapper:
         if sender.error is not None:
             raise sender.error
         if sender.applied < self._last:
-            raise NoAnswer(f"scan {self._last} was not applied within {patience_s:.3g} s")
+            raise sender.trouble or NoAnswer(f"scan {self._last} was not applied within {patience_s:.3g} s")
         return sender.applied
 
     def wait_durable(self, timeout_s: float = 300.0) -> int:
@@ -294,6 +321,7 @@ class LiveMapper:
 
         Raises as `wait_applied`.
         """
+        timeout_s = checked_seconds("timeout_s", timeout_s)
         self.wait_applied()
         return self._sender.save(timeout_s)
 
@@ -314,6 +342,6 @@ def _write(path: str, data: bytes) -> None:
             os.fchmod(fd, 0o644)  # whatever the umask: the daemon may be another user
             file.write(data)
     except OSError as error:
-        if error.errno in (errno.ENOENT, errno.ENOSPC):
+        if error.errno in (errno.ENOENT, errno.ENOSPC, errno.EDQUOT, errno.ENOMEM):
             raise LiveInterrupted(f"{path}: {error.strerror}") from error
         raise CannotWrite(f"{path}: {error.strerror}", hint="may this user map? see `live_group`") from error

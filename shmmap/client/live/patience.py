@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking again while the process that keeps live maps is started anew."""
+"""How long requests about live maps may take; asking again while the process that keeps them is started."""
 
 from __future__ import annotations
 
+import numbers
+import threading
 import time
 from collections.abc import Callable
 from typing import Final, TypeVar
 
-from shmmap.errors import LiveInterrupted
+from shmmap.errors import BadRequest, LiveInterrupted
 
-__all__ = ["PAUSE_S", "until_served"]
+__all__ = ["PAUSE_S", "checked_seconds", "until_served"]
 
 R = TypeVar("R")
 
 PAUSE_S: Final = 0.05
 """Between two tries: nothing tells when it is there again."""
+
+
+def checked_seconds(what: str, seconds: object) -> float:
+    """Return a time that may be waited for; BadRequest where there is none of that length."""
+    if not isinstance(seconds, numbers.Real) or not 0 <= float(seconds) <= threading.TIMEOUT_MAX:  # nor NaN
+        raise BadRequest(f"{what} must be a number of seconds, 0 or more, not {seconds!r}")
+    return float(seconds)
 
 
 def until_served(ask: Callable[[], R], timeout_s: float) -> R:

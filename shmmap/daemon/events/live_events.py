@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.daemon.events.log import EventLog
 from shmmap.protocol import events
@@ -13,6 +15,8 @@ from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["LiveEvents"]
+
+_CHUNK: Final = re.compile(r"chunk -?\d+_-?\d+_-?\d+")
 
 
 @dataclass(eq=False, slots=True)
@@ -75,7 +79,7 @@ class LiveEvents:
 
 def _cause(problem: str) -> str:
     """What is wrong, whichever chunk met it first."""
-    return problem.partition(" cannot be ")[2]
+    return _CHUNK.sub("chunk", problem)
 
 
 def _shown(row: LiveMapRow) -> LiveRow:

@@ -9,7 +9,7 @@ from typing import Final
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["choose_budget", "loader_bytes"]
+__all__ = ["choose_budget", "loader_bytes", "room_in_group"]
 
 DEFAULT_CEILING_BYTES: Final = 4 << 30
 RESERVE_BYTES: Final = 256 << 20
@@ -39,8 +39,18 @@ def loader_bytes(limit_bytes: int | None) -> int:
     return min(max(least, min(total, limit_bytes or total) // 4), most)
 
 
+def room_in_group(limit_bytes: int) -> int:
+    """Return how much of a control group's memory the segments may have: half is left, at most 256 MiB."""
+    return limit_bytes - min(limit_bytes // 2, RESERVE_BYTES)
+
+
 def choose_budget(
-    asked_bytes: int, directory: ShmDirectory, *, ours_bytes: int = 0, limit_bytes: int | None = None
+    asked_bytes: int,
+    directory: ShmDirectory,
+    *,
+    ours_bytes: int = 0,
+    beside_bytes: int = 0,
+    limit_bytes: int | None = None,
 ) -> int:
     """Return the budget in bytes.
 
@@ -55,6 +65,8 @@ def choose_budget(
         The explicit budget; 0 for the default.
     ours_bytes
         What an earlier life of the daemon left in the directory: it is ours to keep or to free.
+    beside_bytes
+        What the default budget leaves of the file system to live maps.
     limit_bytes
         Memory limit of the control group; None for none.
 
@@ -67,7 +79,7 @@ def choose_budget(
         Too little is free.
     """
     size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
-    group_room = limit_bytes - min(limit_bytes // 2, RESERVE_BYTES) if limit_bytes is not None else LARGEST
+    group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
     room = min(free - min(size // 20, RESERVE_BYTES), group_room)
     if asked_bytes:
         if asked_bytes > size:
@@ -96,7 +108,8 @@ def choose_budget(
                 f"a budget of {asked_bytes} bytes is too small", key="budget", hint="use at least 1M"
             )
         return asked_bytes
-    budget = min((_memory_bytes("MemAvailable") + ours_bytes) // 4, DEFAULT_CEILING_BYTES, room)
+    available_bytes = (_memory_bytes("MemAvailable") + ours_bytes) // 4
+    budget = min(available_bytes, DEFAULT_CEILING_BYTES, room - beside_bytes)
     if budget < SMALLEST_BYTES:
         raise CannotStart(
             f"{directory.path} has only {free} bytes free",

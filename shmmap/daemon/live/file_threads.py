@@ -7,11 +7,13 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any, Final, NamedTuple
 
-__all__ = ["FileThreads", "Job"]
+__all__ = ["CLOSE_S", "FileThreads", "Job"]
 
 THREADS: Final = 4
 """One of them flushes.  More would wait for each other: all that they do between two calls of the kernel
 they do one at a time."""
+CLOSE_S: Final = 5.0
+"""How long files that are being read or written at the end may take: a directory that hangs is left alone."""
 FILES_TOGETHER: Final = 8
 """Files that a thread reads or writes, one after the other, until it says so: to be told costs as much."""
 
@@ -37,12 +39,17 @@ class FileThreads:
     def __init__(self, on_done: Callable[[], None], threads: int = THREADS) -> None:
         self._threads = ThreadPoolExecutor(threads, "live-files")
         self._running: dict[Future[list[Future[Any]]], list[Job]] = {}
+        self._progress_s = 0.0
         self._on_done = on_done
 
     @property
     def are_idle(self) -> bool:
         """Whether all was done and told."""
         return not self._running
+
+    def idle_s(self, now_s: float) -> float:
+        """For how long nothing has been done although something is to be."""
+        return now_s - self._progress_s if self._running else 0.0
 
     def start(self, jobs: list[Job]) -> None:
         """Have them done, several by one thread."""
@@ -54,7 +61,10 @@ class FileThreads:
 
     def tell(self, now_s: float) -> None:
         """Tell what came of those that are done."""
-        for future in [future for future in self._running if future.done()]:
+        done = [future for future in self._running if future.done()]
+        if done or not self._running:
+            self._progress_s = now_s
+        for future in done:
             for job, outcome in zip(self._running.pop(future), future.result(), strict=True):
                 job.then(outcome, now_s)
 
@@ -62,15 +72,11 @@ class FileThreads:
         """Wait until there is something to tell, at most so long; not at all if nothing is being done."""
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
-    def stop(self) -> None:
-        """Begin with nothing more, and wait for nothing; nobody is told any more."""
+    def close(self, seconds: float = CLOSE_S) -> list[Any]:
+        """Wait until all is done, at most so long; returns what came of it and was not told, but errors."""
+        done, _ = wait(list(self._running), timeout=seconds)
         self._threads.shutdown(wait=False, cancel_futures=True)
-        self._running.clear()
-
-    def close(self) -> list[Any]:
-        """Wait until all is done; returns what came of it and was not told, but errors."""
-        self._threads.shutdown()
-        untold = [outcome for future in self._running for outcome in future.result()]
+        untold = [outcome for future in done for outcome in future.result()]
         self._running.clear()
         return [outcome.result() for outcome in untold if outcome.exception() is None]
 

@@ -13,6 +13,7 @@ import errno
 import fcntl
 import os
 import secrets
+import stat
 from itertools import count
 from typing import Final, Protocol
 
@@ -25,6 +26,7 @@ __all__ = [
     "FilesToRead",
     "Folder",
     "FolderToRead",
+    "is_aside",
     "keep_aside",
     "replace_file",
     "write_beside",
@@ -34,6 +36,8 @@ INTERIM: Final = ".tmp"
 """How the name of a file ends that has not got its own yet; it begins with a dot."""
 DAMAGED: Final = ".damaged."
 """What stands between the name that a file had and a number when it was put aside."""
+MOST_BYTES: Final = 1 << 28
+"""That are read of any file: more than one can have that is not damaged."""
 
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -49,8 +53,8 @@ class FilesToRead(Protocol):
     def size(self, name: str) -> int:
         """Bytes of a file."""
 
-    def read(self, name: str, most: int = -1) -> bytes:
-        """The first ``most`` bytes of a file, or all."""
+    def read(self, name: str, most: int = MOST_BYTES) -> bytes:
+        """The first ``most`` bytes of a file; OSError of what is no regular file."""
 
 
 class Files(FilesToRead, Protocol):
@@ -77,6 +81,9 @@ class Files(FilesToRead, Protocol):
     def sync_names(self) -> None:
         """Have all names on the disk as they are now."""
 
+    def moved(self) -> str:
+        """What has become of the directory, if it is not where it was opened; empty if it is there."""
+
 
 def write_beside(files: Files, name: str, data: bytes) -> str:
     """Write what is to get this name under another one, which is returned."""
@@ -102,6 +109,11 @@ def replace_file(files: Files, name: str, data: bytes) -> None:
         raise
 
 
+def is_aside(name: str) -> bool:
+    """Whether a file was put aside, because it was damaged or could not be read."""
+    return DAMAGED in name and name.rpartition(".")[2].isdecimal()
+
+
 def keep_aside(files: Files, name: str) -> str:
     """Give a damaged file another name, which is on the disk when this returns it."""
     taken = set(files.names())
@@ -109,6 +121,15 @@ def keep_aside(files: Files, name: str) -> str:
     files.rename(name, aside)
     files.sync_names()
     return aside
+
+
+def _kind(mode: int) -> str:
+    """What a file is that is no regular one."""
+    kinds = {
+        stat.S_IFDIR: "a directory", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket",
+        stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+    }  # fmt: skip
+    return kinds.get(stat.S_IFMT(mode), "something else")
 
 
 class FolderToRead:
@@ -142,15 +163,24 @@ class FolderToRead:
         return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_size
 
     def _open(self, name: str, flags: int) -> int:
-        return os.open(name, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600, dir_fd=self._fd)
+        # a pipe or a device of that name would keep the opener waiting
+        flags |= os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+        try:
+            return os.open(name, flags, 0o600, dir_fd=self._fd)
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise OSError(errno.ELOOP, "it is a symbolic link, not a regular file", name) from error
+            raise
 
-    def read(self, name: str, most: int = -1) -> bytes:
-        """The first ``most`` bytes of a file, or all."""
+    def read(self, name: str, most: int = MOST_BYTES) -> bytes:
+        """The first ``most`` bytes of a file; OSError of what is no regular file."""
         while True:
             fd = self._open(name, os.O_RDONLY)
             try:
                 before = os.fstat(fd)
-                left = before.st_size if most < 0 else most
+                if not stat.S_ISREG(before.st_mode):
+                    raise OSError(errno.EINVAL, f"it is {_kind(before.st_mode)}, not a regular file", name)
+                left = min(before.st_size, most)
                 parts = []
                 while left and (part := os.read(fd, left)):
                     parts.append(part)
@@ -179,8 +209,11 @@ class Folder(FolderToRead):
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        os.makedirs(path, mode=0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):  # which may be something else: it cannot be opened then
+            os.makedirs(path, mode=0o700, exist_ok=True)
         super().__init__(path)
+        status = os.fstat(self._fd)
+        self._identity = status.st_dev, status.st_ino
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -237,3 +270,13 @@ class Folder(FolderToRead):
     def sync_names(self) -> None:
         """Have all names on the disk as they are now."""
         os.fsync(self._fd)
+
+    def moved(self) -> str:
+        """What has become of the directory, if it is not where it was opened; empty if it is there."""
+        try:
+            status = os.stat(self.path)
+        except (FileNotFoundError, NotADirectoryError):
+            return "it was moved or removed"
+        except OSError as error:
+            return f"it cannot be looked at: {error.strerror}"
+        return "" if (status.st_dev, status.st_ino) == self._identity else "another one is in its place"

@@ -8,11 +8,13 @@ flushed in others.  After the death of this process the next one finds the chunk
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final
+from typing import Final, TypeVar
 
 from shmmap.chunks.applying import ChunkWriter, UndoRecord
 from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
@@ -25,7 +27,7 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
-from shmmap.daemon.live.file_threads import FileThreads, Job
+from shmmap.daemon.live.file_threads import CLOSE_S, FileThreads, Job
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.paging.key_index import KeyIndex
 from shmmap.daemon.live.paging.records import Chunk, Limits, Scan
@@ -35,8 +37,14 @@ from shmmap.logfmt import log
 
 __all__ = ["LiveMap"]
 
+T = TypeVar("T")
+
 CHUNKS_A_TURN: Final = 64
 """Chunks that take in a scan in one turn: 37 us each."""
+LOOK_S: Final = 2.0
+"""How often the directory is looked at: it may have been moved, or another one put in its place."""
+HANGS_S: Final = 10.0
+"""After so long without an answer of the disk it hangs, as far as anybody can say."""
 MOST_UNFLUSHED: Final = 32 << 20
 """Files that are written and not flushed: beyond it the disk is waited for, and what is not saved stays."""
 
@@ -76,6 +84,8 @@ class LiveMap:
         Chunks that have files, in order; one whose file was put aside is in it until it is loaded.
     problems : dict
         What keeps chunks from being loaded or saved just now.
+    saved_s : float
+        When a file was written or flushed last.
     """
 
     files: MapFiles
@@ -92,8 +102,11 @@ class LiveMap:
     chunks: dict[ChunkKey, ChunkFile] = field(default_factory=dict)
     stored: KeyIndex = field(init=False)
     problems: dict[str, str] = field(default_factory=dict)
+    saved_s: float = -math.inf
     _parts: dict[Scan, _Part] = field(default_factory=dict)
     _generation: int = 0
+    _look_s: float = 0.0
+    _end_s: float | None = None
 
     def __post_init__(self) -> None:
         self.residency = Residency(self.limits, new_bytes=memory_bytes(0))
@@ -145,12 +158,13 @@ class LiveMap:
 
     @property
     def all_durable(self) -> bool:
-        """Whether everything that came is on the disk, and no file is being read or written."""
-        return not self._parts and self._threads.are_idle and self.residency.all_durable
+        """Whether everything that came is on the disk."""
+        return not self._parts and self.residency.all_durable
 
     def turn(self, now_s: float, now_ns: int, *, save_all: bool = False) -> None:
         """Do what can be done now, without waiting for the disk."""
         self._threads.tell(now_s)
+        self._look_after_directory(now_s, save_all=save_all)
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_A_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
@@ -176,6 +190,32 @@ class LiveMap:
         if residency.flush_is_due(now_s, everything=save_all):
             residency.durability.begin()
             self._threads.start([Job(self.files.flush, self._flushed)])
+
+    def _look_after_directory(self, now_s: float, *, save_all: bool) -> None:
+        hangs = self._threads.idle_s(now_s) > HANGS_S
+        self._note("hangs", "its directory does not answer: its disk is stopped or away" if hangs else "")
+        if now_s >= self._look_s and not save_all:
+            self._look_s = math.inf  # until it was looked at
+            self._threads.start([Job(self.files.files.moved, self._looked)])
+
+    def _looked(self, future: Future[str], now_s: float) -> None:
+        self._look_s = now_s + LOOK_S
+        moved = future.result()
+        text = f"its directory: {moved}; what is saved goes to where it was opened" if moved else ""
+        self._note("moved", text)
+
+    def _note(self, what: str, problem: str) -> None:
+        """Something is wrong, or right again; said once in the log."""
+        if problem and what not in self.problems:
+            log.error("live map has a problem", reason=problem)
+        if problem:
+            self.problems[what] = problem
+        elif self.problems.pop(what, ""):
+            log.info("live map is in order again", what=what)
+
+    def on_disk(self, work: Callable[[], T], then: Callable[[Future[T], float], None]) -> None:
+        """Have a file thread do something; ``then`` gets what came of it in a later turn."""
+        self._threads.start([Job(work, then)])
 
     def wait(self, seconds: float) -> None:
         """Wait until a file was read or written, at most so long; not at all if there is none."""
@@ -220,19 +260,19 @@ class LiveMap:
     def _load(self, identity: ChunkIdentity) -> ChunkFile:
         """Bring a chunk into memory as its file is, or new; a file that is of no use is put aside."""
         key = identity.key
-        data = self.files.load(key)
         content: bytes | bytearray = new_header(identity)
-        if data is not None:
-            try:
+        try:
+            data = self.files.load(key)
+            if data is not None:
                 content = decode_chunk(data, identity, key.text)
-            except MapDataError as error:
-                self.files.put_aside(key, error.message)
+        except MapDataError as error:
+            self.files.put_aside(key, error.message)
         return self.memory.create(content)
 
     def _loaded(self, chunk: Chunk, future: Future[ChunkFile], now_s: float) -> None:
         try:
             file = future.result()
-        except (OSError, PackageMissing) as error:
+        except (OSError, MemoryError, PackageMissing) as error:
             self._failed("loaded", chunk.key.text, str(error))
             self.residency.load_failed(chunk, now_s)
             return
@@ -252,11 +292,12 @@ class LiveMap:
     def _saved(self, chunk: Chunk, version: int, future: Future[None], now_s: float) -> None:
         try:
             future.result()
-        except OSError as error:
-            self._failed("saved", chunk.key.text, error.strerror)
+        except (OSError, MemoryError) as error:
+            self._failed("saved", chunk.key.text, _reason(error))
             self.residency.save_failed(chunk, now_s)
             return
         self._succeeded("saved")
+        self.saved_s = now_s
         self.stored.add(chunk.key)
         self.residency.saved(chunk, version, now_s)
         self.chunks[chunk.key].view.state["saved_version"] = version
@@ -275,6 +316,23 @@ class LiveMap:
         if self.problems.pop(what, ""):
             log.info(f"chunks are {what} again")
 
+    def finish(self, applied: dict[int, int] | None) -> None:
+        """Have the manifest written, and what is only there to be written over removed, before the end."""
+        self._threads.start([Job(partial(self._finish, applied), self._listed)])
+        while not self._threads.are_idle and (left_s := self._left_s()) > 0:
+            self._threads.wait(left_s)
+            self._threads.tell(time.monotonic())
+
+    def _left_s(self) -> float:
+        """How long files may still take at the end, counted from the first time that this is asked."""
+        if self._end_s is None:
+            self._end_s = time.monotonic() + (0.0 if "hangs" in self.problems else CLOSE_S)
+        return max(0.0, self._end_s - time.monotonic())
+
+    def _finish(self, applied: dict[int, int] | None) -> None:
+        self.files.write_manifest(applied)
+        self.files.remove_spare()
+
     def list_files(self, applied: dict[int, int] | None) -> None:
         """Have the manifest written, beside the rest; ``applied`` as there."""
         self._threads.start([Job(partial(self.files.write_manifest, applied), self._listed)])
@@ -287,11 +345,12 @@ class LiveMap:
     def _flushed(self, future: Future[None], now_s: float) -> None:
         try:
             future.result()
-        except OSError as error:
-            self._failed("flushed", "", error.strerror)
+        except (OSError, MemoryError) as error:
+            self._failed("flushed", "", _reason(error))
             self.residency.durability.failed(now_s + RETRY_S)
             return
         self._succeeded("flushed")
+        self.saved_s = now_s
         for scan in self.residency.durability.flushed():
             self.on_durable(scan)
 
@@ -303,10 +362,13 @@ class LiveMap:
 
     def close(self) -> None:
         """Leave memory and files as they are."""
-        for done in self._threads.close():
+        for done in self._threads.close(self._left_s()):
             if isinstance(done, ChunkFile):
                 done.close()  # it has come, and there was no turn since
-        self.files.remove_spare()
         for file in self.chunks.values():
             file.close()
         self.chunks.clear()
+
+
+def _reason(error: OSError | MemoryError) -> str:
+    return (error.strerror or str(error)) if isinstance(error, OSError) else "this process has no memory left"

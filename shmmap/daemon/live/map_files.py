@@ -9,13 +9,15 @@
   fails, and for whoever loads it again: what is written often is flushed seldom.
 - ``manifest.json`` lists the chunks that are durable.  It is written last, and only says what somebody may
   have taken away; all else is read from the chunks' headers.
-- What cannot be read is put aside as ``3_-1_0.chunk.damaged.1``, told, and never overwritten.
+- What is damaged is put aside as ``3_-1_0.chunk.damaged.1``, named, and never overwritten.  What the system
+  does not let be read may be good: then the map cannot be opened, and nothing of it is changed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import secrets
+from collections.abc import Iterator
 from typing import Final
 
 import msgspec
@@ -27,17 +29,19 @@ from shmmap.daemon.live.disk.map_record import (
     MANIFEST,
     MAP_FILE,
     MAP_FORMAT,
-    Manifest,
     Mapper,
     MapRecord,
     MapSettings,
     Row,
+    keys_of,
+    read_chunk,
+    read_manifest,
     read_map,
     write_rows,
 )
 from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
 from shmmap.daemon.live.unflushed_files import UnflushedFiles
-from shmmap.errors import BadRequest, ConfigError, MapDataError
+from shmmap.errors import ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 
@@ -86,9 +90,11 @@ class MapFiles:
         self._unflushed = UnflushedFiles(files)
         self.applied: dict[int, int] = {}
         self._durable: dict[ChunkKey, Row] = {}
+        self._begun = False
         names = files.names()
         if MAP_FILE in names:
-            self._map = self._read_map(settings)
+            with _named(MAP_FILE):
+                self._map = self._read_map(settings)
         elif any(name.endswith(CHUNK) for name in names):
             raise MapDataError(
                 "there are chunks, but the file that says what they are is missing",
@@ -119,30 +125,31 @@ class MapFiles:
 
     def begin_life(self) -> int:
         """Return how many times the map was in memory, this time included; on disk when this returns."""
-        self._map.lives += 1
-        self._write_map()
+        if not self._begun:
+            self._map.lives += 1
+            self._write_map()
+            self._begun = True
         return self._map.lives
 
     def add_mapper(self, uid: int, name: str) -> Mapper:
         """Give a new mapper its number; it is on the disk when this returns."""
         mapper = Mapper(self._map.next_mapper, uid, name)
         self._map.next_mapper += 1
-        self._map.mappers.append(mapper)
+        before, self._map.mappers = self._map.mappers, [*self._map.mappers, mapper]
         try:
             self._write_map()
         except OSError:
-            self._map.mappers.remove(mapper)
+            self._map.mappers = before
             raise
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
         """A mapper gives way; nobody gets its number."""
-        at = self._map.mappers.index(mapper)
-        del self._map.mappers[at]
+        before, self._map.mappers = self._map.mappers, [one for one in self._map.mappers if one is not mapper]
         try:
             self._write_map()
         except OSError:
-            self._map.mappers.insert(at, mapper)
+            self._map.mappers = before
             raise
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
@@ -180,20 +187,24 @@ class MapFiles:
         return row.version if row is not None else 0
 
     def load(self, key: ChunkKey) -> bytes | None:
-        """Read the file of a chunk; None where there is none.  Raises OSError."""
+        """Read the file of a chunk; None where there is none.  Raises OSError, and MapDataError."""
         if key not in self.rows:
             return None
         unflushed = self._unflushed.get(key)
-        return unflushed if unflushed is not None else self.files.read(key.text + CHUNK)
+        return unflushed if unflushed is not None else read_chunk(self.files, key.text + CHUNK)
 
     def put_aside(self, key: ChunkKey, why: str) -> str:
         """Keep a file that cannot be read under another name, which is returned."""
-        name = keep_aside(self.files, key.text + CHUNK)
+        name = self._put_aside(key.text + CHUNK, why)
         self.rows.pop(key, None)
         self._durable.pop(key, None)
-        self.damaged[name] = why
-        log.error("chunk put aside", chunk=key.text, file=name, reason=why)
         return name
+
+    def _put_aside(self, name: str, why: str) -> str:
+        aside = keep_aside(self.files, name)
+        self.damaged[aside] = why
+        log.error("file of a live map quarantined", file=aside, reason=why)
+        return aside
 
     def save(self, key: ChunkKey, data: bytes) -> None:
         """Write the file of a chunk, which takes the place of an older one and is durable after `flush`.
@@ -234,7 +245,7 @@ class MapFiles:
         """What a file of this map says of its chunk, if its length is right, and, if ``whole``, its body."""
         with contextlib.suppress(FileNotFoundError, MapDataError):
             if whole:
-                header = check_file(self.files.read(name), name)
+                header = check_file(read_chunk(self.files, name), name)
             else:
                 header = read_file_header(self.files.read(name, FILE_HEADER_BYTES), name)
             right = self.files.size(name) == FILE_HEADER_BYTES + header.stored_bytes
@@ -247,47 +258,57 @@ class MapFiles:
         for name in names:
             if not (name.startswith(".") and name.endswith(INTERIM)):
                 continue
-            header = self._header(name, whole=True)
-            if header is not None:
-                place = header.key.text + CHUNK
-                old = self._header(place)
-                if old is None or old.version < header.version:
-                    if old is None and place in names:
-                        self.put_aside(header.key, "it cannot be read, and a whole one was beside it")
-                    self.files.sync(name)
-                    self.files.rename(name, place)
-                    continue
-            self.files.remove(name)
+            with _named(name):
+                header = self._header(name, whole=True)
+                if header is not None:
+                    place = header.key.text + CHUNK
+                    old = self._header(place)
+                    if old is None or old.version < header.version:
+                        if old is None and place in names:
+                            self.put_aside(header.key, "it cannot be read, and a whole one was beside it")
+                        self.files.sync(name)
+                        self.files.rename(name, place)
+                        continue
+                self.files.remove(name)
 
     def _read_rows(self) -> None:
         """Find the chunks, and what is missing of those that the manifest lists."""
         names = self.files.names()
-        for name in names:
-            if not name.endswith(CHUNK):
-                continue
-            try:
-                key = ChunkKey.from_text(name.removesuffix(CHUNK))
-            except BadRequest:
-                log.warning("not a chunk of this map", file=name)
-                continue
-            header = self._header(name)
+        found, strange = keys_of(names)
+        if strange:
+            log.warning("not chunks of this map", files=len(strange), first=min(strange))
+        for key, name in found.items():
+            with _named(name):
+                header = self._header(name)
             if header is None or header.key != key:
                 self.put_aside(key, "its header or its length is wrong")
             else:
                 self.rows[key] = Row.of(header)
         self.files.sync_names()
         self._durable = dict(self.rows)
-        listed: dict[str, Row] = {}
-        if MANIFEST in names:
-            with contextlib.suppress(msgspec.MsgspecError):  # it is written anew
-                manifest = msgspec.json.decode(self.files.read(MANIFEST), type=Manifest)
-                listed, self.applied = manifest.chunks, manifest.applied
-        for text, row in listed.items():
-            with contextlib.suppress(BadRequest):
-                key = ChunkKey.from_text(text)
-                if key not in self.rows or self.rows[key].version < row.version:
-                    self.missing[key] = row
-                    log.error("chunk missing", chunk=text, version=row.version)
+        if MANIFEST not in names:
+            return
+        try:
+            with _named(MANIFEST):
+                listed, applied = read_manifest(self.files)
+        except MapDataError as error:
+            self._put_aside(MANIFEST, error.message)  # it is written again
+            return
+        sent = {mapper.number: mapper.scans for mapper in self.mappers}
+        self.applied = {number: scan for number, scan in applied.items() if scan < sent.get(number, 0)}
+        for key, row in listed.items():
+            if key not in self.rows or self.rows[key].version < row.version:
+                self.missing[key] = row
+                log.error("chunk missing", chunk=key.text, version=row.version)
+
+
+@contextlib.contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Have what the system says of a file name it."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, f"{name} cannot be read: {error.strerror}") from error
 
 
 def _flat(settings: MapSettings) -> dict[str, object]:

@@ -22,14 +22,15 @@ __all__ = [
     "Begun",
     "End",
     "Ended",
-    "Failed",
     "FromLive",
     "Left",
     "Status",
     "ToLive",
+    "Unsaved",
     "decode_from_live",
     "decode_to_live",
     "encode",
+    "not_served",
 ]
 
 
@@ -78,17 +79,16 @@ class End(msgspec.Struct, array_like=True, tag="end"):
 
 
 class Begun(msgspec.Struct, array_like=True, tag="begun"):
-    """All maps are served; so many chunks were found in memory."""
+    """Each map is served, or has a problem; so many are, and so many chunks were found in memory.
 
+    The error is why none can be, as long as nobody changes the settings or ends another daemon.
+    """
+
+    maps: int
     adopted: int
-
-
-class Failed(msgspec.Struct, array_like=True, tag="failed"):
-    """Maps cannot be served: an error as it stands on the wire."""
-
-    code: str
-    message: str
-    hint: str
+    code: str = ""
+    message: str = ""
+    hint: str = ""
 
 
 class Answer(msgspec.Struct, array_like=True, tag="answer"):
@@ -104,19 +104,36 @@ class Status(msgspec.Struct, array_like=True, tag="status"):
     maps: tuple[LiveMapRow, ...]
 
 
-class Ended(msgspec.Struct, array_like=True, tag="ended"):
-    """The worker ends now; so many chunks could not be saved and stay in memory."""
+class Unsaved(msgspec.Struct, array_like=True, frozen=True):
+    """So many chunks of a map could not be saved, and stay in memory; and why."""
 
-    unsaved: int
+    map: str
+    chunks: int
+    problem: str
+
+
+class Ended(msgspec.Struct, array_like=True, tag="ended"):
+    """The worker ends now."""
+
+    unsaved: tuple[Unsaved, ...]
 
 
 ToLive: TypeAlias = Begin | Ask | Left | End
-FromLive: TypeAlias = Begun | Failed | Answer | Status | Ended
+FromLive: TypeAlias = Begun | Answer | Status | Ended
 
 MOST_OF_A_SESSION: Final = 64
 """Requests that are passed on before they are answered."""
 
 encode: Final = msgspec.msgpack.Encoder().encode
+
+
+def not_served(one: LiveSettings, budget_bytes: int, problem: str) -> LiveMapRow:
+    """How a map is of which nothing is in memory, and why."""
+    return LiveMapRow(
+        one.name, one.path, one.resolution, one.frame_id, chunks=0, active=0, bytes=0, loading=0, dirty=0,
+        saving=0, evicting=0, evicting_bytes=0, waiting_bytes=0, files=0, file_bytes=0, scans=0, durable=0,
+        budget_bytes=budget_bytes, problem=problem,
+    )  # fmt: skip
 
 
 @cache

@@ -15,13 +15,25 @@ from shmmap.daemon.live.messages import Begin
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
 
-__all__ = ["place_live_maps"]
+__all__ = ["bytes_beside_cells", "place_live_maps"]
 
 CEILING_BYTES: Final = 1 << 30
 PART: Final = 8
 """Of the memory that is free, by default."""
 LEAST_BYTES: Final = 4 << 20
 """Of each map: some of the largest chunks, half a mebibyte each."""
+
+
+def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_bytes: int) -> int:
+    """Return what so many live maps need of the file system in which the cells are: at least, or as set."""
+    if not maps:
+        return 0
+    path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
+    try:
+        same = os.stat(path).st_dev == os.stat(cells.path).st_dev
+    except OSError:
+        same = False  # `place_live_maps` says what is wrong with it
+    return (budget_bytes or LEAST_BYTES * maps) if same else 0
 
 
 def place_live_maps(

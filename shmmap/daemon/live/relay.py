@@ -23,18 +23,18 @@ from shmmap.daemon.live.tickets import Tickets
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.errors import BadRequest, Busy, CannotStart, LiveInterrupted, ShmmapError, error_from_wire
+from shmmap.errors import BadRequest, Busy, LiveInterrupted, ShmmapError, error_from_wire
 from shmmap.logfmt import log
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import start_child
 from shmmap.protocol.codec import encode
-from shmmap.protocol.live import LiveList, LiveListed, LiveRequest
+from shmmap.protocol.live import LiveList, LiveListed, LiveMapRow, LiveRequest
 
 __all__ = ["LiveRelay", "NoLiveMaps"]
 
 BEAT_S: Final = 0.5
-START_S: Final = 120.0
-"""How long the maps may take to come into memory before the daemon is ready: kernels are compiled, too."""
+BEGINNING_S: Final = 2.0
+"""How long a worker that does not serve yet may take to end."""
 END_S: Final = 60.0
 """How long saving everything may take at the end; the unit's stop timeout is longer."""
 PAUSES_S: Final = (0.0, 0.5, 2.0, 10.0, 30.0)
@@ -87,6 +87,11 @@ class NoLiveMaps:
     def close(self, *, keep: bool) -> None:
         """Nothing has to be ended."""
 
+    @property
+    def unsaved(self) -> dict[str, int]:
+        """Nothing can be lost."""
+        return {}
+
 
 class LiveRelay:
     """Has the live worker, and passes on what concerns it.
@@ -105,7 +110,9 @@ class LiveRelay:
     Attributes
     ----------
     restarts : int
-        Workers that ended without being told to.
+        Workers that ended without being asked to.
+    unsaved : dict
+        Chunks by map that could not be saved at the end.
     """
 
     def __init__(
@@ -116,6 +123,7 @@ class LiveRelay:
         events: LiveEvents,
     ) -> None:
         self.restarts = 0
+        self.unsaved: dict[str, int] = {}
         self._begin = begin
         self._watched = watched
         self._may_map = may_map
@@ -129,8 +137,9 @@ class LiveRelay:
         self._serving = False
         self._failures = 0
         self._start_s = self._served_s = 0.0
-        self._why: ShmmapError | None = None
-        self._unsaved = -1
+        self._refused: ShmmapError | None = None
+        self._rows: tuple[LiveMapRow, ...] = ()
+        self._ended: messages.Ended | None = None
 
     # --- the worker's life ----------------------------------------------------------------------
 
@@ -138,21 +147,28 @@ class LiveRelay:
         """Start the worker; `wait_until_serving` says what came of it."""
         self._process, self._channel = start_child("shmmap.daemon.live.worker.main", new_session=True)
         self._channel.setblocking(False)
-        self._serving, self._why = False, None
+        self._serving = False
         with contextlib.suppress(ConnectionError):
             self._channel.send(messages.encode(self._begin))
         self._watched.watch(self._channel.fileno(), self.hear, "answers")
 
-    def wait_until_serving(self) -> None:
-        """Wait until all maps are in memory.
+    def wait_until_serving(self, seconds: float, *, alone: bool) -> None:
+        """Wait until each map is in memory or has a problem, at most so long: the rest comes by itself.
+
+        Parameters
+        ----------
+        seconds
+            How long points may have to wait for live maps.
+        alone
+            There is nothing else to serve.
 
         Raises
         ------
         ShmmapError
-            One cannot be: the daemon cannot start like that.
+            There is nothing else, and settings or another daemon keep every map from being served.
         """
-        end_s = time.monotonic() + START_S
-        while not self._serving and self._why is None and (left_s := end_s - time.monotonic()) > 0:
+        end_s = time.monotonic() + seconds
+        while not self._serving and (left_s := end_s - time.monotonic()) > 0:
             if self._channel is None:
                 if self._failures > STARTS:
                     break
@@ -160,10 +176,17 @@ class LiveRelay:
             self._wait(min(left_s, BEAT_S))
             self.hear()
             self._events.beat()
+        if alone and self._refused is not None:
+            raise self._refused
         if not self._serving:
-            raise self._why or CannotStart(
-                "the process that keeps live maps did not begin", hint="see the lines of the log before this"
-            )
+            log.warning("live maps are not ready yet", maps=len(self._begin.maps), after_s=seconds)
+            self._say_of_all("the process that keeps live maps is being started")
+
+    def _say_of_all(self, problem: str) -> None:
+        """Have each map shown as one that is not served just now."""
+        budget_bytes = self._begin.budget_bytes // max(1, len(self._begin.maps))
+        self._rows = tuple(messages.not_served(one, budget_bytes, problem) for one in self._begin.maps)
+        self._events.told(self._rows)
 
     def tell(self) -> None:
         """Tell events from now on: clients are heard."""
@@ -208,16 +231,17 @@ class LiveRelay:
             if session is not None:
                 session.connection.reply(message.body)
         elif isinstance(message, messages.Status):
+            self._rows = message.maps
             self._events.told(message.maps)
         elif isinstance(message, messages.Begun):
             self._serving, self._served_s = True, time.monotonic()
-            log.info("live maps are served", maps=len(self._begin.maps), chunks=message.adopted)
-            self._events.started(len(self._begin.maps), message.adopted)
-        elif isinstance(message, messages.Failed):
-            self._why = error_from_wire(message.code, message.message, message.hint)
-            log.error("live maps cannot be served", reason=message.message)
+            self._refused = (
+                error_from_wire(message.code, message.message, message.hint) if message.code else None
+            )
+            log.info("live maps ready", maps=message.maps, of=len(self._begin.maps), chunks=message.adopted)
+            self._events.started(message.maps, message.adopted)
         elif isinstance(message, messages.Ended):
-            self._unsaved = message.unsaved
+            self._ended = message
 
     def _lost(self) -> None:
         """The worker has ended: tell who waits, and start another one soon."""
@@ -225,13 +249,15 @@ class LiveRelay:
         if self._serving and now_s >= self._served_s + IN_ORDER_S:
             self._failures = 0
         self._forget()
-        if self._unsaved >= 0:
-            return  # as it was told to
+        if self._ended is not None:
+            return  # as it was asked to
         self.restarts += 1
         self._start_s = now_s + PAUSES_S[min(self._failures, len(PAUSES_S) - 1)]
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
+        if self._failures > 1:  # once is hardly noticed: the next one finds what was in memory
+            self._say_of_all("the process that keeps live maps ends again and again: see the log")
         self._tickets.lose()
 
     @property
@@ -273,8 +299,14 @@ class LiveRelay:
         """
         if len(body) > MOST_BYTES:
             raise BadRequest(f"a request about a live map has at most {MOST_BYTES} bytes")
-        if self._channel is None:
-            raise LiveInterrupted("the process that keeps live maps is being started anew")
+        if isinstance(message, LiveList) and not self._serving:
+            session.connection.reply(encode(LiveListed(message.request, self._rows)))
+            return
+        if self._channel is None or not self._serving:
+            raise LiveInterrupted(
+                "the process that keeps live maps is being started",
+                hint="ask again: it takes long the first time",
+            )
         if len(self._unsent) >= MOST_UNSENT:
             raise Busy("the process that keeps live maps hears nothing just now", hint="ask again")
         maps = self._may_map(session.peer, now_s)
@@ -311,18 +343,33 @@ class LiveRelay:
     # --- the end --------------------------------------------------------------------------------
 
     def close(self, *, keep: bool) -> None:
-        """Have everything saved and all names taken away, or leave memory to the next life."""
+        """Have everything saved and all names taken away, or leave memory to the next run.
+
+        What could not be saved is `unsaved` then, and stays in memory.
+        """
         if self._channel is None:
             return
-        end_s = time.monotonic() + END_S
-        self._unsaved = -1
+        was_serving = self._serving
+        ended = self._ask_to_end(time.monotonic() + (END_S if was_serving else BEGINNING_S), keep=keep)
+        if ended is not None and not keep:
+            for one in ended.unsaved:
+                self.unsaved[one.map] = one.chunks
+                log.error(
+                    "live map not saved: its chunks stay in memory for the next start", map=one.map,
+                    chunks=one.chunks, reason=one.problem or "there was no time left",
+                )  # fmt: skip
+        elif ended is None and was_serving:
+            unsaved = {row.name: row.dirty + row.saving for row in self._rows if row.dirty + row.saving}
+            self.unsaved = {} if keep else unsaved
+            log.error("live worker did not end in time: what is in memory stays there for the next start")
+        self._forget()
+
+    def _ask_to_end(self, end_s: float, *, keep: bool) -> messages.Ended | None:
+        """Have the worker end; what it says at last, if it does by then."""
+        self._ended = None
         self._unsent.append(messages.encode(messages.End(keep)))
-        while self._channel is not None and (left_s := end_s - time.monotonic()) > 0:
+        while self._channel is not None and self._ended is None and (left_s := end_s - time.monotonic()) > 0:
             self._flush()
             self._wait(left_s)
             self.hear()
-        if self._unsaved > 0 and not keep:
-            log.error("chunks not saved stay in memory", chunks=self._unsaved)
-        elif self._unsaved < 0:
-            log.error("live worker did not end in time: what is in memory stays there for the next start")
-        self._forget()
+        return self._ended

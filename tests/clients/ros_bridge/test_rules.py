@@ -102,6 +102,21 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
     assert not waiting.put(request("one too many"))
 
 
+def test_clients_take_turns() -> None:
+    """However many one has waiting, and what could not be answered yet comes after all others."""
+    waiting = WaitingRequests()
+    for number in range(MOST_OF_ONE):
+        waiting.put(request("greedy", number))
+    waiting.put(request("other"))
+    slow = waiting.get()
+    waiting.again(slow)
+    waiting.put(request("new"))
+    taken = [waiting.get() for _ in range(len(waiting))]
+    assert [one.requester.name for one in taken[:3]] == ["other", "new", "greedy"]
+    assert {one.requester.name for one in taken[3:]} == {"greedy"}
+    assert sorted(one.message for one in taken if one.requester.name == "greedy") == [0, 1, 2, 3]
+
+
 # --- names --------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,11 +181,43 @@ def test_more_chunks_than_there_was_memory_for(monkeypatch: pytest.MonkeyPatch) 
         (np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0, 1.0]), "mirrors"),
         (np.zeros((3, 3)), pose_at((np.nan, 0.0, 0.0)), "a rotation and a finite position"),
         (np.zeros((3, 3)), pose_at((1.0737417e8, 0.0, 0.0)), "further than"),
+        (np.zeros((3, 3)), pose_at((0.0, -5.4e7, 0.0)), "further than 5.369e"),
+        (np.zeros((3, 3)), pose_at((0.0, 0.0, 1e300)), "further than"),
+        (np.zeros((3, 3)), np.vstack([np.eye(4)[:3], [1.0, 2.0, 3.0, 1.0]]), "transposed"),
+        (np.zeros((3, 3)), np.eye(4)[None], "shape"),
+        (np.zeros((3, 3)), None, "pose: need an array of numbers"),
+        (np.zeros((3, 3)), "identity", "pose: need an array of numbers"),
+        (np.zeros((3, 3)), np.ma.masked_equal(np.eye(4), 1.0), "finite"),
+        (None, np.eye(4), "points: need an array of numbers"),
+        ([[1.0, 2.0, 3.0], [1.0]], np.eye(4), "points: need an array of numbers"),
+        ([["a", "b", "c"]], np.eye(4), "points: need an array of numbers"),
+        (np.zeros((3, 3), complex), np.eye(4), "points: need an array of numbers"),
+        ([1.0, 2.0, 3.0], np.eye(4), "shape"),
     ],
 )
-def test_what_is_no_scan_is_refused(points: Points, pose: NDArray[np.float64], said: str) -> None:
+def test_what_is_no_scan_is_refused(points: Any, pose: Any, said: str) -> None:
     with pytest.raises(BadRequest, match=said):
         Marker(0.1).mark(points, pose)
+
+
+def test_lists_and_whole_numbers_are_scans_too() -> None:
+    points = np.random.default_rng(4).integers(-8, 8, (50, 3))
+    expected = sets_of(Marker(0.1).mark(points.astype(float), np.eye(4))[0])
+    for same in (points, points.tolist(), points.astype(np.int16), np.asfortranarray(points)):
+        assert sets_of(Marker(0.1).mark(same, np.eye(3, 4).tolist())[0]) == expected
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_points_that_are_masked_do_not_count(kind: type[np.generic]) -> None:
+    """Not even where one coordinate of them is masked."""
+    points = np.random.default_rng(4).integers(2, 9, (40, 3)).astype(kind)
+    mask = np.zeros(points.shape, bool)
+    mask[::4, 1] = mask[1] = True
+    found, counts = Marker(0.1).mark(np.ma.MaskedArray(points, mask), np.eye(4))
+    expected, _ = Marker(0.1).mark(points[~mask.any(axis=1)], np.eye(4))
+    assert sets_of(found) == sets_of(expected)
+    _, of_nan = Marker(0.1).mark(np.where(mask, np.nan, points.astype(float)), np.eye(4))
+    assert counts == of_nan
 
 
 def test_marks_come_in_the_order_of_their_chunks() -> None:

@@ -54,7 +54,7 @@ def add_parser(subparsers: Subparsers) -> None:
     how.add_argument(
         "--repair",
         action="store_true",
-        help="put damaged files aside under another name, and list the good ones in a new manifest",
+        help="quarantine files that are damaged or cannot be read, and list the good ones in a new manifest",
     )
     add_json_option(parser)
 
@@ -122,7 +122,7 @@ def _print(found: CheckedMap) -> None:
 
 def _advice(found: CheckedMap) -> str:
     if found.unreadable:
-        return "as root it may be readable; else look at the disk"
+        return "as root it may be readable; else look at the disk; --repair quarantines what stays unreadable"
     if found.damaged:
         return "--repair puts damaged files aside: what they had is mapped anew, unless a copy is put back"
     return "put the files back from a copy, or let --repair forget them"

@@ -9,10 +9,10 @@ import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, read_file_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, Manifest, Row, write_rows
+from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, Row, read_manifest, write_rows
 from shmmap.daemon.live.disk.stored_map import StoredMap
 from shmmap.daemon.live.folder import INTERIM, Files, FilesToRead, keep_aside
-from shmmap.errors import BadRequest, MapDataError
+from shmmap.errors import MapDataError
 
 __all__ = ["CheckedMap", "DamagedFile", "MissingChunk", "check", "repair"]
 
@@ -65,7 +65,8 @@ class CheckedMap(msgspec.Struct):
     damaged
         Those that are not.
     unreadable
-        Files that the system does not let this process read, and why: they may be good.
+        Files that the system does not let this process read, or that are no regular ones, and why: they may
+        be good.  `repair` quarantines them, too.
     missing
         What the manifest lists beyond the files.
     manifest
@@ -130,7 +131,15 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
             unreadable[name] = reason
         elif row.cause != "missing":  # since the names were listed
             damaged.append(DamagedFile(name, reason))
-    told = {one.file for one in damaged} | unreadable.keys()
+    known = {one.file for one in damaged} | unreadable.keys()
+    interim = []
+    for name in stored.names:
+        if name.startswith(".") and name.endswith(INTERIM):
+            try:
+                if not _is_older(files, name, rows):
+                    interim.append(name)
+            except OSError as error:
+                unreadable[name] = f"it cannot be read: {error.strerror}"
     return CheckedMap(
         path=path,
         map_id=stored.map_id.hex(),
@@ -139,23 +148,19 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
         rows=rows,
         damaged=damaged,
         unreadable=unreadable,
-        missing=_missing(listed, rows, told) if isinstance(listed, dict) else [],
+        missing=_missing(listed, rows, known) if isinstance(listed, dict) else [],
         manifest=("current" if listed == rows else "stale") if isinstance(listed, dict) else listed,
-        interim=[
-            name
-            for name in stored.names
-            if name.startswith(".") and name.endswith(INTERIM) and not _is_older(files, name, rows)
-        ],
+        interim=interim,
         aside=stored.aside,
         strange=stored.strange,
     )
 
 
 def _is_older(files: FilesToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
-    """Whether a file is only there to be written over: its chunk's own is as new."""
+    """Whether a file is only there to be written over: its chunk's own is as new.  Raises OSError."""
     try:
         header = read_file_header(files.read(name, FILE_HEADER_BYTES))
-    except (OSError, MapDataError):
+    except (FileNotFoundError, MapDataError):
         return False
     return header.key in rows and rows[header.key].version >= header.version
 
@@ -171,27 +176,26 @@ def _row_or_error(stored: StoredMap, key: ChunkKey) -> Row | MapDataError:
 def _listed(files: FilesToRead) -> dict[ChunkKey, Row] | Literal["absent", "unreadable"]:
     """The chunks that the manifest lists."""
     try:
-        listed = msgspec.json.decode(files.read(MANIFEST), type=Manifest).chunks
-        return {ChunkKey.from_text(text): row for text, row in listed.items()}
+        return read_manifest(files)[0]
     except FileNotFoundError:
         return "absent"
-    except (OSError, ValueError, BadRequest):
+    except (OSError, MapDataError):
         return "unreadable"
 
 
-def _missing(listed: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], told: set[str]) -> list[MissingChunk]:
+def _missing(listed: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[str]) -> list[MissingChunk]:
     found = {key: rows[key].version if key in rows else 0 for key in listed}
     return [
         MissingChunk(key.text, row.version, found[key])
         for key, row in listed.items()
-        if row.version > found[key] and key.text + CHUNK not in told
+        if row.version > found[key] and key.text + CHUNK not in known
     ]
 
 
 def repair(files: Files, found: CheckedMap) -> None:
-    """Put damaged files aside, which is noted in ``found``, and list the good ones in a new manifest.
+    """Quarantine files that are damaged or cannot be read, and list the good ones in a new manifest.
 
-    There is no new one while a file is unreadable: the old one may list it.
+    What was done is noted in ``found``: all that was quarantined is ``damaged`` then, with its new name.
 
     Nobody else may work with the files since they were checked.  Nothing is deleted.
 
@@ -200,8 +204,12 @@ def repair(files: Files, found: CheckedMap) -> None:
     OSError
         A file cannot be renamed or written.
     """
+    found.damaged += [DamagedFile(name, reason) for name, reason in found.unreadable.items()]
+    found.unreadable = {}
+    if found.manifest == "unreadable":
+        found.damaged.append(DamagedFile(MANIFEST, "it cannot be read, or does not list chunks"))
     for one in found.damaged:
         one.kept_as = keep_aside(files, one.file)
-    if found.manifest != "current" and not found.unreadable:
+    if found.manifest != "current":
         write_rows(files, found.rows, {})  # who plays scans again brings back what was damaged
         found.rewritten = True

@@ -1,22 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the directory of a live map says of it: ``map.json``, ``manifest.json``, and the names of its files.
 
-``map_files.py`` says what they are for.
+``map_files.py`` says what they are for.  Whatever is in a file, reading it is bounded, and what it cannot be
+is a `MapDataError`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final
+import re
+import struct
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Final, TypeAlias, TypeVar
 
 import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader
-from shmmap.chunks.layout import ChunkIdentity
+from shmmap.chunks.layout import MAPPERS, MOST_FRAME_BYTES, ChunkIdentity
+from shmmap.chunks.layout import MOST_BYTES as MOST_CHUNK_BYTES
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.folder import Files, FilesToRead, replace_file
-from shmmap.errors import ConfigError, MapDataError
+from shmmap.daemon.live.folder import MOST_BYTES, Files, FilesToRead, replace_file
+from shmmap.errors import BadRequest, ConfigError, MapDataError
 
 __all__ = [
     "CHUNK",
@@ -28,15 +32,35 @@ __all__ = [
     "MapSettings",
     "Mapper",
     "Row",
+    "keys_of",
+    "read_chunk",
+    "read_manifest",
     "read_map",
     "write_rows",
 ]
+
+_T = TypeVar("_T")
 
 MAP_FILE: Final = "map.json"
 MANIFEST: Final = "manifest.json"
 MAP_FORMAT: Final = 1
 CHUNK: Final = ".chunk"
 """How the names of chunks' files end."""
+
+_MOST_CHUNK_BYTES: Final = 2 * MOST_CHUNK_BYTES
+"""Of a chunk's file: what cannot be compressed gets a little longer by that."""
+_MOST_MAP_BYTES: Final = 1 << 20
+_MOST_MANIFEST_BYTES: Final = MOST_BYTES - 1
+"""Of ``map.json``, and of ``manifest.json``: about two million chunks."""
+_MAP_ID: Final = re.compile(r"[0-9a-f]{32}")
+_RESOLUTION_M: Final = (1e-4, 1e3)
+_NOT_DECODED: Final = (
+    msgspec.MsgspecError, ValueError, ConfigError, RecursionError, MemoryError, OverflowError, struct.error,
+)  # fmt: skip
+"""What decoders raise of bytes that nobody has written like that."""
+
+Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62) - 1)]
+"""Of a file that may have been changed: never negative, and something can be added."""
 
 
 class MapSettings(msgspec.Struct, frozen=True):
@@ -75,21 +99,21 @@ class Mapper(msgspec.Struct):
         All scans that it sent have smaller numbers; true on disk before one is applied.
     """
 
-    number: int
-    uid: int
+    number: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)]
+    uid: Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
     name: str
-    scans: int = 0
+    scans: Count = 0
 
 
 class Row(msgspec.Struct, frozen=True):
     """What is known of a chunk's file without opening it."""
 
-    version: int
-    bytes: int
-    active: int
-    occupied: int
-    free: int
-    bricks: int
+    version: Count
+    bytes: Count
+    active: Count
+    occupied: Count
+    free: Count
+    bricks: Count
 
     @classmethod
     def of(cls, header: ChunkFileHeader) -> Row:
@@ -105,8 +129,8 @@ class MapRecord(msgspec.Struct):
     map_id: str
     settings: MapSettings
     mappers: list[Mapper] = []
-    next_mapper: int = 1
-    lives: int = 0
+    next_mapper: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)] = 1
+    lives: Annotated[int, msgspec.Meta(ge=0, lt=(1 << 31) - 1)] = 0
 
 
 class Manifest(msgspec.Struct):
@@ -122,11 +146,45 @@ class Manifest(msgspec.Struct):
 
     format: int
     chunks: dict[str, Row]
-    applied: dict[int, int] = {}
+    applied: dict[int, Count] = {}
+
+
+def keys_of(names: Iterable[str]) -> tuple[dict[ChunkKey, str], list[str]]:
+    """Files of chunks by key, in the order of the keys; and those called so that no chunk can have."""
+    found: dict[ChunkKey, str] = {}
+    strange: list[str] = []
+    for name in names:
+        if name.endswith(CHUNK):
+            try:
+                found[ChunkKey.from_text(name.removesuffix(CHUNK))] = name
+            except BadRequest:
+                strange.append(name)
+    return dict(sorted(found.items())), strange
+
+
+def _whole(files: FilesToRead, name: str, most: int) -> bytes:
+    """All of a file that is no longer than it can be; raises as `read_map`."""
+    data = files.read(name, most + 1)
+    if len(data) > most:
+        raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
+    return data
+
+
+def read_chunk(files: FilesToRead, name: str) -> bytes:
+    """Return the whole file of a chunk, which may be anything yet; raises as `read_map`."""
+    return _whole(files, name, _MOST_CHUNK_BYTES)
+
+
+def _decoded(data: bytes, kind: type[_T], name: str) -> _T:
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except _NOT_DECODED as error:
+        said = str(error) or type(error).__name__
+        raise MapDataError(f"it is damaged: {said}", path=name) from error
 
 
 def read_map(files: FilesToRead) -> MapRecord:
-    """What ``map.json`` says.
+    """Return what ``map.json`` says.
 
     Raises
     ------
@@ -135,14 +193,41 @@ def read_map(files: FilesToRead) -> MapRecord:
     OSError
         It cannot be read.
     """
-    try:
-        found = msgspec.json.decode(files.read(MAP_FILE), type=MapRecord)
-        bytes.fromhex(found.map_id)
-    except (msgspec.MsgspecError, ValueError, ConfigError) as error:
-        raise MapDataError(f"it does not say what the map is: {error}", path=MAP_FILE) from error
-    if found.format != MAP_FORMAT or len(found.map_id) != 32:
+    found = _decoded(_whole(files, MAP_FILE, _MOST_MAP_BYTES), MapRecord, MAP_FILE)
+    if found.format != MAP_FORMAT:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
+    numbers = [one.number for one in found.mappers]
+    least, most = _RESOLUTION_M
+    for is_so, what in (
+        (_MAP_ID.fullmatch(found.map_id), "map_id is not 32 hexadecimal digits"),
+        (least <= found.settings.resolution <= most, f"resolution {found.settings.resolution!r}"),
+        (0 < len(found.settings.frame_id.encode()) <= MOST_FRAME_BYTES, "frame_id is empty or too long"),
+        (len(numbers) <= MAPPERS, f"{len(numbers)} mappers; {MAPPERS} are the most"),
+        (len(set(numbers)) == len(numbers), "two mappers have one number"),
+        (max(numbers, default=0) < found.next_mapper, "a mapper has a number that was not given yet"),
+    ):
+        if not is_so:
+            raise MapDataError(f"it is damaged: {what}", path=MAP_FILE)
     return found
+
+
+def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, int]]:
+    """Return the chunks that the manifest lists, and up to which scan of each mapper all are durable.
+
+    Raises
+    ------
+    MapDataError
+        It is not what it should be.
+    OSError
+        It cannot be read; FileNotFoundError: there is none.
+    """
+    found = _decoded(_whole(files, MANIFEST, _MOST_MANIFEST_BYTES), Manifest, MANIFEST)
+    if found.format != MAP_FORMAT:
+        raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MANIFEST)
+    try:
+        return {ChunkKey.from_text(text): row for text, row in found.chunks.items()}, found.applied
+    except BadRequest as error:
+        raise MapDataError(f"it is damaged: {error.message}", path=MANIFEST) from error
 
 
 def write_rows(files: Files, rows: Mapping[ChunkKey, Row], applied: dict[int, int]) -> None:

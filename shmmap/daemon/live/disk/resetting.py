@@ -9,7 +9,7 @@ from itertools import count
 import msgspec
 
 from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, MAP_FILE
-from shmmap.daemon.live.folder import DAMAGED, INTERIM, Folder, FolderToRead
+from shmmap.daemon.live.folder import INTERIM, Folder, FolderToRead, is_aside
 from shmmap.formats.durable_file import flush_directory
 
 __all__ = ["ResetMap", "files_of_map", "reset"]
@@ -48,7 +48,7 @@ def files_of_map(files: FolderToRead) -> dict[str, int]:
 def _is_of_map(name: str) -> bool:
     if name.startswith(".") and name.endswith(INTERIM):
         return name.startswith((f".{MAP_FILE}.", f".{MANIFEST}.")) or f"{CHUNK}." in name
-    return name in {MAP_FILE, MANIFEST} or name.endswith(CHUNK) or CHUNK + DAMAGED in name
+    return name in {MAP_FILE, MANIFEST} or name.endswith(CHUNK) or is_aside(name)
 
 
 def reset(folder: Folder, *, delete: bool) -> ResetMap:

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, decode_chunk, read_file_header
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, read_map
-from shmmap.daemon.live.folder import DAMAGED, FilesToRead, Folder, FolderToRead
-from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
+from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, keys_of, read_chunk, read_map
+from shmmap.daemon.live.folder import FilesToRead, Folder, FolderToRead, is_aside
+from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 
 __all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]
 
@@ -51,7 +51,10 @@ class StoredMap:
         self.files = files
         self.path = path
         try:
-            record = read_map(files)
+            try:
+                record = read_map(files)
+            except OSError as error:
+                raise MapDataError(f"it cannot be read: {error.strerror}", path=MAP_FILE) from error
         except MapDataError as error:
             raise MapDataError(
                 error.message,
@@ -61,16 +64,8 @@ class StoredMap:
         self.map_id = bytes.fromhex(record.map_id)
         self.settings = record.settings
         self.names = sorted(files.names())
-        self.strange: list[str] = []
-        found: dict[ChunkKey, str] = {}
-        for name in self.names:
-            if name.endswith(CHUNK):
-                try:
-                    found[ChunkKey.from_text(name.removesuffix(CHUNK))] = name
-                except BadRequest:
-                    self.strange.append(name)
-        self.chunks = dict(sorted(found.items()))
-        self.aside = [name for name in self.names if CHUNK + DAMAGED in name]
+        self.chunks, self.strange = keys_of(self.names)
+        self.aside = [name for name in self.names if is_aside(name)]
 
     def header(self, key: ChunkKey) -> ChunkFileHeader:
         """What a file says of its chunk; raises as `chunk`."""
@@ -91,7 +86,7 @@ class StoredMap:
         """
         path = self.path_of(key)
         with _reading(path):
-            data = self.files.read(self.chunks[key])
+            data = read_chunk(self.files, self.chunks[key])
             view = ChunkView(decode_chunk(data, self.settings.identity(self.map_id, key, 0), path))
             return read_file_header(data), view
 

@@ -8,7 +8,9 @@ by it; afterwards every chunk knows that it has it.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.chunks.layout import MAPPERS
 from shmmap.daemon.live.map_files import MapFiles, Mapper
@@ -16,6 +18,9 @@ from shmmap.daemon.live.worker.applied_scans import AppliedScans
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 
 __all__ = ["ActiveMapper", "Mappers"]
+
+MOST_SCANS: Final = 1 << 61
+"""Numbers of scans are less: what ``map.json`` expects beyond them has to be a number, too."""
 
 
 @dataclass(eq=False, slots=True)
@@ -62,13 +67,14 @@ class Mappers:
         self._files = files
         self._record = record
         self._uses = 0
+        self._opening = threading.Lock()
         self.by_number: dict[int, ActiveMapper] = {}
         for one in files.mappers:
             last = max(record.of(one.number), files.applied.get(one.number, 0))
             self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
-        """Let a session map under a name; one that did before does not any more.
+        """Let a session map under a name; one that did before does not any more.  From any thread.
 
         Raises
         ------
@@ -77,20 +83,22 @@ class Mappers:
         OSError
             The disk does not take a new one.
         """
-        for active in self.by_number.values():
-            if (active.mapper.uid, active.mapper.name) == (uid, name):
-                break
-        else:
-            if len(self.by_number) >= MAPPERS:
-                self._forget_one()
-            mapper = self._files.add_mapper(uid, name)
-            active = self.by_number[mapper.number] = ActiveMapper(mapper)
-        # now, and not with the first scan: once it may map, it does, also on a disk that is full
-        self._files.expect_scan(active.mapper, self.next_scan(active))
-        active.session = session
-        self._uses += 1
-        active.used = self._uses
-        return active
+        with self._opening:
+            for active in self.by_number.values():
+                if (active.mapper.uid, active.mapper.name) == (uid, name):
+                    break
+            else:
+                if len(self.by_number) >= MAPPERS:
+                    self._forget_one()
+                mapper = self._files.add_mapper(uid, name)
+                active = ActiveMapper(mapper)
+                self.by_number = {**self.by_number, mapper.number: active}  # others go through it meanwhile
+            # now, and not with the first scan: once it may map, it does, also on a disk that is full
+            self._files.expect_scan(active.mapper, self.next_scan(active))
+            active.session = session
+            self._uses += 1
+            active.used = self._uses
+            return active
 
     def _forget_one(self) -> None:
         idle = [one for one in self.by_number.values() if not one.session and not one.unsaved]
@@ -101,7 +109,7 @@ class Mappers:
             )
         oldest = min(idle, key=lambda one: one.used)
         self._files.forget_mapper(oldest.mapper)
-        del self.by_number[oldest.mapper.number]
+        self.by_number = {number: one for number, one in self.by_number.items() if one is not oldest}
 
     def taken(self, active: ActiveMapper, scan: int) -> None:
         """A scan is on its way into the map; it may have come before."""
@@ -118,8 +126,13 @@ class Mappers:
         """The least number that a new scan may have: no earlier one, of any life, had it."""
         return max(active.last + 1, active.first)
 
+    def is_far(self, number: int, scan: int) -> bool:
+        """Whether the disk has to learn of a scan's number first."""
+        active = self.by_number.get(number)
+        return active is not None and active.mapper.scans <= scan < MOST_SCANS
+
     def expect(self, number: int, scan: int, session: int) -> ActiveMapper:
-        """Return whose scan this is, which is about to be taken in.
+        """Return whose scan this is, which is about to be taken in; waits for the disk if `is_far` says so.
 
         Raises
         ------
@@ -144,9 +157,11 @@ class Mappers:
             raise BadRequest(
                 f"another program maps as {active.mapper.name!r} now", hint="give each program its own name"
             )
-        if not 0 < scan < 1 << 63:
+        if not 0 < scan < MOST_SCANS:
             raise BadRequest(f"scan {scan}: numbers begin at 1 and rise")
-        self._files.expect_scan(active.mapper, scan)
+        if scan >= active.mapper.scans:
+            with self._opening:
+                self._files.expect_scan(active.mapper, scan)
         return active
 
     def left(self, session: int) -> None:

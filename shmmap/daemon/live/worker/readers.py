@@ -112,7 +112,7 @@ class Readers:
     def close(self) -> None:
         """Answer nothing more: nobody waits for a disk that readers asked for."""
         self.lists.is_closed = True
-        self._threads.stop()
+        self._threads.close(0.0)
 
     def begin(self, ask: Ask, message: messages.LiveChunks | messages.LiveVoxels) -> None:
         """Begin with a request, which is answered in later turns; raises `BadRequest`."""

@@ -7,14 +7,16 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, islice
 from typing import Final, Protocol, TypeVar
 
 import msgspec
 
 from shmmap.chunks.marks import decode_marks
-from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX
+from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_SENSOR
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.messages import MOST_OF_A_SESSION, Ask
@@ -22,7 +24,7 @@ from shmmap.daemon.live.paging.records import Chunk, Scan
 from shmmap.daemon.live.paging.windows import place_ahead
 from shmmap.daemon.live.worker.applied_scans import AppliedScans
 from shmmap.daemon.live.worker.changes import Changes
-from shmmap.daemon.live.worker.mappers import Mappers
+from shmmap.daemon.live.worker.mappers import ActiveMapper, Mappers
 from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
 from shmmap.daemon.live.worker.readers import Readers
 from shmmap.daemon.live.worker.voxel_lists import VoxelLists
@@ -88,6 +90,7 @@ class ServedMap:
         self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
         self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
         self._places: dict[int, _Place] = {}
+        self._writing: dict[int, int] = {}  # sessions by ticket whose requests wait for the disk
         durability, chunks = live.residency.durability, live.residency.chunks
         self._earlier = durability.missing(chunks.values())  # what an earlier life applied, and did not save
         self._scans = self._durable = 0
@@ -107,7 +110,7 @@ class ServedMap:
         if isinstance(message, messages.LiveScan | messages.LiveSave):
             _require_mapper(ask)
         if isinstance(message, messages.LiveOpen):
-            self._answer(ask.ticket, self._open(ask, message))
+            self._open(ask, message)
         elif isinstance(message, messages.LiveScan):
             self._scan(ask, message, now_s)
         elif isinstance(message, messages.LiveMove):
@@ -122,7 +125,7 @@ class ServedMap:
             self.readers.lists.release(ask.session, message.segment)
             self._answer(ask.ticket, messages.LiveReleased(message.request))
 
-    def _open(self, ask: Ask, message: messages.LiveOpen) -> messages.LiveOpened:
+    def _open(self, ask: Ask, message: messages.LiveOpen) -> None:
         live, fixed = self.live, self.live.files.settings
         if message.frame_id not in ("", fixed.frame_id):
             raise BadRequest(
@@ -136,26 +139,47 @@ class ServedMap:
             below, self.readers.lists.path, live.memory.prefix, ask.session,
             probabilities=msgspec.structs.astuple(fixed.occupancy),
         )  # fmt: skip
-        if message.mapper:
-            _require_mapper(ask)
-            active = self._on_disk(lambda: self.mappers.open(ask.uid, message.mapper, ask.session))
+        if not message.mapper:
+            self._answer(ask.ticket, reply)
+            return
+        _require_mapper(ask)
+
+        def opened(active: ActiveMapper) -> None:
             reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
             reply.applied = active.applied
             reply.marks_dir = self._marks.path
             reply.most_marks_bytes = min(MOST_MARKS_BYTES, live.limits.budget_bytes // MARKS_PART)
-        return reply
+            self._answer(ask.ticket, reply)
 
-    def _on_disk(self, work: Callable[[], _T]) -> _T:
-        try:
-            return work()
-        except OSError as error:
-            raise CannotWrite(
-                f"live map {self.settings.name}: its directory cannot be written: {error.strerror}",
-                hint=f"see to {self.settings.path}; what is in memory stays there",
-            ) from error
+        open_mapper = partial(self.mappers.open, ask.uid, message.mapper, ask.session)
+        self._on_disk(ask, message.request, open_mapper, opened)
+
+    def _on_disk(self, ask: Ask, request: int, work: Callable[[], _T], then: Callable[[_T], None]) -> None:
+        """Have something written first, by a file thread, for the directory may hang; answers a refusal."""
+        self._writing[ask.ticket] = ask.session
+
+        def written(future: Future[_T], now_s: float) -> None:
+            del now_s
+            if self._writing.pop(ask.ticket, None) is None:
+                self.mappers.left(ask.session)  # the session has ended meanwhile
+                return
+            try:
+                then(future.result())
+            except ShmmapError as error:
+                self._refuse(ask, request, error)
+            except OSError as error:
+                said = f"live map {self.settings.name}: its directory cannot be written: {error.strerror}"
+                hint = f"see to {self.settings.path}; what is in memory stays there"
+                self._refuse(ask, request, CannotWrite(said, hint=hint))
+
+        self.live.on_disk(work, written)
 
     def _scan(self, ask: Ask, message: messages.LiveScan, now_s: float) -> None:
-        active = self._on_disk(lambda: self.mappers.expect(message.mapper, message.scan, ask.session))
+        expect = partial(self.mappers.expect, message.mapper, message.scan, ask.session)
+        if self.mappers.is_far(message.mapper, message.scan):
+            self._on_disk(ask, message.request, expect, lambda _active: self._scan(ask, message, now_s))
+            return
+        active = expect()
         self._move(ask.session, message.sensor, now_s)
         on_its_way = self._tickets.get((active.mapper.number, message.scan))
         if on_its_way is not None:
@@ -196,7 +220,7 @@ class ServedMap:
 
     def _move(self, session: int, position: tuple[float, float, float], now_s: float) -> None:
         """A client is here, and will be further on: what is near both is brought into memory."""
-        reach = FURTHEST_INDEX * self.live.files.settings.resolution / 2
+        reach = FURTHEST_SENSOR * self.live.files.settings.resolution
         if not all(-reach < value < reach for value in position):
             raise BadRequest(f"position {position}: it is not finite, or too far away")
         self.live.move(session, position)
@@ -213,6 +237,7 @@ class ServedMap:
         for client in (session, (session, "ahead")):
             self.live.residency.leave(client)
         self._places.pop(session, None)
+        self._writing = {ticket: one for ticket, one in self._writing.items() if one != session}
         self.mappers.left(session)
         self.readers.left(session)
         self._waiting = deque(row for row in self._waiting if row[0].session != session)
@@ -326,10 +351,7 @@ class ServedMap:
         self.readers.lists.remove_all()
         unsaved = sum(chunk.version > chunk.saved for chunk in self.live.residency.chunks.values())
         if not keep and not unsaved:
-            try:
-                self.live.files.write_manifest(self._durable_scans())
-            except OSError as error:
-                log.warning("manifest not written", map=self.settings.name, reason=error.strerror)
+            self.live.finish(self._durable_scans())
             self.live.remove_from_memory()
         self.live.close()
         return unsaved

@@ -6,6 +6,8 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import re
+import socket
 from pathlib import Path
 
 import msgspec
@@ -485,3 +487,153 @@ def test_the_manifest_lists_what_is_durable() -> None:
     }
     disk.remove("0_0_0.chunk")
     assert list(MapFiles(disk, SETTINGS).missing) == [KEYS[0]]
+
+
+# --- whatever is in a file -----------------------------------------------------------------------
+
+
+def stored(disk: CutDisk) -> dict[str, object]:
+    """A map of a mapper and a chunk; what ``map.json`` says."""
+    made = MapFiles(disk, SETTINGS)
+    made.expect_scan(made.add_mapper(1000, "front"), 5)
+    made.save(KEYS[0], chunk(made, KEYS[0], 3))
+    made.write_manifest({1: 4})
+    said: dict[str, object] = msgspec.json.decode(disk.read("map.json"))
+    return said
+
+
+def put(disk: CutDisk, name: str, data: bytes) -> None:
+    disk.remove(name)
+    disk.write(name, data)
+
+
+MAPPER = {"number": 1, "uid": 0, "name": "a", "scans": 5}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"lives": -1}, {"lives": (1 << 31) - 1}, {"lives": 1 << 70}, {"lives": 1.5}, {"lives": "1"},
+        {"lives": None}, {"format": 0}, {"format": True}, {"map_id": "0" * 31 + "g"}, {"map_id": " " * 32},
+        {"map_id": "00" * 17}, {"next_mapper": 0}, {"next_mapper": 1}, {"next_mapper": -(1 << 63)},
+        {"mappers": {}}, {"mappers": [7]},
+        {"mappers": [MAPPER] * 2, "next_mapper": 9}, {"mappers": [{**MAPPER, "number": 0}]},
+        {"mappers": [{**MAPPER, "scans": -1}]}, {"mappers": [{**MAPPER, "scans": (1 << 63) - 1}]},
+        {"mappers": [{**MAPPER, "uid": -1}]}, {"mappers": [{**MAPPER, "name": None}]},
+        {"mappers": [{**MAPPER, "number": n} for n in range(1, 40)], "next_mapper": 99},
+        {"settings": None}, {"settings": {"resolution": 0.0}}, {"settings": {"resolution": 1e308}},
+        {"settings": {"resolution": -0.1}}, {"settings": {"frame_id": ""}},
+        {"settings": {"frame_id": "é" * 40}},
+        {"settings": {"occupancy": {"hit": 7.0}}}, {"settings": {"occupancy": {"hit": "x"}}},
+    ],
+)  # fmt: skip
+def test_a_map_file_that_cannot_be_is_damaged_and_stays(changes: dict[str, object]) -> None:
+    """Every error is one that names the file: none ends the process, and nothing is changed."""
+    disk = CutDisk()
+    said = {**stored(disk), **changes}
+    put(disk, "map.json", msgspec.json.encode(said))
+    before = {name: disk.read(name) for name in disk.names()}
+    with pytest.raises((MapDataError, ConfigError)):
+        MapFiles(disk, SETTINGS)
+    assert {name: disk.read(name) for name in disk.names()} == before
+
+
+ROW = '{"version":3,"bytes":9,"active":0,"occupied":0,"free":0,"bricks":0}'
+NO_MANIFEST = [
+    b"", b"\xff", b"[" * 100_000, b"{" * 100_000, b'{"a":' * 100_000, b"null", b'{"format":1}', b"\0" * 5000,
+    b'{"format":2,"chunks":{}}', b'{"format":1,"chunks":{"x":' + ROW.encode() + b"}}",
+    b'{"format":1,"chunks":{"0_0_0":' + ROW.replace("3", "-3").encode() + b"}}",
+    b'{"format":1,"chunks":{"0_0_0":' + ROW.replace("3", str(1 << 64)).encode() + b"}}",
+    b'{"format":1,"chunks":{"99999999999_0_0":' + ROW.encode() + b"}}",
+    b'{"format":1,"chunks":{"0_0_0":' + ROW.encode() + b'},"applied":{"1":-4}}',
+    b'{"format":1,"chunks":{"0_0_0\xe9":' + ROW.encode() + b"}}",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", NO_MANIFEST, ids=range(len(NO_MANIFEST)))
+def test_a_manifest_that_cannot_be_is_quarantined_and_written_again(text: bytes) -> None:
+    disk = CutDisk()
+    stored(disk)
+    put(disk, "manifest.json", text)
+    again = MapFiles(disk, SETTINGS)
+    assert list(again.damaged) == ["manifest.json.damaged.1"]
+    assert disk.read("manifest.json.damaged.1") == text
+    assert (list(again.rows), again.missing) == ([KEYS[0]], {})
+    again.write_manifest()
+    assert not MapFiles(disk, SETTINGS).damaged
+
+
+def test_any_bit_of_any_file_may_flip() -> None:
+    """The map opens or says what is damaged; of chunks that are good none is lost."""
+    rng = random.Random(3)
+    for _ in range(400):
+        disk = CutDisk()
+        stored(disk)
+        name = rng.choice(["map.json", "manifest.json", "0_0_0.chunk"])
+        data = bytearray(disk.read(name))
+        at = rng.randrange(len(data) * 8)
+        data[at // 8] ^= 1 << at % 8
+        put(disk, name, bytes(data))
+        try:
+            again = MapFiles(disk, SETTINGS)
+        except (MapDataError, ConfigError):
+            assert name == "map.json"
+            continue
+        assert KEYS[0] in again.rows or name != "manifest.json"
+        assert again.begin_life() < 1 << 31
+        assert len(again.applied) <= 1
+
+
+def test_what_a_manifest_says_of_scans_that_nobody_sent_does_not_count() -> None:
+    disk = CutDisk()
+    stored(disk)
+    MapFiles(disk, SETTINGS).write_manifest({1: SCANS_AHEAD + 7, 9: 3})
+    assert MapFiles(disk, SETTINGS).applied == {}
+
+
+@pytest.mark.parametrize("name", ["map.json", "manifest.json", "0_0_0.chunk", ".chunk.ab.tmp"])
+def test_a_file_of_a_tebibyte_is_not_read(tmp_path: Path, name: str) -> None:
+    folder = Folder(tmp_path)
+    made = MapFiles(folder, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 3))
+    made.write_manifest()
+    (tmp_path / name).touch()
+    os.truncate(tmp_path / name, 1 << 40)
+    if name == "map.json":
+        with pytest.raises(MapDataError, match="more than 1,048,576 bytes"):
+            MapFiles(folder, SETTINGS)
+    else:
+        again = MapFiles(folder, SETTINGS)
+        assert list(again.damaged) == ([] if name.endswith(".tmp") else [f"{name}.damaged.1"])
+    folder.close()
+
+
+@pytest.mark.parametrize("name", ["map.json", "manifest.json", "0_0_0.chunk", ".chunk.ab.tmp"])
+@pytest.mark.parametrize("kind", ["directory", "pipe", "loop", "socket"])
+def test_what_is_no_regular_file_keeps_the_map_closed(tmp_path: Path, name: str, kind: str) -> None:
+    """It may hide a good file: nothing is changed until it is gone."""
+    folder = Folder(tmp_path)
+    made = MapFiles(folder, SETTINGS)
+    made.save(KEYS[0], chunk(made, KEYS[0], 3))
+    made.write_manifest()
+    path = tmp_path / name
+    if path.exists():
+        path.rename(tmp_path / "kept")
+    if kind == "directory":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "loop":
+        path.symlink_to(path)
+    else:
+        with socket.socket(socket.AF_UNIX) as one:
+            one.bind(f"/proc/self/fd/{folder._fd}/{name}")
+    before = sorted(os.listdir(tmp_path))
+    with pytest.raises(OSError, match=f"{re.escape(name)} cannot be read: "):
+        MapFiles(folder, SETTINGS)
+    assert sorted(os.listdir(tmp_path)) == before
+    path.rmdir() if kind == "directory" else path.unlink()
+    if (tmp_path / "kept").exists():
+        (tmp_path / "kept").rename(path)
+    assert list(MapFiles(folder, SETTINGS).rows) == [KEYS[0]]
+    folder.close()

@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.host.budget import choose_budget
 from shmmap.daemon.host.mounts import Mount
 from shmmap.daemon.live import place
 from shmmap.daemon.live.messages import Begin
-from shmmap.daemon.live.place import CEILING_BYTES, place_live_maps
+from shmmap.daemon.live.place import CEILING_BYTES, bytes_beside_cells, place_live_maps
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
@@ -143,6 +144,42 @@ def test_the_innermost_and_last_mount_counts(cells: ShmDirectory, monkeypatch: p
     mounted(monkeypatch)
     assert placed(cells).shm_dir == cells.path
     os.rmdir(below)
+
+
+@pytest.mark.parametrize(
+    ("maps", "cells_asked", "live_asked", "fits"),
+    [
+        (1, 0, 0, True), (3, 0, 0, True), (1, 0, 32 * MIB, True), (1, 40 * MIB, 0, True),
+        (1, 40 * MIB, 16 * MIB, True),
+        (1, 62 * MIB, 0, False), (1, 40 * MIB, 32 * MIB, False), (16, 0, 0, False), (1, 0, 63 * MIB, False),
+    ],
+)  # fmt: skip
+def test_a_small_shm_is_shared_by_default_and_refused_where_it_was_set(
+    cells: ShmDirectory,
+    monkeypatch: pytest.MonkeyPatch,
+    maps: int,
+    cells_asked: int,
+    live_asked: int,
+    fits: bool,
+) -> None:
+    """Docker's /dev/shm has 64 MiB: the default budgets make room for each other."""
+    monkeypatch.setattr(ShmDirectory, "size_bytes", lambda _self: 64 * MIB)
+    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 64 * MIB)
+    names = [f"m{number}" for number in range(maps)]
+
+    def budgets() -> tuple[int, int]:
+        beside = bytes_beside_cells(maps, cells=cells, shm_dir="", budget_bytes=live_asked)
+        of_cells = choose_budget(cells_asked, cells, beside_bytes=beside)
+        return of_cells, placed(cells, *names, cells_budget=of_cells, budget=live_asked).budget_bytes
+
+    if not fits:
+        with pytest.raises((ConfigError, CannotStart)):
+            budgets()
+        return
+    of_cells, of_live = budgets()
+    assert of_cells + of_live <= 64 * MIB
+    assert of_cells == (cells_asked or of_cells)
+    assert of_live == (live_asked or 4 * MIB * maps)
 
 
 def test_a_directory_of_its_own(cells: ShmDirectory) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import pytest
 
 from shmmap.daemon.config_live import LiveSettings
@@ -23,10 +24,10 @@ from shmmap.daemon.live.relay import (
 )
 from shmmap.daemon.live.tickets import REFUSED_AT_ONCE
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
-from shmmap.errors import BadRequest, Busy, CannotStart, ConfigError, LiveInterrupted
+from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import channel
-from shmmap.protocol.codec import encode
+from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.live import LiveList, LiveListed, LiveMove
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ class World:
         """Another worker that has all maps in memory."""
         self.relay.start()
         assert isinstance(self.heard()[0], messages.Begin)
-        self.say(messages.Begun(0))
+        self.say(messages.Begun(1, 0))
 
     def heard(self) -> list[Any]:
         """What the worker is told."""
@@ -220,28 +221,64 @@ def test_one_that_dies_again_and_again_is_not_started_all_the_time(world: World)
         world.relay.beat(world.now_s)
         assert len(world.workers) == number + 2
         if number % 2:
-            world.say(messages.Begun(0))
-    world.say(messages.Begun(0))
+            world.say(messages.Begun(1, 0))
+    world.say(messages.Begun(1, 0))
     world.now_s += IN_ORDER_S
     world.die()
     world.relay.beat(world.now_s)
     assert len(world.workers) == len(PAUSES_S) + 3, "it had been in order"
 
 
-def test_what_keeps_maps_from_memory_is_what_keeps_the_daemon_from_starting(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.fixture
+def starting(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    """A relay whose worker has begun and said nothing yet."""
+    one = World(monkeypatch)
+    one.relay.start()
+    yield one
+    one.relay._forget()
+    for worker in one.workers:
+        worker.close()
+    one.watched.close()
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_settings_refuse_the_start_where_there_is_nothing_else_to_serve(
+    starting: World, *, alone: bool
 ) -> None:
-    world = World(monkeypatch)
-    world.relay.start()
-    world.workers[-1].send(messages.encode(messages.Failed("bad_config", "resolution = 0.5", "leave it")))
+    starting.workers[-1].send(
+        messages.encode(messages.Begun(0, 0, "bad_config", "resolution = 0.5", "leave it"))
+    )
+    if not alone:
+        starting.relay.wait_until_serving(60.0, alone=False)
+        return
     with pytest.raises(ConfigError, match=r"resolution = 0\.5"):
-        world.relay.wait_until_serving()
-    world.relay._forget()
-    world.workers[-1].close()
-    world.watched.close()
+        starting.relay.wait_until_serving(60.0, alone=True)
+
+
+def test_a_worker_that_says_nothing_keeps_nobody_waiting(
+    starting: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Points are served; each map is shown with the problem, and clients are asked to come again."""
+
+    def wait(seconds: float) -> None:
+        starting.now_s += seconds
+
+    monkeypatch.setattr(starting.relay, "_wait", wait)
+    starting.relay.wait_until_serving(2.0, alone=False)
+    asker = Asker(1)
+    with pytest.raises(LiveInterrupted, match="is being started"):
+        starting.ask(asker)
+    starting.relay.ask(asker, LiveList(7), b"", 0.0)  # type: ignore[arg-type]
+    (listed,) = asker.answered
+    reply = decode_reply(listed)
+    assert isinstance(reply, LiveListed)
+    assert [(row.name, "is being started" in row.problem) for row in reply.maps] == [("lidar", True)]
+    starting.say(messages.Begun(1, 0))
+    starting.ask(asker)
 
 
 def test_workers_that_die_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are not what points wait for."""
     world = World(monkeypatch)
     start = world._start
 
@@ -252,20 +289,37 @@ def test_workers_that_die_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(relay, "start_child", dead)
     world.relay.start()
-    with pytest.raises(CannotStart, match="did not begin"):
-        world.relay.wait_until_serving()
+    world.relay.wait_until_serving(60.0, alone=False)
     assert len(world.workers) == relay.STARTS + 1
+    with pytest.raises(LiveInterrupted):
+        world.ask(Asker(1))
     world.watched.close()
 
 
 @pytest.mark.parametrize("unsaved", [0, 3])
 def test_the_end(world: World, caplog: pytest.LogCaptureFixture, unsaved: int) -> None:
-    world.workers[-1].send(messages.encode(messages.Ended(unsaved)))
+    left = (messages.Unsaved("lidar", 3, "not saved: No space left on device"),) if unsaved else ()
+    world.workers[-1].send(messages.encode(messages.Ended(left)))
     world.workers[-1].shutdown(socket.SHUT_WR)
     world.relay.close(keep=False)
     assert world.heard() == [messages.End(False)]
-    assert ("chunks not saved stay in memory chunks=3" in caplog.text) == (unsaved > 0)
+    assert ("stay in memory for the next start map=lidar chunks=3" in caplog.text) == (unsaved > 0)
+    assert ("No space left" in caplog.text) == (unsaved > 0)
+    assert world.relay.unsaved == ({"lidar": 3} if unsaved else {})
     world.relay.close(keep=False)
+
+
+def test_a_worker_that_does_not_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is ended; what it had not saved by its last word counts as not saved."""
+
+    def wait(seconds: float) -> None:
+        world.now_s += seconds
+
+    monkeypatch.setattr(world.relay, "_wait", wait)
+    row = msgspec.structs.replace(messages.not_served(BEGIN.maps[0], 1, ""), dirty=4, saving=1)
+    world.say(messages.Status((row,)))
+    world.relay.close(keep=False)
+    assert world.relay.unsaved == {"lidar": 5}
 
 
 def test_where_there_are_no_live_maps() -> None:

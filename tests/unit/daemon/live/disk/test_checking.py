@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import random
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -228,20 +229,56 @@ def test_the_manifest(tmp_path: Path, change: Callable[[Path], None], manifest: 
     assert checked(tmp_path).good
 
 
-def test_a_file_that_cannot_be_opened_is_not_taken_for_a_damaged_one(tmp_path: Path) -> None:
-    """It may be as good as ever: it stays, and the manifest that lists it."""
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def folder_with_something(path: Path) -> None:
+    path.mkdir()
+    (path / "mine").write_text("kept")
+
+
+def loop(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def device(path: Path) -> None:
+    os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))  # /dev/zero
+
+
+@pytest.mark.parametrize("what", [".chunk", "manifest.json", ".chunk.abcd.tmp"])
+@pytest.mark.parametrize("kind", [pipe, folder_with_something, loop, device])
+def test_what_cannot_be_read_is_quarantined(tmp_path: Path, what: str, kind: Callable[[Path], None]) -> None:
+    """It may be as good as ever: a check changes nothing, and a repair gives it another name."""
+    if kind is device and os.geteuid():
+        pytest.skip("needs root")
     stored_drive(tmp_path)
-    path = largest(tmp_path)
-    path.rename(tmp_path / "elsewhere")
-    path.symlink_to("elsewhere")
-    before = (tmp_path / "manifest.json").read_bytes()
+    path = largest(tmp_path) if what == ".chunk" else tmp_path / what
+    if path.exists():
+        path.rename(tmp_path / "elsewhere")
+    kind(path)
+    with opened_folder_to_read(str(tmp_path)) as files:
+        found = check(files, str(tmp_path))
+    if what == "manifest.json":
+        assert found.manifest == "unreadable"
+    else:
+        assert list(found.unreadable) == [path.name]
+    assert (found.good, path.lstat().st_size) == (False, path.lstat().st_size)
     found = repaired(tmp_path)
-    assert list(found.unreadable) == [path.name]
-    assert not found.good
-    assert [*found.damaged, *found.missing] == []
-    assert not found.rewritten
-    assert path.is_symlink()
-    assert (tmp_path / "manifest.json").read_bytes() == before
+    (quarantined,) = found.damaged
+    assert (quarantined.file, quarantined.kept_as) == (path.name, f"{path.name}.damaged.1")
+    assert (tmp_path / quarantined.kept_as).lstat()
+    assert not path.exists() or what == "manifest.json"
+    assert found.rewritten == (what != ".chunk.abcd.tmp")
+    again = checked_as_it_is(tmp_path)
+    assert (again.good, again.manifest, again.aside) == (True, "current", [quarantined.kept_as])
+    with opened_folder(str(tmp_path), "") as folder:
+        MapFiles(folder, SETTINGS)
+
+
+def checked_as_it_is(directory: Path) -> CheckedMap:
+    with opened_folder_to_read(str(directory)) as files:
+        return check(files, str(directory))
 
 
 def test_what_is_only_there_to_be_written_over_is_not_told(tmp_path: Path) -> None:

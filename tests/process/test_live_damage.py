@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever is wrong with a live map's files is that map's problem, by name, until it is mended.
+
+Points are served, and so are other live maps; the daemon ends when it is asked to.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import stat
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.errors import BadRequest, CannotWrite, LiveInterrupted
+from shmmap.protocol.live import LiveMapRow
+from tests.process.conftest import DaemonFactory
+from tests.support.divided_map import DividedMap
+from tests.support.doctor_verb import doctor
+from tests.support.hanging_directory import HangingDirectory
+from tests.support.live_daemon import SETTINGS, LiveDaemon
+from tests.support.live_drive import FILTER, RESOLUTION, drive
+from tests.support.live_reference import held, reference
+from tests.support.patience import Patience
+from tests.support.slow_occupancy import Voxel
+from tests.support.stored_live_map import stored_drive
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What is done to the directory of a map, and how that is mended."""
+
+    name: str
+    says: str
+    do: Callable[[Path], object]
+    mend: Callable[[Path], object]
+    needs_root: bool = False
+
+
+def largest(directory: Path) -> Path:
+    return max(directory.glob("*.chunk"), key=lambda path: path.lstat().st_size)
+
+
+def instead_of_a_chunk(name: str, says: str, make: Callable[[Path], None], *, root: bool = False) -> Damage:
+    """Something else has the name of a chunk."""
+
+    def do(directory: Path) -> None:
+        path = largest(directory)
+        path.rename(directory.parent / f"{directory.name}.{path.name}")
+        make(path)
+
+    def mend(directory: Path) -> None:
+        (kept,) = directory.parent.glob(f"{directory.name}.*.chunk")
+        path = directory / kept.name.removeprefix(f"{directory.name}.")
+        path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+        kept.rename(path)
+
+    return Damage(name, says, do, mend, root)
+
+
+def in_a_file(name: str, file: str, says: str, change: Callable[[bytes], bytes]) -> Damage:
+    """A file says something else; it is put back from a copy."""
+
+    def do(directory: Path) -> None:
+        shutil.copy(directory / file, directory.parent / f"{name}.{file}")
+        (directory / file).write_bytes(change((directory / file).read_bytes()))
+
+    return Damage(
+        name, says, do, lambda directory: shutil.copy(directory.parent / f"{name}.{file}", directory / file)
+    )
+
+
+def with_value(**values: object) -> Callable[[bytes], bytes]:
+    """``map.json`` with other values."""
+    return lambda data: json.dumps({**json.loads(data), **values}).encode()
+
+
+def sparse(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)
+
+
+def sparse_map(directory: Path) -> None:
+    (directory / "map.json").rename(directory.parent / "sparse.map.json")
+    sparse(directory / "map.json")
+
+
+def a_file_instead(directory: Path) -> None:
+    directory.rename(f"{directory}.away")
+    directory.touch()
+
+
+def the_directory_again(directory: Path) -> None:
+    directory.unlink()
+    Path(f"{directory}.away").rename(directory)
+
+
+DEVICE = stat.S_IFCHR | 0o600
+DAMAGES = [
+    instead_of_a_chunk("directory", "it is a directory", lambda path: path.mkdir()),
+    instead_of_a_chunk("pipe", "it is a pipe", os.mkfifo),
+    instead_of_a_chunk("loop", "it is a symbolic link", lambda path: path.symlink_to(path.name)),
+    instead_of_a_chunk("zeros", "a device", lambda path: os.mknod(path, DEVICE, os.makedev(1, 5)), root=True),
+    in_a_file("negative", "map.json", "damaged", with_value(lives=-7)),
+    in_a_file("future", "map.json", "damaged", with_value(lives=1 << 62)),
+    in_a_file("wrong_type", "map.json", "damaged", with_value(mappers=7)),
+    in_a_file("deep", "map.json", "damaged", lambda _data: b"[" * 200_000),
+    in_a_file("bit", "map.json", "damaged", lambda data: data[:9] + bytes([data[9] | 128]) + data[10:]),
+    in_a_file("two", "map.json", "two mappers have one number", with_value(
+        next_mapper=9, mappers=[{"number": 3, "uid": 0, "name": name} for name in "ab"]
+    )),
+    in_a_file("other", "map.json", "was made with", lambda data: data.replace(b"0.2", b"0.3")),
+    Damage(
+        "sparse", "more than", sparse_map,
+        lambda path: (path.parent / "sparse.map.json").replace(path / "map.json"),
+    ),
+    Damage("file", "Not a directory", a_file_instead, the_directory_again),
+    Damage(
+        "closed", "Permission denied", lambda path: os.chmod(largest(path), 0),
+        lambda path: os.chmod(largest(path), 0o600),
+    ),
+]  # fmt: skip
+
+
+def settings(tmp_path: Path, *names: str) -> Path:
+    """A settings file with these live maps, each in the directory of its name."""
+    file = tmp_path / "shmmap.toml"
+    file.write_text(
+        "".join(
+            SETTINGS.format(resolution=RESOLUTION, checkpoint=0.2, path=tmp_path / name).replace(
+                "lidar]", f"{name}]"
+            )
+            for name in names
+        )
+    )
+    return file
+
+
+def rows(client: shmmap.Client) -> dict[str, LiveMapRow]:
+    return {row.name: row for row in client.live_maps()}
+
+
+def until_problems(client: shmmap.Client, names: set[str]) -> dict[str, LiveMapRow]:
+    """Ask until these maps have problems, and no others."""
+    waiting, found = Patience(), rows(client)
+    while waiting({name for name, row in found.items() if row.problem} != names):
+        found = rows(client)
+    return found
+
+
+def points_are_served(client: shmmap.Client) -> bool:
+    return bool(client.area(shmmap.Circle(0.0, 0.0, 10.0), wait=30.0).complete)
+
+
+def test_each_damage_is_one_map_s_problem_until_it_is_mended(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    damages = [one for one in DAMAGES if os.geteuid() == 0 or not one.needs_root]
+    if os.geteuid() == 0:
+        damages = [one for one in damages if one.name != "closed"]  # root may read it all the same
+    names = [one.name for one in damages]
+    voxels: dict[Voxel, int] = stored_drive(tmp_path / "good", 2)
+    for one in damages:
+        shutil.copytree(tmp_path / "good", tmp_path / one.name)
+        one.do(tmp_path / one.name)
+    served = daemon(
+        divided_map.root, "--config", str(settings(tmp_path, "good", *names)), "--live-budget", "64M"
+    )
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        assert points_are_served(client)
+        found = until_problems(client, set(names))
+        for one in damages:
+            assert one.says in found[one.name].problem
+        assert held(client.live("good")) == voxels
+        said = pytest.raises(LiveInterrupted, match=r"live map pipe: .* it is a pipe")
+        with shmmap.connect(served.endpoint, timeout=0.2) as hasty, said:
+            hasty.live("pipe")
+        finding = doctor(served)[1]["live maps"]
+        assert (finding["state"], "pipe: it cannot be opened" in finding["fact"]) == ("fail", True), finding
+        assert all(served.log.count(f"live map not open map={name} ") == 1 for name in names), "once each"
+        for one in damages:
+            one.mend(tmp_path / one.name)
+        until_problems(client, set())
+        for name in names:
+            assert held(client.live(name)) == voxels, name
+    assert served.stop() == 0
+
+
+@pytest.fixture
+def hang() -> Iterator[Callable[[Path], HangingDirectory]]:
+    """Have directories hang."""
+    hanging: list[HangingDirectory] = []
+
+    def make(path: Path) -> HangingDirectory:
+        try:
+            hanging.append(HangingDirectory(path))
+        except OSError as error:
+            pytest.skip(f"cannot mount a file system that hangs: {error.strerror}")
+        return hanging[-1]
+
+    yield make
+    for one in hanging:
+        one.end()
+
+
+@pytest.mark.root
+def test_a_directory_that_hangs_keeps_nobody_waiting(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, hang: Callable[[Path], HangingDirectory]
+) -> None:
+    """From the start on: points and other maps are served, the daemon ends, and it comes back by itself."""
+    voxels = stored_drive(tmp_path / "good", 2)
+    shutil.copytree(tmp_path / "good", tmp_path / "away")
+    hanging = hang(tmp_path / "away")
+    served = daemon(
+        divided_map.root, "--config", str(settings(tmp_path, "away", "good")), "--live-budget", "16M"
+    )
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        assert points_are_served(client)
+        assert "is" in until_problems(client, {"away"})["away"].problem
+        assert held(client.live("good")) == voxels
+    assert served.stop() == 0
+    served.start()
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        until_problems(client, {"away"})
+        hanging.end()
+        until_problems(client, set())
+        assert held(client.live("away")) == voxels
+    assert served.stop() == 0
+
+
+@pytest.mark.root
+def test_a_directory_that_begins_to_hang(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, hang: Callable[[Path], HangingDirectory]
+) -> None:
+    """While it maps: that map says so, others go on, and what is not saved is named at the end."""
+    served = daemon(
+        divided_map.root, "--config", str(settings(tmp_path, "lidar", "good")), "--live-budget", "16M"
+    )
+    scans = drive(3)
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        until_problems(client, set())
+        with client.live("lidar").mapper("front", FILTER) as mapper:
+            mapper.add(*scans[0])
+            mapper.wait_durable()
+        hang(tmp_path / "lidar")
+        waiting = Patience()
+        while waiting("its directory" not in rows(client)["lidar"].problem):
+            pass
+        with client.live("good").mapper("front", FILTER) as mapper:
+            for points, pose in scans:
+                mapper.add(points, pose)
+            mapper.wait_durable()
+        assert points_are_served(client)
+    assert served.stop() == 0
+
+
+@pytest.mark.root
+def test_a_full_disk_at_the_start_and_at_the_end(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, private_tmpfs: Callable[[str], str]
+) -> None:
+    """The map is opened when there is room; what is not saved at the end is named, and there afterwards."""
+    disk, scans = Path(private_tmpfs("64k")), drive()
+    filler = disk / "filler"
+    filler.write_bytes(bytes((64 << 10) - os.sysconf("SC_PAGESIZE")))
+    with contextlib.suppress(OSError), filler.open("ab") as file:
+        file.write(bytes(1 << 20))
+    (tmp_path / "full").symlink_to(disk)
+    served = daemon(divided_map.root, "--config", str(settings(tmp_path, "full")), "--live-budget", "16M")
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        assert points_are_served(client)
+        waiting = Patience()
+        while waiting("No space left" not in rows(client)["full"].problem):
+            pass
+        filler.unlink()
+        until_problems(client, set())
+        with client.live("full").mapper("front", FILTER) as mapper:
+            for points, pose in scans:
+                mapper.add(points, pose)
+            mapper.wait_applied()
+        waiting = Patience()
+        while waiting("cannot be saved: No space left" not in rows(client)["full"].problem):
+            pass
+    assert served.stop() == CannotWrite.exit_code
+    assert "live map not saved: its chunks stay in memory for the next start map=full" in served.log
+    subprocess.run(["mount", "-o", "remount,size=16m", str(disk)], check=True)
+    served.start()
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        assert held(client.live("full")) == reference(scans)
+    assert served.stop() == 0
+
+
+def test_a_directory_that_is_moved_or_replaced(live_daemon: LiveDaemon, tmp_path: Path) -> None:
+    one = live_daemon()
+    scans, away = drive(3), tmp_path / "away"
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            mapper.add(*scans[0])
+            mapper.wait_durable()
+            (tmp_path / "lidar").rename(away)
+            assert "moved or removed" in until_problems(client, {"lidar"})["lidar"].problem
+            (tmp_path / "lidar").mkdir()
+            waiting = Patience()
+            while waiting("another one is in its place" not in rows(client)["lidar"].problem):
+                pass
+            mapper.add(*scans[1])
+            mapper.wait_durable()
+            assert not list((tmp_path / "lidar").iterdir()), "never a mixture of two maps"
+            (tmp_path / "lidar").rmdir()
+            away.rename(tmp_path / "lidar")
+            until_problems(client, set())
+        assert held(live, "disk") == reference(scans[:2])
+
+
+def test_arguments_that_make_no_sense_end_no_mapper(live_daemon: LiveDaemon) -> None:
+    """Each is refused before anything is sent, with an error of ours; the mapper and the reader live on."""
+    one, scans = live_daemon(), drive(2)
+    nan, nothing = float("nan"), cast("Any", None)
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            mapper.add(*scans[0])
+            reach = 2**29 * RESOLUTION
+            for axis, metres in ((0, reach), (1, -reach), (2, 1.9 * reach), (0, 1e300)):
+                pose = scans[1][1].copy()
+                pose[axis, 3] = metres
+                with pytest.raises(BadRequest, match="pose"):
+                    mapper.add(scans[1][0], pose)
+            refused: list[Callable[[], object]] = [
+                lambda: mapper.add(scans[1][0], nothing), lambda: mapper.add(nothing, scans[1][1]),
+                lambda: mapper.wait_applied(nan), lambda: mapper.wait_durable(nan),
+                lambda: mapper.wait_applied(-1),
+                lambda: mapper.wait_durable(cast("Any", "soon")),
+                lambda: live.mapper("rear", timeout_s=nan), lambda: live.save(timeout_s=nan),
+                lambda: live.move_to(nan, 0.0, 0.0), lambda: live.move_to(nothing, 0.0, 0.0),
+                lambda: live.move_to(reach, 0.0, 0.0), lambda: live.log_odds(nothing),
+                lambda: live.log_odds([[nan] * 3]), lambda: live.log_odds([1.0, 2.0]),
+                lambda: live.first_hits([0.0, 0.0, 0.0], [1e5, 0.0, 0.0]),
+                lambda: live.first_hits([0.0, 0.0, 0.0], [nan, 0.0, 0.0]),
+                lambda: live.first_hits(np.zeros((2, 3)), np.ones((3, 3))),
+                lambda: live.first_hits(np.ma.MaskedArray(np.zeros((1, 3)), True), [1.0, 0.0, 0.0]),
+            ]  # fmt: skip
+            for call in refused:
+                with pytest.raises(BadRequest):
+                    call()
+            assert mapper.add(*(array.tolist() for array in scans[1])) == 2
+            mapper.wait_applied()
+        assert held(live) == reference(scans)
+        assert live.first_hits([0.0, 0.0, 0.0], [10_000.0, 0.0, 0.0]).shape == (1,)
+
+
+@pytest.mark.root
+def test_a_mapper_that_met_a_full_tmpfs_goes_on_when_there_is_room(
+    live_daemon: LiveDaemon, private_tmpfs: Callable[[str], str]
+) -> None:
+    """Scans that were taken are sent until they are in the map; one that was not may be added again."""
+    scans, shm = drive(5), Path(private_tmpfs("48m"))
+    one = live_daemon("--live-shm-dir", str(shm))
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER, timeout_s=0.3) as mapper:
+            mapper.add(*scans[0])
+            waiting = Patience()
+            while waiting(mapper.applied < 1):
+                pass
+            filler = shm / "filler"
+            with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+                while file.write(bytes(1 << 16)):
+                    pass
+            taken: list[int] = []
+
+            def add_all() -> None:
+                for points, pose in scans[1:]:
+                    taken.append(mapper.add(points, pose))
+
+            with pytest.raises(LiveInterrupted, match="No space left"):
+                add_all()
+            with pytest.raises(LiveInterrupted, match="No space left"):
+                mapper.wait_applied()
+            filler.unlink()
+            while waiting(mapper.applied < len(taken) + 1):
+                pass
+            assert mapper.add(*scans[4]) == len(taken) + 2
+            while waiting(mapper.applied < len(taken) + 2):
+                pass
+        assert held(live) == reference([*scans[: len(taken) + 1], scans[4]])

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`shmmap doctor` for one daemon."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+from tests.support.daemon_process import ROOT, DaemonProcess
+
+__all__ = ["doctor"]
+
+
+def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
+    """Exit code, and the findings by name."""
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "shmmap.cli", "doctor", "--json", "--instance", one.instance,
+            "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir, *words,
+        ],
+        env={**{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.stdout, done.stderr
+    told = json.loads(done.stdout)
+    found = {finding["name"]: finding for finding in told["findings"]}
+    states = [finding["state"] for finding in told["findings"]]
+    assert told["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
+    return done.returncode, found
