@@ -277,7 +277,7 @@ class LiveMapper:
         if len(data) > opened.most_marks_bytes:
             raise BadRequest(
                 f"the scan's marks have {len(data)} bytes; {opened.most_marks_bytes} are the most",
-                hint="lower max_range, or make the map with larger voxels",
+                hint="lower max_range, make the map with larger voxels, or raise --live-budget",
             )
         x, y, z = (float(value) for value in np.asarray(pose, np.float64)[:3, 3])
         self._sender.put(_Marked(number, data, (x, y, z)))

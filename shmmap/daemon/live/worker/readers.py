@@ -110,8 +110,9 @@ class Readers:
         self.lists.left(session)
 
     def close(self) -> None:
-        """Wait a moment for what is in threads."""
-        self._threads.close()
+        """Answer nothing more: nobody waits for a disk that readers asked for."""
+        self.lists.is_closed = True
+        self._threads.close(0.0)
 
     def begin(self, ask: Ask, message: messages.LiveChunks | messages.LiveVoxels) -> None:
         """Begin with a request, which is answered in later turns; raises `BadRequest`."""

@@ -84,6 +84,11 @@ class VoxelLists:
         The map.
     path, mode, gid
         Directory of the lists, and who may read them.
+
+    Attributes
+    ----------
+    is_closed
+        Threads read no further file.
     """
 
     live: LiveMap
@@ -93,6 +98,7 @@ class VoxelLists:
     _lists: dict[int, deque[_List]] = field(default_factory=dict)
     _making: int = 0
     _asked: dict[int, int] = field(default_factory=dict)
+    is_closed: bool = False
 
     @property
     def nbytes(self) -> int:
@@ -175,11 +181,13 @@ class VoxelLists:
         """Voxels of chunks as they were last saved; done by a thread."""
         found = []
         for key in keys:
+            if self.is_closed:
+                break
             try:
                 data = self.live.files.load(key)
                 if data is not None:
                     found.append(pick(ChunkView(decode_chunk(data, self.live.identity(key, 0), key.text))))
-            except (FileNotFoundError, MapDataError):  # noqa: PERF203  it is put aside when it is loaded
+            except (FileNotFoundError, MapDataError):
                 continue
             except OSError as error:
                 raise MapDataError(

@@ -39,10 +39,10 @@ def take(marks: MarksDirectory, name: str = MINE, nbytes: int = len(CONTENT)) ->
     return marks.take(name, nbytes, SESSION, os.geteuid())
 
 
-def test_a_file_is_copied(marks: MarksDirectory, path: Path) -> None:
+def test_a_file_is_taken(marks: MarksDirectory, path: Path) -> None:
     (path / MINE).write_bytes(CONTENT)
     assert take(marks) == CONTENT
-    assert (path / MINE).exists(), "it is its mapper's to remove: the same scan may be sent again"
+    assert not (path / MINE).exists(), "its memory is free for chunks"
 
 
 @pytest.mark.parametrize(

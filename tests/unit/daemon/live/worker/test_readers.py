@@ -285,6 +285,31 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
     assert left not in served.answers
 
 
+def test_the_end_waits_for_no_reader_s_files(served: Served) -> None:
+    """Of so many that were asked for, at most those that are being read just now are read."""
+    for x in range(100):
+        on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
+    begun, goes_on, read = threading.Event(), threading.Event(), []
+
+    def slow(key: ChunkKey) -> None:
+        read.append(key)
+        begun.set()
+        goes_on.wait()
+
+    served.live.files.load = slow  # type: ignore[method-assign, assignment]
+    try:
+        for session in range(1, 9):
+            served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk"), session)
+        while not begun.is_set():
+            served.turn()
+        served.map.readers.close()
+    finally:
+        goes_on.set()
+    for thread in served.map.readers._threads._threads._threads:
+        thread.join()
+    assert len(read) <= readers.THREADS
+
+
 def test_the_busiest_readers_are_named(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     for x in range(500):
         on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
